@@ -167,15 +167,13 @@ class Recommender:
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
                 `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
-            on_validation: called after every validation with the step and all that is logged,
-                `validation_loss` among it.
+            on_validation: called after every validation with the step and all that is logged.
 
         Returns:
             This recommender, trained.
 
         Raises:
-            InputError: the data cannot be used, options for logs were given with a store, or `out`
-                is a run on other data or settings.
+            InputError: the data or its options cannot be used, or `out` is another run.
         """
         names = ("reward", "session_by", "gap_minutes", "split", "dataset")
         values = (reward, session_by, gap_minutes, split, dataset)
@@ -185,9 +183,8 @@ class Recommender:
             folder = scratch.enter_context(scratch_folder(Path(tempfile.gettempdir()), "run"))
             store = store_given(data, mapping, folder, options)
             out = folder / "run" if out is None else Path(out)
-            record = train_screened(
-                store, out, self.config, screen, callbacks=Callbacks(on_step, on_validation)
-            )
+            watchers = Callbacks(on_step, on_validation)
+            record = train_screened(store, out, self.config, screen, callbacks=watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
             trained = _completed(store, out, refit)

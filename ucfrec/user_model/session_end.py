@@ -128,9 +128,12 @@ class SessionEnd:
             scores = models[kind]._log_odds(given)
             losses[kind] = F.softplus(torch.where(target, -scores, scores).clamp(max=_MOST))
             decrease = losses[kept] - losses[kind]
-            error = float(decrease.std(correction=0)) / max(1, len(decrease)) ** 0.5
-            gains[kind] = float(decrease.mean()) if len(decrease) else 0.0, error
-            if gains[kind][0] > error:
+            gain, error = 0.0, 0.0
+            if len(decrease):
+                gain = float(decrease.mean())
+                error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
+            gains[kind] = gain, error
+            if gain > error:
                 kept = kind
         means = {kind: float(each.mean()) if len(each) else 0.0 for kind, each in losses.items()}
         report = SessionEndReport(len(ended), len(target), means, gains, kept)

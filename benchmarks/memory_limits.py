@@ -152,7 +152,7 @@ def commands(folder: Path, kind: str, limit: int) -> dict[str, list[str]]:
     return found
 
 
-def main() -> None:
+def given() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--folder", type=Path, required=True, help="for logs, stores and runs")
     parser.add_argument("--limit", default="1GB", help="of a command's memory (default: 1GB)")
@@ -171,7 +171,11 @@ def main() -> None:
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
     )
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = given()
     folder, limit = options.folder, bytes_of(options.limit)
     assert limit is not None
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,13 +1,11 @@
 #!/usr/bin/env bash
-# Train on all logs but the latest day, and estimate old and new on that day. Promotes nothing:
-# read the verdict, then point /srv/ucfrec/current at the new run.
+# Every day: join what was shown with what was clicked, train on from the current run, and promote
+# the new run. `ucfrec promote` refuses a worse one, so that the old one goes on.
 set -euo pipefail
 cd /srv/ucfrec
-today=$(date -u +%F)
-latest=$(find logs -name '*.parquet' | sort | tail -n 1)
-find logs -name '*.parquet' | sort | head -n -1 > "runs/$today.logs"
-mapfile -t training < "runs/$today.logs"
-ucfrec prepare "${training[@]}" --mapping shop.toml --out "stores/$today"
-ucfrec train "stores/$today" --out "runs/$today" --config train.toml
-ucfrec ope current "runs/$today" "$latest" --mapping shop.toml --json "runs/$today-ope.json"
-ucfrec report "runs/$today" --results "runs/$today-ope.json" --out "runs/$today.html"
+day=$(date -u -d yesterday +%F)
+shown="shown/exposures-${day//-/}T*.parquet"
+ucfrec join "$shown" "clicks/$day.parquet" --within 30m --out "logs/$day.parquet"
+ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --out "runs/$day"
+ucfrec report "runs/$day" --out "runs/$day.html"
+ucfrec promote "runs/$day"

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import tomllib
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,18 @@ import pandas as pd
 import pytest
 
 from examples.make_shop_log import make_log
+from examples.simulated_month import Day, Month, plot, simulate, summary
 from tests.support.markdown import ROOT
 from ucfrec.logs.mapping import read_mapping
 from ucfrec.logs.prepare import PrepareOptions, validate
 
+SETTINGS = (
+    "train.learning_rate=1e-3",
+    "policy.dim=32",
+    "policy.context=10",
+    "policy.exposure=true",
+    "rule.sessions=50",
+)
 NOTEBOOKS = ("shop", "evaluation", "control")
 
 
@@ -88,3 +97,37 @@ def test_the_development_extra_can_run_the_notebooks() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {requirement.split(">")[0] for requirement in project["optional-dependencies"]["dev"]}
     assert {"nbclient", "ipykernel"} <= names
+
+
+SMALL = ("train.steps=40", "policy.dim=16", "policy.context=4", "rule.sessions=4")
+
+
+def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) -> None:
+    month = Month(days=2, sessions=50, users=80, items=110, settings=SMALL)
+    days = simulate(tmp_path, replace(month, days=1))
+    assert [each.day for each in days] == [1]
+    days = simulate(tmp_path, month)
+    assert [each.day for each in days] == [1, 2]
+    assert all(0 < each.reward < 20 and 0 < each.frozen < 20 for each in days)
+    current = json.loads((tmp_path / "runs" / "promoted.json").read_text())["current"]
+    assert current == days[-1].current
+    assert "last 2 days" in summary(days)
+    shown = pd.concat(map(pd.read_parquet, (tmp_path / "shown-02").glob("*.parquet")))
+    log = pd.read_parquet(tmp_path / "log-02.parquet")
+    assert len(log) == len(shown) > 0
+    assert log.click.sum() == round(days[1].reward * month.sessions)
+    if find_spec("matplotlib") is not None:
+        plot(days, tmp_path / "month.svg")
+        assert (tmp_path / "month.svg").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_policy_that_is_updated_earns_more_than_one_that_is_not(tmp_path: Path) -> None:
+    month = Month(days=6, sessions=400, users=800, settings=("train.steps=600", *SETTINGS))
+    days: list[Day] = simulate(tmp_path, month)
+    reward, frozen = (
+        np.mean([getattr(each, name) for each in days[-3:]]) for name in ("reward", "frozen")
+    )
+    assert reward > 1.15 * frozen
+    covered = [found for each in days for found in each.covered if found is not None]
+    assert np.mean(covered) > 0.7

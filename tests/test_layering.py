@@ -28,9 +28,11 @@ ORDER = (
     {"runs"},
     {"evaluation", "recommending"},
     {"off_policy"},
+    {"updating"},
     {"reporting"},
-    {"benchmark"},
-    {"recommender"},
+    {"benchmark", "tuning"},
+    {"given_data"},
+    {"exploring", "recommender"},
     {"commands"},
     {"__init__", "__main__"},
 )

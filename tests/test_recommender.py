@@ -5,17 +5,22 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from sklearn.base import clone
 
 import ucfrec
 from tests.recommending.test_recommend import SMALL, random_log
 from ucfrec import UCF, EpisodeStore, Recommender
+from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
+from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.off_policy.selection import choose
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +45,9 @@ def fitted(folder: Path) -> Recommender:
 
 
 def test_the_names_of_the_package() -> None:
-    assert set(ucfrec.__all__) == {"UCF", "EpisodeStore", "Recommender", "__version__"}
+    assert dir(ucfrec) == sorted(ucfrec.__all__)
+    assert {"UCF", "EpisodeStore", "Recommender", "prepare"} <= set(ucfrec.__all__)
+    assert all(getattr(ucfrec, name) is not None for name in ucfrec.__all__)
     assert UCF is Recommender
     assert UCF(settings=SMALL).config.policy_name == "ucf"
     with pytest.raises(AttributeError, match="no attribute 'Recommendation'"):
@@ -64,7 +71,7 @@ def test_a_store_its_logs_and_a_frame_of_them_train_the_same_policy(
     pd.testing.assert_frame_equal(policy.recommend(log), fitted.recommend(log))
 
 
-def test_a_frame_leaves_only_the_run_behind(
+def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
     log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scratch, work = tmp_path / "scratch", tmp_path / "work"
@@ -73,14 +80,19 @@ def test_a_frame_leaves_only_the_run_behind(
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(work)
     policy = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
-    assert not [*scratch.iterdir(), *work.iterdir()]
+    assert not [*work.iterdir()]
     folders = (scratch, work, tmp_path, tmp_path / "run", tmp_path / "run" / "policy")
     before = [folder.stat().st_mtime_ns for folder in folders]
     policy.recommend(log)
     assert [folder.stat().st_mtime_ns for folder in folders] == before  # nothing came and went
     kept = Recommender("dt", settings=SMALL).fit(log)
-    assert [path.name for path in kept.run.parent.iterdir()] == ["run"]
+    assert {path.name for path in kept.run.parent.iterdir()} == {"run", "store"}
     assert kept.run.is_relative_to(scratch)
+    of_store = Recommender("dt", settings=SMALL).fit(kept.run.parent / "store", tmp_path / "other")
+    assert len([path for path in scratch.iterdir() if path.is_dir()]) == 2
+    del policy, kept
+    assert not [*scratch.iterdir()]
+    assert of_store.run.is_dir()
 
 
 KILLED = """
@@ -195,3 +207,154 @@ def test_six_rows_with_new_users_in_validation_are_enough_for_a_policy(tmp_path:
     tiny = pd.DataFrame(rows).assign(timestamp=1_700_000_000_000 + 10**7 * np.arange(6))
     policy = Recommender("bc", settings=SMALL).fit(tiny, tmp_path / "run")
     assert len(policy.recommend(tiny, k=1, filter_seen=False)) == 3
+
+
+@pytest.fixture(scope="module")
+def shown(log: pd.DataFrame) -> pd.DataFrame:
+    """The log with the probabilities of a logging policy that drew uniformly."""
+    return log.assign(propensity=1 / 30)
+
+
+@pytest.fixture(scope="module")
+def clicked(shown: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Recommender:
+    settings = {"train.steps": 60, "train.validate_every": 30, "policy.dim": 16, "rule.sessions": 5}
+    return Recommender("dt", settings=settings).fit(
+        shown, tmp_path_factory.mktemp("clicked") / "run", reward="reward", session_by="user"
+    )
+
+
+def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_path: Path) -> None:
+    """Train, rank, estimate, decide, recommend, score, export, report: as the commands do it."""
+    later = shown.assign(timestamp=shown.timestamp + 10**9)
+    ranking = clicked.rank(later, k=5, liked="reward > 0.5")
+    frame = ranking.to_frame().set_index("method")
+    assert {"dt", "random", "most shown"} <= set(frame.index)
+    assert frame.loc["dt", "hit_rate_liked_low"] <= frame.loc["dt", "hit_rate_liked"]
+    report = clicked.ope(later)
+    estimates = report.to_frame().set_index("method")
+    assert estimates.loc["logged", "R_cum"] == pytest.approx(
+        shown.groupby("user_id").reward.sum().mean()
+    )
+    assert report.verdict.headline in report._repr_html_()
+    rule = ucfrec.DecisionRule(1.0, temperature=1.0)
+    other = clicked.ope(later, rule=rule)
+    choice = choose({"own": report, "drawn": other}, 0)
+    assert choice.excluded.keys() <= {"own", "drawn"}  # 40 users are few
+    chosen = clicked.recommend(later, k=3, rule=rule, users=[3, 7])
+    assert chosen.groupby("user_id").size().to_dict() == {3: 3, 7: 3}
+    scored = clicked.score(later, rule=rule)
+    assert len(scored) == len(later)
+    assert scored.probability.between(0, 1).all()
+    page = clicked.report(tmp_path / "report.html", [report])
+    text = page.read_text(encoding="utf-8")
+    assert "dt" in text
+    card = (clicked.run / "MODEL_CARD.md").read_text(encoding="utf-8")
+    assert "ucfrec rank" in card
+    assert "ucfrec ope" in card
+
+
+def test_later_logs_may_be_files_and_the_test_split(
+    fitted: Recommender, folder: Path, log: pd.DataFrame
+) -> None:
+    from_files = fitted.rank(folder / "log-*.parquet", k=3).to_frame()
+    from_frame = fitted.rank(log, k=3).to_frame()
+    numbers = [name for name in from_frame.select_dtypes("number") if name != "wall_time_s"]
+    pd.testing.assert_frame_equal(from_files[numbers], from_frame[numbers])
+    held_out = fitted.rank(k=3, others=[fitted])
+    assert [row.method for row in held_out][:2] == ["dt", "dt-2"]
+    assert "training" in " ".join(fitted.rank(log).warnings)
+
+
+def test_users_of_the_store_need_no_frame(fitted: Recommender, log: pd.DataFrame) -> None:
+    expected = fitted.recommend(log, k=4, users=[5, "11"])
+    pd.testing.assert_frame_equal(fitted.recommend(users=[11, 5], k=4), expected)
+    assert set(expected.user_id) == {5, 11}
+    assert fitted.recommend(k=1).user_id.nunique() == log.user_id.nunique()
+    for users, message in (
+        ([5, 999], "1 of 2 users have no rows in the histories, such as 999"),
+        ("5", "give a list of user_ids"),
+        ([], "give a list of user_ids"),
+    ):
+        with pytest.raises(InputError, match=message):
+            fitted.recommend(log, users=users)
+    with pytest.raises(InputError, match="none of the 1 users is in the store"):
+        fitted.recommend(users=[999])
+
+
+def test_recommend_leaves_out_what_fit_leaves_out(fitted: Recommender, log: pd.DataFrame) -> None:
+    holes = log.assign(reward=log.reward.mask(log.index < 5))
+    with pytest.warns(UserWarning, match=r"5 of 1,500 rows were excluded \(5: reward is missing"):
+        found = fitted.recommend(holes, k=3)
+    pd.testing.assert_frame_equal(found, fitted.recommend(log.iloc[5:], k=3))
+
+
+def test_callbacks_see_every_step_and_what_is_logged(folder: Path, tmp_path: Path) -> None:
+    steps: list[int] = []
+    validations: dict[int, Mapping[str, float]] = {}
+    settings = {"train.steps": 5, "train.validate_every": 2, "policy.dim": 8, "rule.choose": False}
+    policy = Recommender("dt", settings=settings).fit(
+        folder / "store",
+        tmp_path / "run",
+        on_step=lambda step, _: steps.append(step),
+        on_validation=lambda step, logged: validations.update({step: logged}),
+    )
+    assert steps == [1, 2, 3, 4, 5]
+    logged = read_metrics(policy.run / "policy")["validation_loss"]
+    assert logged == {step: found["validation_loss"] for step, found in validations.items()}
+
+    def stop(step: int, _: Mapping[str, float]) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Recommender("dt", settings=settings).fit(
+            folder / "store", tmp_path / "stopped", on_step=stop
+        )
+    counted: list[int] = []
+    Recommender("item-rate").fit(
+        folder / "store",
+        tmp_path / "rate",
+        on_validation=lambda step, _: counted.append(step),
+    )
+    assert counted == [1]
+
+
+def test_it_follows_scikit_learns_conventions(fitted: Recommender) -> None:
+    policy = Recommender("dt", settings=["train.steps=7"], seed=2)
+    twin = clone(policy)
+    assert twin.get_params() == policy.get_params()
+    assert twin.config == policy.config
+    policy.set_params(train__steps=9, policy__dim=8, seed=4)
+    assert (policy.config.train.steps, policy.config.policy.dim, policy.config.seed) == (9, 8, 4)
+    assert policy.get_params()["train__steps"] == 9
+    assert policy.get_params(deep=False).keys() == {"policy", "settings", "seed"}
+    with pytest.raises(InputError, match="train has no field 'step'"):
+        policy.set_params(train__step=1)
+    assert policy.config.train.steps == 9
+    loaded = Recommender.load(fitted.run)
+    assert clone(loaded).config == fitted.config
+    assert policy.set_params(policy="bc", settings={}).config.policy_name == "bc"
+
+
+def test_evaluated_in_a_simulator(tmp_path: Path) -> None:
+    simulated = tmp_path / "logs"
+    collect = ["collect", "--env", "synthetic-catalog", "--sessions", "40", "--behavior", "random"]
+    assert main([*collect, "--out", str(simulated)]) == 0
+    policy = Recommender("item-rate").fit(
+        simulated / "sessions.parquet", tmp_path / "run", reward="is_click"
+    )
+    found = policy.evaluate("synthetic-catalog", 8, behaviors=["random"])
+    assert [row.method for row in found] == ["item-rate", "random"]
+    assert found.to_frame()["R_cum"].notna().all()
+
+
+def test_new_logs_bring_it_up_to_date(log: pd.DataFrame, tmp_path: Path) -> None:
+    policy = Recommender("dt", settings=[*SMALL, "rule.sessions=3"]).fit(log[:1000])
+    new = policy.update(log[1000:], tmp_path / "new")
+    update = new.trained.record.update
+    assert update is not None
+    assert update.appended["steps"] == 500
+    assert update.verdict is not None
+    assert new.run == tmp_path / "new"
+    assert new.recommend(log, k=2).groupby("user_id").size().max() == 2
+    with pytest.raises(InputError, match=r"gone|no row"):
+        Recommender.load(tmp_path / "new").update(log[:10], tmp_path / "third")

@@ -33,7 +33,6 @@ def damage_explained(path: Path | str, remedy: str) -> Iterator[None]:
 
     Args:
         path: of the file, or words for what is used.
-        remedy: what to do about it.
 
     Raises:
         InputError: an entry is missing or has another type or shape than the block needs.

@@ -144,7 +144,6 @@ def pool_of_processes(
     process of a command, and this one ends the others.
 
     Args:
-        workers: number of processes.
         begin: a module-level function that each process calls first.
     """
     import multiprocessing

@@ -1,47 +1,67 @@
-"""Recommender: train a policy on logs, recommend items, save and load it."""
+"""Recommender: train a policy on logs, recommend items, measure it, save and load it."""
 
-import re
 import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from html import escape
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import pandas as pd
-import pyarrow.parquet as pq
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.liked import LikedExpression
+from ucfrec.evaluation.ranking import Later
+from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue, training_store
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
+from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.logs.clean import REASONS
-from ucfrec.logs.histories import log_table
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
-from ucfrec.reporting.model_card import write_card
-from ucfrec.runs.config import resolve_config
-from ucfrec.runs.refit import refit_within
-from ucfrec.runs.run import train_run
-from ucfrec.runs.trained_policy import TrainedPolicy
-
-_OPTIONS: Final = (
-    (r" or --max-session \d+", ""),
-    (r"--column (\w+)=('[^']*'|\.\.\.)", r"mapping=LogMapping({'\1': \2})"),
-    (r"--column (\w+)=", r"mapping=LogMapping({'\1': ''})"),
-    (r"--where (\"[^\"]*\")", r"mapping=LogMapping(where=\1)"),
-    (r"--time-format ('[^']*')", r"mapping=LogMapping(time_format=\1)"),
-    (r"--earliest ([\d-]+)", r"mapping=LogMapping(earliest='\1')"),
-    (r"--time-format", "LogMapping.time_format"),
-    (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
+from ucfrec.given_data import (
+    Logs,
+    files_given,
+    histories_given,
+    in_words_of_python,
+    logs_given,
+    store_given,
 )
-"""Options of commands in messages, and what they are in Python."""
+from ucfrec.logs.append import AppendOptions
+from ucfrec.logs.expressions import Expression
+from ucfrec.logs.mapping import LogFiles, LogMapping
+from ucfrec.off_policy.evaluate import (
+    DEFAULTS,
+    EstimateOptions,
+    OffPolicyReport,
+    evaluate_off_policy,
+)
+from ucfrec.off_policy.score import score
+from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+from ucfrec.provenance import without_folders
+from ucfrec.recommending.export import Exported, export
+from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.similar import similar_items
+from ucfrec.reporting.cards import card_of_estimates, card_of_evaluation, card_of_ranking
+from ucfrec.reporting.model_card import write_card
+from ucfrec.reporting.page import write_report
+from ucfrec.results.table import Evaluation, Ranking, ResultTable
+from ucfrec.runs.config import TABLES, resolve_config, settings_given
+from ucfrec.runs.refit import refit_within
+from ucfrec.runs.screened import train_screened
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.updating.update import UpdateOptions, update_run
+
+_OWN = ("policy", "settings", "seed")
+_FRAME = "a frame"
+"""What a data frame is called in model cards."""
 
 
 class Recommender:
@@ -69,6 +89,7 @@ class Recommender:
         Raises:
             InputError: the policy or a setting is unknown or out of range.
         """
+        self.policy, self.settings, self.seed = policy, settings, seed
         self.config = resolve_config(policy, None, settings, seed)
         self._remove_scratch: Callable[[], object] = ExitStack().close
         self._folder: Path | None = None
@@ -79,9 +100,42 @@ class Recommender:
             return f"Recommender({self.config.policy_name!r}, not trained)"
         return f"Recommender({self._trained.record.summary})"
 
+    def _repr_html_(self) -> str:
+        lines = [repr(self), *([] if self._trained is None else [str(self._trained.rule)])]
+        return "".join(f"<p>{escape(line)}</p>" for line in lines)
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """The arguments of the constructor, as scikit-learn's estimators have it.
+
+        Args:
+            deep: also every setting, as `table__field`.
+        """
+        params = {name: getattr(self, name) for name in _OWN}
+        if deep:
+            for table in TABLES:
+                values = asdict(getattr(self.config, table))
+                params |= {f"{table}__{name}": value for name, value in values.items()}
+        return params
+
+    def set_params(self, **params: Any) -> Self:
+        """Change arguments of the constructor, or settings as `train__steps=200`, before `fit`.
+
+        Raises:
+            InputError: a policy or setting is unknown or out of range; nothing is changed then.
+        """
+        own = {name: params.pop(name) for name in _OWN if name in params}
+        given = {name: own.get(name, getattr(self, name)) for name in _OWN}
+        if params:
+            new = {name.replace("__", ".", 1): value for name, value in params.items()}
+            # Texts `table.field=value` come first, so that the new values count.
+            given["settings"] = settings_given(given["settings"]) | new
+        self.config = resolve_config(given["policy"], None, given["settings"], given["seed"])
+        self.policy, self.settings, self.seed = (given[name] for name in _OWN)
+        return self
+
     def fit(
         self,
-        data: EpisodeStore | pd.DataFrame | Path | str,
+        data: EpisodeStore | Logs,
         out: Path | str | None = None,
         *,
         reward: str | None = None,
@@ -89,22 +143,32 @@ class Recommender:
         gap_minutes: float | None = None,
         split: tuple[float, ...] | None = None,
         mapping: LogMapping | None = None,
+        dataset: str | None = None,
+        screen: str | None = None,
         refit: bool = False,
+        on_step: Watcher | None = None,
+        on_validation: Watcher | None = None,
     ) -> Self:
         """Train on a store's training episodes; logs are prepared into a temporary store first.
 
         Args:
-            data: a store or its folder; or logs: a file, folder or glob, or a frame with one row
-                per interaction: `user_id`, `item_id`, `timestamp` (milliseconds, dates or
-                timestamps) and feedback.
+            data: a store or its folder; or logs: files, folders and globs, what
+                `ucfrec_datasets.load` returns, or a frame with one row per interaction:
+                `user_id`, `item_id`, `timestamp` (milliseconds, dates or timestamps) and
+                feedback. A store prepared from logs lasts as long as this recommender.
             out: run folder, resumed if training was interrupted; None for a temporary one.
             reward: logs only: SQL expression over the feedback columns; see `PrepareOptions`.
             session_by: logs only: "session_id", "gap" or "user"; see `PrepareOptions`.
             gap_minutes: logs only: with "gap", a longer pause (minutes) starts a new session (30).
             split: logs only: shares of training, validation and test (0.8, 0.1, 0.1).
             mapping: logs only: names of the columns, and feature tables.
+            dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
+            screen: "drop" or "copies", as for `ucfrec train --screen`.
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
-                only later logs can evaluate the policy then.
+                `rank` and `ope` on the test split use the weights before that.
+            on_step: called after every update with the step and `{"loss": …}`.
+            on_validation: called after every validation with the step and all that is logged,
+                `validation_loss` among it.
 
         Returns:
             This recommender, trained.
@@ -118,32 +182,27 @@ class Recommender:
             "session_by": session_by,
             "gap_minutes": gap_minutes,
             "split": split,
+            "dataset": dataset,
         }
         options = {name: value for name, value in log_options.items() if value is not None}
         temporary = Path(tempfile.gettempdir())
-        with ExitStack() as stack:
-            if not isinstance(data, EpisodeStore):
-                prepared = stack.enter_context(scratch_folder(temporary, "logs"))
-                store = _store(data, prepared, mapping, options)
-            elif options or mapping is not None:
-                raise InputError(f"{data} is prepared already; prepare its logs with other options")
-            else:
-                store = data
-            scratch = stack.enter_context(ExitStack())
-            if out is None:
-                # Whoever fits next removes the run, should this process be killed.
-                out = scratch.enter_context(scratch_folder(temporary, "run")) / "run"
-            record = train_run(store, Path(out), self.config)
+        callbacks = Callbacks(on_step, on_validation)
+        with ExitStack() as scratch:
+            # Whoever fits next removes what is left, should this process be killed.
+            folder = scratch.enter_context(scratch_folder(temporary, "run"))
+            store = store_given(data, mapping, folder, options)
+            out = folder / "run" if out is None else Path(out)
+            record = train_screened(store, out, self.config, screen, callbacks=callbacks)
             if refit:
-                refit_within(store, Path(out))
-            if warning := record.learned_nothing(read_metrics(Path(out) / "policy")):
+                refit_within(store, out)
+            if warning := record.learned_nothing(read_metrics(out / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
-            write_card(Path(out))
-            trained = TrainedPolicy.load(Path(out))
-            kept = scratch.pop_all()
+            write_card(out)
+            trained = TrainedPolicy.load(out)
+            kept = scratch.pop_all() if any(folder.iterdir()) else ExitStack()
         self._remove_scratch()
         self._remove_scratch = weakref.finalize(self, kept.close)
-        self._trained, self._folder = trained, Path(out)
+        self._trained, self._folder = trained, out
         return self
 
     @property
@@ -168,11 +227,19 @@ class Recommender:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
         return self._trained
 
+    def _evaluated(self, logs: Logs | None) -> TrainedPolicy:
+        """The policy that logs can evaluate: the test split, the weights before a refit."""
+        trained = self.trained
+        if logs is not None or trained.record.refit_of is None:
+            return trained
+        return TrainedPolicy.load(self.run, split=True)
+
     def recommend(
         self,
-        histories: pd.DataFrame,
+        histories: pd.DataFrame | None = None,
         k: int = 10,
         *,
+        users: Sequence[Any] | None = None,
         filter_seen: bool = True,
         candidates: Sequence[Any] | None = None,
         skip_unknown: bool = False,
@@ -182,16 +249,18 @@ class Recommender:
     ) -> pd.DataFrame:
         """The `k` best next items of every user; nothing is written to disk.
 
-        Rows are read as by `ucfrec prepare`, and sessions are split as those of training. Rows that
-        repeat a user, item and time count once. The state is made of at most the last 1,000 rows of
-        a user; all rows count as seen.
+        Rows are read as by `ucfrec prepare`, which drops rows with a warning, and sessions are
+        split as those of training. Rows that repeat a user, item and time count once. The state is
+        made of at most the last 1,000 rows of a user; all rows count as seen.
 
         Args:
             histories: one row per interaction, in any order: `user_id`, `item_id`, `timestamp`
                 (milliseconds, dates or timestamps); `reward`, or the columns of the training
                 reward's expression; `session_id`, if the run's sessions are split by it; and
-                `observation` (lists of floats), if the run has observations.
+                `observation` (lists of floats), if the run has observations. None for the rows
+                of the store that the policy was trained on.
             k: number of items per user, at least 1.
+            users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
             skip_unknown: ignore rows of items that are not in the training data.
@@ -209,13 +278,13 @@ class Recommender:
 
         Raises:
             InputError: the recommender is not trained, an argument is wrong, a column is missing or
-                of a wrong type, rows have missing or undefined values, or an item or candidate is
-                not in the training data.
+                of a wrong type, no row can be used, a user has no rows, or an item or candidate
+                is not in the training data.
         """
         trained = self.trained
         frames = recommend(
             trained,
-            histories_of_frame(trained, histories, mapping or LogMapping()),
+            histories_given(trained, histories, mapping, users),
             k,
             rule=rule,
             seed=seed,
@@ -223,8 +292,234 @@ class Recommender:
             candidates=candidates,
             skip_unknown=skip_unknown,
         )
-        with _in_words_of_python():
+        with in_words_of_python():
             return pd.concat(frames, ignore_index=True)
+
+    def recommend_to_items(self, items: Sequence[Any] | None = None, k: int = 10) -> pd.DataFrame:
+        """The `k` most similar other items of each item, by the cosine of the policy's vectors.
+
+        Args:
+            items: item_ids; None for all.
+            k: number of similar items, at least 1.
+
+        Returns:
+            `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
+
+        Raises:
+            InputError: the recommender is not trained, or an item is not in the training data.
+        """
+        return similar_items(self.trained, items, k)
+
+    def rank(
+        self,
+        logs: Logs | None = None,
+        k: int = 10,
+        *,
+        others: Iterable["Recommender"] = (),
+        rule: DecisionRule | None = None,
+        filter_seen: bool = True,
+        liked: str | None = None,
+        seed: int = 0,
+        mapping: LogMapping | None = None,
+    ) -> Ranking:
+        """How this policy, others and baselines rank what users were shown later: `ucfrec rank`.
+
+        Args:
+            logs: later logs, as for `fit`; None for the test split of the store.
+            k: items recommended at each step.
+            others: policies trained on the same store, ranked beside this one.
+            rule: the decision rule of this policy; None for the run's own.
+            filter_seen: exclude items that the user has seen before a step.
+            liked: truth value over the column reward, such as "reward >= 4"; None for at least 60%
+                of the way from the lowest training reward to the highest.
+            seed: of the bootstrap over users and of the random baseline.
+            mapping: of the logs' columns; what it leaves open is as in the training log.
+
+        Raises:
+            InputError: the recommender is not trained, the logs cannot be used, or another policy
+                has another catalogue.
+        """
+        trained, *rest = (each._evaluated(logs) for each in (self, *others))
+        all_trained = [trained, *rest]
+        require_one_catalogue(all_trained)
+        with in_words_of_python():
+            wanted = liked and Expression(liked, "--liked")
+            by = LikedExpression(wanted, trained.record.reward) if wanted else None
+        rankers = [PolicyRanker(each, None, each.name) for each in all_trained]
+        rankers[0] = PolicyRanker(trained, rule, trained.name)
+        with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
+            said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
+            said += [logged.history_lacking] if logged.history_lacking else []
+            assert logged.rows is not None
+            later = Later(logged.store, logged.rows, filter_seen)
+            about = later, logged.users, k, seed
+            rows = ranking_rows(rankers, trained, training_store(trained), *about, by)
+        rows = [replace(row, checkpoint="best") for row in rows]
+        card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
+        return Ranking(rows, said)
+
+    def ope(
+        self,
+        logs: Logs | None = None,
+        *,
+        rule: DecisionRule | None = None,
+        options: EstimateOptions = DEFAULTS,
+        seed: int = 0,
+        mapping: LogMapping | None = None,
+    ) -> OffPolicyReport:
+        """Estimate the return of a session from logs alone, with a verdict: `ucfrec ope`.
+
+        Reports of several rules or policies are compared by
+        `ucfrec.off_policy.selection.choose({"a": report, "b": …}, seed)`.
+
+        Args:
+            logs: logs with propensities, as for `fit`; None for the test split of the store.
+            rule: the decision rule; None for the run's own.
+            options: what is estimated, and how.
+            seed: of the folds and the bootstrap.
+            mapping: of the logs' columns; what it leaves open is as in the training log.
+
+        Raises:
+            InputError: the recommender is not trained, or the logs cannot be used.
+        """
+        trained = self._evaluated(logs)
+        with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
+            report = evaluate_off_policy(
+                trained.folder, trained, logged, rule=rule, seed=seed, options=options
+            )
+        card_of_estimates(trained.folder, [_named(logs)], report)
+        return report
+
+    def evaluate(
+        self,
+        environment: str | Environment,
+        episodes: int = 1000,
+        *,
+        rule: DecisionRule | None = None,
+        behaviors: Sequence[str] = (),
+        seed: int = 0,
+    ) -> Evaluation:
+        """Measure the return in a simulator: `ucfrec evaluate`.
+
+        Args:
+            environment: name of a simulator, such as "synthetic-taobao", or an `Environment`.
+            episodes: number of episodes of each policy.
+            rule: the decision rule; None for the run's own.
+            behaviors: built-in policies of the simulator to evaluate beside it, such as "random".
+            seed: of the episodes.
+
+        Raises:
+            InputError: the recommender is not trained, or the environment does not fit it.
+        """
+        trained = self.trained
+        simulated = Environment(environment) if isinstance(environment, str) else environment
+        about = episodes, seed
+        own = evaluate_policy(simulated, trained, trained.name, *about, rule)
+        own = replace(own, checkpoint="best")
+        card_of_evaluation(trained.folder, own)
+        others = [evaluate_behavior(simulated, name, *about) for name in behaviors]
+        return Evaluation([own, *others])
+
+    def score(
+        self, logs: Logs, *, rule: DecisionRule | None = None, mapping: LogMapping | None = None
+    ) -> pd.DataFrame:
+        """The policy's probability of every logged choice: `ucfrec score`.
+
+        Args:
+            logs: as for `fit`.
+            rule: the decision rule; None for the run's own.
+            mapping: of the logs' columns; what it leaves open is as in the training log.
+
+        Returns:
+            One row per logged step; see `ucfrec.off_policy.score.score`.
+
+        Raises:
+            InputError: the recommender is not trained, or the logs cannot be used.
+        """
+        with logs_given(self.trained, logs, mapping, keep_unknown=False) as logged:
+            return pd.concat(score(self.trained, logged, rule), ignore_index=True)
+
+    def update(
+        self,
+        logs: Logs,
+        out: Path | str,
+        *,
+        window_days: float | None = None,
+        refit: bool = True,
+        mapping: LogMapping | None = None,
+    ) -> Self:
+        """Bring the policy up to date with new logs: `ucfrec update`.
+
+        Args:
+            logs: new logs, as for `fit`; rows that are not newer than the store are left out.
+            out: folder of the new run; the store with the new rows is beside it, with `-store`
+                added to its name.
+            window_days: leave out sessions that ended longer ago, before the end of the new logs;
+                None to keep all.
+            refit: go on learning from all rows once both policies are compared.
+            mapping: of the logs' columns; what it leaves open is as in the training log.
+
+        Returns:
+            The new recommender; this one is not changed. `trained.record.update` has the drift and
+            the verdict on both.
+
+        Raises:
+            InputError: the recommender is not trained, its store is gone, or the logs cannot be
+                used.
+        """
+        window = None if window_days is None else round(window_days * 86_400_000)
+        options = UpdateOptions(AppendOptions(window), refit=refit)
+        given = files_given(self.trained, logs, mapping)
+        with given as (files, columns, frame), in_words_of_python(frame):
+            update_run(self.run, files, Path(out), mapping=columns, options=options)
+        write_card(Path(out))
+        return self.load(out)
+
+    def export(
+        self, folder: Path | str, k: int = 100, *, rule: DecisionRule | None = None
+    ) -> Exported:
+        """Write the policy with its rule as an ONNX graph: `ucfrec export`.
+
+        Args:
+            folder: folder to make.
+            k: items that the graph chooses.
+            rule: the decision rule; None for the run's own.
+
+        Raises:
+            InputError: the extra `export` is not installed, the policy cannot be exported, or the
+                folder exists.
+        """
+        return export(self.trained, Path(folder), rule=rule, k=k)
+
+    def report(
+        self,
+        file: Path | str,
+        results: Iterable[ResultTable | Path | str] = (),
+        items: Path | str | None = None,
+    ) -> Path:
+        """Write one HTML page about the training and results: `ucfrec report`.
+
+        Args:
+            file: HTML file to write.
+            results: what `evaluate` and `ope` returned, or files of it.
+            items: file with item features to show beside sample recommendations.
+
+        Returns:
+            The file.
+
+        Raises:
+            InputError: the recommender is not trained, or a file cannot be used.
+        """
+        with tempfile.TemporaryDirectory() as scratch:
+            files = []
+            for number, result in enumerate(results):
+                if isinstance(result, ResultTable):
+                    files.append(Path(scratch) / f"{number}.json")
+                    result.save(files[-1])
+                else:
+                    files.append(Path(result))
+            write_report(Path(file), [self.run], files, None if items is None else Path(items))
+        return Path(file)
 
     def save(self, folder: Path | str) -> None:
         """Copy the run to a new folder, which `load` and the command line can read.
@@ -245,7 +540,9 @@ class Recommender:
         """
         policy = cls()
         policy._folder, policy._trained = Path(run), TrainedPolicy.load(Path(run))
-        policy.config = policy._trained.record.config
+        policy.config = config = policy._trained.record.config
+        policy.policy, policy.seed = config.policy_name, config.seed
+        policy.settings = {table: asdict(getattr(config, table)) for table in TABLES}
         return policy
 
 
@@ -253,54 +550,12 @@ UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
-def _store(
-    data: pd.DataFrame | Path | str,
-    scratch: Path,
-    mapping: LogMapping | None,
-    options: Mapping[str, Any],
-) -> EpisodeStore:
-    """The store at `data`, or one prepared from the logs in `data` in the folder `scratch`."""
-    if isinstance(data, (str, Path)):
-        if (Path(data) / "meta.json").is_file():
-            if options or mapping is not None:
-                raise InputError(f"{data} is prepared already; prepare its logs with other options")
-            return EpisodeStore.open(data)
-        logs = data
-    else:
-        logs = scratch / "logs.parquet"
-        pq.write_table(log_table(data, "data"), logs)
-    with _in_words_of_python(scratch / "logs.parquet"):
-        prepared = PrepareOptions(**options)
-        report = prepare([logs], mapping or LogMapping(), scratch / "store", prepared)
-    dropped = {reason: rows for reason, rows in report["dropped"].items() if rows}
-    if dropped:
-        reasons = "; ".join(f"{n:,}: {REASONS.get(name, name)}" for name, n in dropped.items())
-        warnings.warn(
-            f"{sum(dropped.values()):,} of {report['rows_read']:,} rows were excluded ({reasons})",
-            stacklevel=3,
-        )
-    return EpisodeStore.open(scratch / "store")
-
-
-@contextmanager
-def _in_words_of_python(file: Path | None = None) -> Iterator[None]:
-    """Let errors and warnings of the block name arguments, not a scratch file or options.
-
-    Args:
-        file: scratch file of the argument `data`.
-    """
-
-    def translated(message: object) -> str:
-        text = str(message) if file is None else str(message).replace(str(file), "data")
-        for option, python in _OPTIONS:
-            text = re.sub(option, python, text)
-        return text
-
-    with warnings.catch_warnings(record=True) as noted:
-        warnings.simplefilter("always")
-        try:
-            yield
-        except InputError as error:
-            raise InputError(translated(error)) from None
-    for each in noted:
-        warnings.warn(each.category(translated(each.message)), stacklevel=5)
+def _named(logs: Logs | None) -> str:
+    """What a model card calls the logs that a measurement is on."""
+    if logs is None:
+        return "the test split"
+    if isinstance(logs, pd.DataFrame):
+        return _FRAME
+    files = logs.files if isinstance(logs, LogFiles) else logs
+    listed = [files] if isinstance(files, (str, Path)) else files
+    return ", ".join(without_folders(str(file)) for file in listed)

@@ -115,7 +115,6 @@ def require(holds: bool, message: str, *keys: str) -> None:
     """Check a constraint between fields, in the `__post_init__` of a table.
 
     Args:
-        holds: whether the constraint is satisfied.
         message: names the fields, their values and the allowed values.
         keys: the fields of the constraint, as `table.field`.
 
@@ -133,7 +132,6 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
 
     Args:
         name: of the table, the prefix of the keys.
-        table: the instance whose values are shown.
     """
     for key, info in _fields(type(table)).items():
         meaning = next(

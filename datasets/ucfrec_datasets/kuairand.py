@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
 
 LOGS: Final = ("log_standard_", "log_random_")
 FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
@@ -105,4 +105,14 @@ def _table(
 DATASET: Final = Dataset(
     summary="KuaiRand Pure, 1K or 27K: the official folder, or files of it (CSV or Parquet)",
     resolve=_resolve,
+    releases={
+        "kuairand-pure": Release(
+            url="https://zenodo.org/records/10439422/files/KuaiRand-Pure.tar.gz",
+            homepage="https://kuairand.com",
+            licence="CC BY-SA 4.0",
+            checksum="md5:0820331067a3784d9691136f772b35a7",
+            size=47_432_272,
+            parts={"all": "KuaiRand-Pure/data"},
+        )
+    },
 )

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
 from ucfrec_datasets.kuairand import PROFILE
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
@@ -78,4 +78,14 @@ def _table(
 DATASET: Final = Dataset(
     summary="KuaiRec: the official folder (its big_matrix), or files of it (CSV or Parquet)",
     resolve=_resolve,
+    releases={
+        "kuairec": Release(
+            url="https://zenodo.org/records/18164998/files/KuaiRec.zip",
+            homepage="https://kuairec.com",
+            licence="CC BY-SA 4.0",
+            checksum="md5:261550d472c48eff4990fb13c0e5bcf7",
+            size=431_964_858,
+            parts={"all": "KuaiRec 2.0/data"},
+        )
+    },
 )

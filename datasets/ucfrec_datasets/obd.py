@@ -6,7 +6,7 @@ from typing import Final
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import SUFFIXES, Dataset, FeatureTable, LogMapping, log_files
+from ucfrec.logs.mapping import SUFFIXES, Dataset, FeatureTable, LogMapping, Release, log_files
 
 CAMPAIGNS: Final = ("all", "men", "women")
 """Each has items of its own, which it numbers from 0."""
@@ -93,4 +93,18 @@ def _campaign(file: Path) -> str | None:
 DATASET: Final = Dataset(
     summary="Open Bandit Dataset: folders of a policy and campaign, or files (CSV or Parquet)",
     resolve=_resolve,
+    releases={
+        "open-bandit": Release(
+            url="https://research.zozo.com/data_release/open_bandit_dataset.zip",
+            homepage="https://research.zozo.com/data.html",
+            licence="CC BY 4.0",
+            checksum="sha256:e8ec18196582a5937381a1776382ca940689b90a18d2dcd1fb635be6df614d78",
+            size=412_931_917,
+            parts={
+                f"{policy}/{campaign}": f"open_bandit_dataset/{policy}/{campaign}"
+                for policy in ("random", "bts")
+                for campaign in CAMPAIGNS
+            },
+        )
+    },
 )

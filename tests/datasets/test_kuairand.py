@@ -47,10 +47,8 @@ def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
         **{name: generator.integers(2, size=rows) for name in feedback},
         "play_time_ms": generator.integers(9000, size=rows),
         "duration_ms": generator.integers(1, 9000, size=rows),
-        "profile_stay_time": 0,
-        "comment_stay_time": 0,
-        "is_profile_enter": 0,
-        "is_rand": 0,
+        **dict.fromkeys(("profile_stay_time", "comment_stay_time"), 0),
+        **dict.fromkeys(("is_profile_enter", "is_rand"), 0),
         "tab": 1,
     }
     ids = np.arange(videos)

@@ -13,7 +13,7 @@ from ucfrec import schema
 from ucfrec.arrays import Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import prepare
 from ucfrec.off_policy.diagnostics import diagnose

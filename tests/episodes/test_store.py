@@ -477,23 +477,6 @@ def test_successors_are_the_factual_next_states(folder: Path, items: bool) -> No
             assert torch.equal(moved.actions[row], states.embeddings[logged.items[step]])
 
 
-def test_an_overlay_without_edits_or_copies_changes_nothing(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    empty = Overlay(
-        copy_source=np.empty(0, dtype=np.int64),
-        edit_copy=np.empty(0, dtype=np.int64),
-        edit_step=np.empty(0, dtype=np.int64),
-        edit_state=np.empty((0, base.state_size), dtype=np.float32),
-    )
-    union = base.with_overlay(empty)
-    assert len(union) == len(base)
-    assert same(every_window(union, 5), every_window(base, 5))
-
-    plain = base.with_overlay(replace(empty, copy_source=np.array([2])))
-    copy = np.full(7, len(base)), np.arange(7)
-    assert same(plain.windows(*copy, 5), base.windows(np.full(7, 2), np.arange(7), 5))
-
-
 def test_copies_are_never_dropped_silently(folder: Path) -> None:
     base = write_store(folder / "store", random_episodes(LENGTHS * 2), some_states())
     union = base.with_overlay(random_overlay(base, 9, seed=4)[0])

@@ -5,6 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.support.killed import kills
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs.join import join_feedback
@@ -104,3 +105,22 @@ def test_a_log_is_not_taken_for_exposures(tmp_path: Path) -> None:
             LogMapping(),
         )
     assert not (tmp_path / "out.parquet").exists()
+
+
+def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> None:
+    rows = 200_000
+    frame = pd.DataFrame({"user_id": [str(n % 977) for n in range(rows)]})
+    frame["item_id"] = frame.index % 83
+    frame = frame.assign(timestamp=START + frame.index, request_id=frame.index.astype(str))
+    frame = frame.assign(position=1, propensity=0.5, run="r", rule="d")
+    (tmp_path / "shown").mkdir()
+    frame.to_parquet(tmp_path / "shown" / "a.parquet")
+    clicked = frame[::7][["user_id", "item_id", "timestamp", "request_id"]].assign(click=1)
+    clicked.to_parquet(tmp_path / "feedback.parquet")
+    assert kills("join", tmp_path) >= 2
+    log = pd.read_parquet(tmp_path / "joined.parquet")
+    assert len(log) == rows
+    assert log.click.sum() == log.feedback.sum() == len(clicked)
+    assert sorted(path.name for path in tmp_path.glob("*.parquet")) == [
+        "feedback.parquet", "joined.parquet"
+    ]  # fmt: skip

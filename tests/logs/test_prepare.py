@@ -164,15 +164,6 @@ def test_order_of_rows_and_files_is_immaterial(tmp_path: Path) -> None:
         assert once[name] == again[name]
 
 
-def test_another_row_is_another_fingerprint(tmp_path: Path) -> None:
-    log = make_log()
-    prepare([write(log, tmp_path / "a.parquet")], LogMapping(), tmp_path / "a", SMALL)
-    log["item_id"] += 1
-    prepare([write(log, tmp_path / "b.parquet")], LogMapping(), tmp_path / "b", SMALL)
-    prints = [EpisodeStore.open(tmp_path / name).record.fingerprint for name in "ab"]
-    assert prints[0] != prints[1]
-
-
 def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     log = make_log()
     log["when"] = pd.to_datetime(log.pop("timestamp"), unit="ms")
@@ -248,23 +239,6 @@ def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:
     assert report["rows_read"] == len(log) == report["steps"] + sum(report["dropped"].values())
     assert "clock_out_of_range" in format_report(report)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_of_repeated_rows_the_best_rewarded_stays(tmp_path: Path) -> None:
-    log = pd.DataFrame(
-        {
-            "user_id": [1, 1, 1, 2],
-            "item_id": [5, 5, 5, 6],
-            "timestamp": [START, START, START, START + 1],
-            "reward": [1.0, np.nan, 3.0, 0.0],
-        }
-    )
-    options = PrepareOptions(split=(1.0, 0.0, 0.0))
-    report = prepare([write(log, tmp_path / "l.parquet")], LogMapping(), tmp_path / "s", options)
-    assert report["dropped"]["duplicate"] == 2
-    assert report["conflicting_duplicates"] == 2
-    assert "the kept row, which has the highest" in format_report(report)
-    assert list(steps_of(tmp_path / "s")["reward"]) == [3.0, 0.0]
 
 
 def test_repeated_rows_that_agree_are_no_conflict(tmp_path: Path) -> None:
@@ -705,11 +679,6 @@ def test_globs_of_a_mapping_are_relative_to_a_folder_of_any_name(
         (here / "mapping.toml").write_text(lines)
         mapping = read_mapping(here / "mapping.toml")
         assert validate([here / "log [1].parquet"], mapping)["rows_read"] == 660
-
-
-def test_a_single_path_is_one_log(tmp_path: Path) -> None:
-    path = write(make_log(), tmp_path / "log.parquet")
-    assert log_files(str(path)) == (path,)
 
 
 def test_a_path_that_no_pattern_matches_is_refused(tmp_path: Path) -> None:

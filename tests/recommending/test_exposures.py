@@ -7,6 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from tests.support.killed import kills
 from tests.support.served import histories, requests_of, responder, trained_run, with_rule
 from ucfrec.commands.cli import main
 from ucfrec.recommending.exposures import ExposureLog
@@ -41,7 +42,7 @@ def rows_of(given: dict[int, Answer]) -> list[tuple[object, ...]]:
 def read(folder: Path) -> list[tuple[object, ...]]:
     frame = pd.concat([pd.read_parquet(file) for file in sorted(folder.glob("*.parquet"))])
     assert frame.timestamp.between((time.time() - 600) * 1000, time.time() * 1000).all()
-    return list(frame.drop(columns="timestamp").itertuples(index=False, name=None))
+    return list(frame.drop(columns=["timestamp", "arm"]).itertuples(index=False, name=None))
 
 
 def test_what_waits_is_written_when_the_log_is_closed(
@@ -114,3 +115,7 @@ def test_an_answer_carries_propensities_and_where_it_is_from(trained: TrainedPol
         assert [item["propensity"] for item in told["items"]] == answer.propensities
         assert told["request_id"] == answer.request_id
         assert told["run"] == trained.fingerprint
+
+
+def test_a_kill_loses_only_what_waited(trained: TrainedPolicy) -> None:
+    assert kills("exposures", trained.folder.parent) >= 10

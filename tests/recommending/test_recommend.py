@@ -14,7 +14,7 @@ from scipy.stats import chisquare
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.recommending import histories
 from ucfrec.recommending.histories import histories_of_files
@@ -334,28 +334,6 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         lambda log: log.rename(columns={"reward": "rewards"}),
         r"no column 'reward' \(for the reward\); nearest: rewards",
     ),
-    "null users": (
-        lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
-        "3 rows: user, item or action, time or session is missing",
-    ),
-    "null times": (
-        lambda log: log.assign(
-            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
-        ),
-        "2 rows: user, item or action, time or session is missing",
-    ),
-    "a clock of 1970": (
-        lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
-        "4 rows: time before 2000.*is the time in milliseconds",
-    ),
-    "no number": (
-        lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
-        "5 rows: reward is missing, NaN or infinite",
-    ),
-    "infinite": (
-        lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),
-        "5 rows: reward is missing, NaN or infinite",
-    ),
     "text for times": (
         lambda log: log.assign(timestamp="noon"),
         r"timestamp \(timestamp\) is 'noon', no ISO 8601 time nor milliseconds",
@@ -379,6 +357,48 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
 }
 
 
+LEFT_OUT: dict[str, tuple[object, str]] = {
+    "null users": (
+        lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
+        r"\(3: user, item or action, time or session is missing",
+    ),
+    "null times": (
+        lambda log: log.assign(
+            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
+        ),
+        r"\(2: user, item or action, time or session is missing",
+    ),
+    "a clock of 1970": (
+        lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
+        r"\(4: time before 2000.*is the time in milliseconds",
+    ),
+    "no number": (
+        lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
+        r"\(5: reward is missing, NaN or infinite",
+    ),
+    "infinite": (
+        lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),
+        r"\(5: reward is missing, NaN or infinite",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LEFT_OUT)
+def test_rows_that_cannot_be_used_are_left_out_with_a_warning(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, case: str, tmp_path: Path
+) -> None:
+    change, message = LEFT_OUT[case]
+    changed = change(log)  # type: ignore[operator]
+    count = int(message[2])
+    with pytest.warns(InputNote, match=rf"{count} of 1,500 rows were excluded {message}"):
+        found = fitted[0].recommend(changed)
+    pd.testing.assert_frame_equal(found, fitted[0].recommend(log.iloc[count:]), check_dtype=False)
+    changed.to_parquet(tmp_path / "log.parquet")
+    trained = fitted[0].trained
+    with pytest.warns(InputNote, match=rf"log\.parquet: {count} of 1,500 rows were excluded"):
+        list(histories_of_files(trained, [tmp_path / "log.parquet"], LogMapping()))
+
+
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_histories_are_refused(
     fitted: tuple[Recommender, Path], log: pd.DataFrame, case: str
@@ -395,7 +415,7 @@ def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.Dat
         with pytest.raises(InputError, match=r"k is .*; give a whole number, 1 or more"):
             policy.recommend(log, k=k)  # type: ignore[arg-type]
     assert policy.recommend(log, k=np.int64(2)).groupby("user_id").size().max() == 2
-    with pytest.raises(InputError, match="target nan; give a finite number"):
+    with pytest.raises(InputError, match="target is nan; it must be a number"):
         policy.recommend(log, rule=DecisionRule(float("nan")))
 
 
@@ -404,7 +424,7 @@ def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
     policy = Recommender("dt", settings=SMALL).fit(sessions, session_by="session_id")
     with pytest.raises(InputError, match="no column 'session_id'"):
         policy.recommend(log)
-    with pytest.raises(InputError, match=r"9 rows: user, .* or session is missing"):
+    with pytest.warns(InputNote, match=r"\(9: user, .* or session is missing"):
         policy.recommend(
             sessions.assign(session_id=sessions.session_id.mask(log.index < 9).astype("Int64"))
         )

@@ -1,6 +1,7 @@
 """The server as a process: it verifies the run, listens, and ends its requests before itself."""
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -67,6 +68,42 @@ def test_term_writes_the_exposures_of_every_answer(trained: TrainedPolicy, tmp_p
     found = shown[["user_id", "item_id", "request_id", "propensity"]]
     assert list(found.itertuples(index=False, name=None)) == expected
     assert shown.position.tolist() == [1, 2] * 5
+
+
+def test_it_follows_the_promoted_run_and_answers_all_the_while(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    for name in ("monday", "tuesday"):
+        shutil.copytree(trained.folder, tmp_path / name)
+    assert main(["promote", str(tmp_path / "monday")]) == 0
+    with served(tmp_path) as (_, address):
+        assert httpx.get(f"{address}/health").json()["name"] == "monday"
+        assert main(["promote", str(tmp_path / "tuesday"), "--force"]) == 0
+        deadline = time.monotonic() + 60
+        while httpx.get(f"{address}/health").json()["name"] != "tuesday":
+            answer = httpx.post(f"{address}/recommendations", json={"user_id": 1, "k": 2})
+            assert answer.status_code == 200
+            assert time.monotonic() < deadline
+        metrics = httpx.get(f"{address}/metrics").text
+        assert 'ucfrec_drift{measure="unknown_users"}' in metrics
+
+
+def test_two_runs_share_the_users(trained: TrainedPolicy, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(trained.folder, tmp_path / name)
+    options = ("--split", "a=0.5,b=0.5", "--exposures", str(tmp_path / "shown"))
+    with served(tmp_path, *options) as (process, address):
+        arms = {
+            str(user): httpx.post(f"{address}/recommendations", json={"user_id": user}).json()[
+                "arm"
+            ]
+            for user in range(20)
+        }
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    assert {*arms.values()} == {"a", "b"}
+    shown = pd.concat(map(pd.read_parquet, (tmp_path / "shown").iterdir()))
+    assert dict(zip(shown.user_id, shown.arm, strict=True)) == arms
 
 
 def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> None:

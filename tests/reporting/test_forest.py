@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.random_runs import random_run
 from tests.support.report_page import Page, estimate
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.forest import forest, quoted
@@ -82,13 +83,4 @@ def test_rows_of_ope_are_drawn_in_the_report(folder: Path, tmp_path: Path) -> No
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on random sessions."""
-    from tests.recommending.test_recommend import SETTINGS, random_log
-    from ucfrec import UCF, EpisodeStore
-    from ucfrec.logs import LogMapping, PrepareOptions, prepare
-
-    folder = tmp_path_factory.mktemp("forest")
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    UCF(settings=SETTINGS).fit(EpisodeStore.open(folder / "store"), folder / "ucf")
-    return folder
+    return random_run(tmp_path_factory.mktemp("forest"), "dt", name="ucf").parent

@@ -9,16 +9,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.recommending.test_recommend import SMALL, random_log
+from tests.recommending.test_recommend import SMALL
+from tests.support.random_runs import random_run
 from tests.support.records import DAMAGE, damaged, paths
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
-from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord, read_record
-from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 OPTIONAL = {"reference_losses", "augmentation", "policy", "reward_model", "rule"}
@@ -33,12 +31,8 @@ anything = st.recursive(
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log and a run on it, without checksums of its files."""
-    folder = tmp_path_factory.mktemp("records")
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    config = resolve_config("ucf", None, [*SMALL, "augment.copies=1", "crm.epochs=1"])
-    train_run(EpisodeStore.open(folder / "store"), folder / "run", config)
+    settings = [*SMALL, "augment.copies=1", "crm.epochs=1"]
+    folder = random_run(tmp_path_factory.mktemp("records"), "ucf", settings).parent
     write_json(folder / "run" / "run.json", record_of(folder) | {"files": {}})
     return folder
 

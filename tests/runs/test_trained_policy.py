@@ -8,31 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from tests.recommending.test_recommend import SMALL, random_log
+from tests.recommending.test_recommend import random_log
+from tests.support.random_runs import random_run
 from ucfrec.commands.cli import main
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.checkpoint import load_module, load_tensors, save_tensors
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.policies.registry import BUILT_IN, policy_class
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on a log of items, without the checksums of its files, as a stranger can make it."""
-    folder = tmp_path_factory.mktemp("trained")
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    config = resolve_config("dt", None, SMALL)
-    train_run(EpisodeStore.open(folder / "store"), folder / "run", config)
-    record = read_json(folder / "run" / "run.json")
-    write_json(folder / "run" / "run.json", record | {"files": {}})
-    return folder / "run"
+    run = random_run(tmp_path_factory.mktemp("trained"), "dt")
+    write_json(run / "run.json", read_json(run / "run.json") | {"files": {}})
+    return run
 
 
 @pytest.fixture

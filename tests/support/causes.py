@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
+from ucfrec.arrays import Float64Array
 from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.episodes.states import ItemStates
@@ -18,6 +19,21 @@ QUICK = ScreeningConfig(
     measurement=MeasurementConfig(trees=25),
 )
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
+
+
+def written(
+    out: Path, states: Float64Array, actions: Float64Array, rewards: Float64Array
+) -> EpisodeStore:
+    """The store of states (E, T, S), actions (E, T, 1) and rewards (E, T)."""
+    trajectories, length = rewards.shape
+    columns = {
+        schema.OBSERVATION: states.reshape(-1, states.shape[2]).astype(np.float32),
+        schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
+        schema.REWARD: rewards.reshape(-1).astype(np.float32),
+    }
+    # As control stores are split: every twentieth is for validation.
+    split = {schema.SPLIT: (np.arange(trajectories) % 20 == 10).astype(np.int8)}
+    return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
 
 
 def planted_vectors(
@@ -38,14 +54,7 @@ def planted_vectors(
             states[:, t + 1, 1] += jolt * (rng.random(trajectories) < 0.003)
     rewards = states[:, :, 1] + np.abs(states[:, :, 2]) + 0.3 * actions[:, :, 0]
     states[:, :, 3] = rewards > np.median(rewards)
-    columns = {
-        schema.OBSERVATION: states.reshape(-1, 5).astype(np.float32),
-        schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
-        schema.REWARD: rewards.reshape(-1).astype(np.float32),
-    }
-    # As control stores are split: every twentieth is for validation.
-    split = {schema.SPLIT: (np.arange(trajectories) % 20 == 10).astype(np.int8)}
-    return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
+    return written(out, states, actions, rewards)
 
 
 def planted_category(
@@ -67,13 +76,7 @@ def planted_category(
     rewards = states[:, :, 0] + moves * category[:, None] + 0.8 * actions[:, :, 0]
     rewards += noise * np.random.default_rng(1).normal(size=shape)
     states[:, :, 6] = rewards > np.median(rewards)
-    columns = {
-        schema.OBSERVATION: states.reshape(-1, 8).astype(np.float32),
-        schema.ACTION: actions.reshape(-1, 1).astype(np.float32),
-        schema.REWARD: rewards.reshape(-1).astype(np.float32),
-    }
-    split = {schema.SPLIT: (np.arange(trajectories) % 20 == 10).astype(np.int8)}
-    return EpisodeStore.write(out, columns, np.full(trajectories, length), split, source=SOURCE)
+    return written(out, states, actions, rewards)
 
 
 COLUMNS = ("bit", "seen by the policy", "not seen", "user", "early bit")

@@ -1,8 +1,11 @@
 """A small run with everything that a decision rule can use, and requests of its users."""
 
 import json
+import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,9 +36,18 @@ FULL = DecisionRule(None, minimum_target=0.1, reward_weight=0.7, exclude_seen=Tr
 
 
 def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:
-    """A run at `folder / "run"` on `tagged_log`, which has tags, users with features and a gap."""
-    Recommender(policy, settings=SETTINGS).fit(tagged_store(folder), folder / "run")
+    """A run at `folder / "run"` on `tagged_log`, which has tags, users with features and a gap: a
+    copy of one that is trained once for all files of tests."""
+    shutil.copytree(_trained_run(policy).name, folder, dirs_exist_ok=True)
     return TrainedPolicy.load(folder / "run")
+
+
+@cache
+def _trained_run(policy: str) -> "TemporaryDirectory[str]":
+    made = TemporaryDirectory()
+    folder = Path(made.name)
+    Recommender(policy, settings=SETTINGS).fit(tagged_store(folder), folder / "run")
+    return made
 
 
 def learn_tastes(trained: TrainedPolicy) -> None:

@@ -133,7 +133,6 @@ class DecisionRule:
         """Target returns at the next step, (B,) float64, in reward units.
 
         Args:
-            returns: what returns-to-go count.
             collected: (B,) rewards earlier in the session.
             best: (B,) the largest returns that the policy expects; needed without a target.
         """
@@ -158,7 +157,6 @@ class DecisionRule:
 
         Args:
             scores: (B, n_items) of `Scorer.scores`.
-            generator: of the draws.
         """
         if not self.draws:
             return scores.argmax(-1), torch.ones(len(scores))
@@ -175,7 +173,6 @@ class DecisionRule:
 
         Args:
             scores: (B, n_items) of `Scorer.scores`; k at most n_items.
-            k: number of items.
             uniforms: (B, n_items + 1) draws from [0, 1), needed if the rule `draws`; the last
                 decides whether a request explores.
         """

@@ -36,7 +36,6 @@ class ItemIndex:
         """
         Args:
             scorer: of a policy of items; its weights must not change afterwards.
-            kind: of the policy, for messages.
             seed: of the lists and of the sessions on which the recall is measured.
 
         Raises:

@@ -198,7 +198,6 @@ class ItemProduct:
         """(B, n_items), up to a constant per row.
 
         Args:
-            factors: of the sessions.
             outputs: (B, n_items) of a policy that scores items in a way of its own.
             policy: whether the factors have the policy's part.
             rewards: whether they have the reward model's.

@@ -40,7 +40,6 @@ class PolicyActor:
     ) -> None:
         """
         Args:
-            scorer: the policy under its decision rule.
             episodes: N, number of episodes simulated in parallel.
             observation_size: leading entries of the environment's observation that the logs
                 contain, less those in `dropped`; 0 ignores the observation.

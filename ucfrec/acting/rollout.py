@@ -104,14 +104,8 @@ def rollout(
 
     Args:
         env: N environments, reset within the step (`AutoresetMode.SAME_STEP`).
-        actor: chooses the actions.
-        episodes: number of episodes.
         seed: environment i is seeded with `seed` + i.
         on_step: called after each step with the rows that belong to one of the `episodes`.
-        describe: name of the progress bar.
-
-    Returns:
-        Return and length of each episode.
 
     Raises:
         InputError: the environment does not reset within the step, or forbids actions (`FORBIDDEN`)

@@ -75,7 +75,6 @@ class Scorer:
         """
         Args:
             policy: in evaluation mode; its weights must not change after the first scores.
-            rule: how it decides.
             states: of the run's items; None if actions are vectors.
             returns: what the returns-to-go of the training counted; None for whole sessions.
             reward_model: f̂_r; needed for a reward weight.
@@ -287,7 +286,6 @@ class Scorer:
 
         Args:
             sessions: as for `scores`.
-            factors: of the sessions.
             items: (B, C) int64.
             products: (B, C) of `multipliers` of the factors and the items' `vectors`.
         """
@@ -380,7 +378,6 @@ def logged_history(
     """What was known before logged steps, and what the rule excludes because it was shown.
 
     Args:
-        scorer: the policy under its rule.
         store: the logs, with the training's items.
         episodes: (B,) sessions.
         steps: (B,) steps of those sessions, from 0.

@@ -41,7 +41,6 @@ class History:
             episodes: (B,) sessions.
             steps: (B,) steps of those sessions, from 0.
             context: K, most steps of a window.
-            reach: items shown before that are read.
         """
         context = min(context, int(steps.max(initial=0)) + 1)
         windows = store.windows(episodes, steps, context)

@@ -91,9 +91,6 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
 
     Plots are written to `out/budget/plots` if matplotlib is installed.
 
-    Returns:
-        The tables as Markdown.
-
     Raises:
         InputError: the budget, a task or a method is unknown, another table than main is requested
             of a single environment, or cells failed.

@@ -72,7 +72,6 @@ class RuleSearch:
         """Roll out each of the rules, side by side, all with the same draws.
 
         Args:
-            rules: to roll out.
             times: how many times the sessions of the configuration.
         """
         if not rules:

@@ -36,7 +36,6 @@ def roll_out(
         simulator: of C · n sessions that have just begun; those from c · n on follow rule c.
         scorers: C; none excludes seen items.
         sessions: n, number of sessions of each rule.
-        states: builds states from items.
         observation_size: of the simulator's observations.
         seed: of the draws of each rule.
 

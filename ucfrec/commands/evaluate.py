@@ -4,7 +4,6 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from ucfrec.commands.cards import card_of_evaluation
 from ucfrec.commands.options import environment_given, environment_options, rule_given, rule_options
 from ucfrec.errors import InputError
 
@@ -37,6 +36,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
     from ucfrec.provenance import without_folders
+    from ucfrec.reporting.cards import card_of_evaluation
     from ucfrec.reporting.tables import evaluation_table
     from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy

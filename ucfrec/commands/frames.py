@@ -11,11 +11,7 @@ from ucfrec.files.atomic import atomic_file
 
 
 def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
-    """Write `frames` one after the other as a single Parquet file, atomically.
-
-    Returns:
-        Number of rows written.
-    """
+    """Write `frames` one after the other as a single Parquet file, atomically."""
     rows, writer = 0, None
     with atomic_file(out) as scratch:
         for frame in frames:

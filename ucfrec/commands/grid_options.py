@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
-    """Add --out, --results, --workers, --again and --show-only.
-
-    Args:
-        out: default of --out.
-        workers: default of --workers.
-    """
+    """Add --out, --results, --workers, --again and --show-only."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -129,7 +124,6 @@ def rows_given(
     """The rows that `--show-only` prints: the last of each measurement.
 
     Args:
-        suite: benchmark suite of the rows.
         tables: tables of the suite; empty for all.
 
     Raises:
@@ -157,10 +151,8 @@ def rows_of(
 
     Args:
         options: of `grid_options`.
-        suite: suite of the rows.
         tables: tables of the suite; empty for all.
         cells: lists what to measure; writes the stores that it needs.
-        how: how cells are measured.
         costs: for the announcement of how long it takes; None for none.
         describe: name of the benchmark in progress output; "" for `suite`.
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.cards import card_of_estimates
 from ucfrec.commands.options import (
     log_options,
     logs_given,
@@ -185,6 +184,7 @@ class _Candidate:
 def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
+    from ucfrec.reporting.cards import card_of_estimates
     from ucfrec.reporting.tables import format_rows
 
     run = candidate.run

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
@@ -241,11 +240,7 @@ def item_options(parser: argparse.ArgumentParser) -> None:
 
 
 def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
-    """Add --seed and --exposures, of a rule that draws items.
-
-    Args:
-        place: FILE or DIR.
-    """
+    """Add --seed and --exposures, of a rule that draws items."""
     parser.add_argument(
         "--seed",
         type=int,
@@ -374,7 +369,6 @@ def logs_given(
     """Log files and column mapping that `log_options` name.
 
     Args:
-        options: with the logs.
         trained: policy that the logs are for, which remembers the dataset of its training logs.
 
     Raises:
@@ -394,29 +388,11 @@ def logs_given(
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
     if trained is not None and options.dataset is None:
-        return _logs_like(trained, options.logs, given)
+        from ucfrec.runs.later_logs import later_logs
+
+        return later_logs(trained, options.logs, given)
     dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
     return dataset.resolve(options.logs, given)
-
-
-def _logs_like(
-    trained: "TrainedPolicy", paths: list[str], given: "LogMapping"
-) -> "tuple[tuple[Path, ...], LogMapping]":
-    """Logs of the dataset that a policy was trained on, whose columns may have plain names too."""
-    from ucfrec.logs.mapping import LogMapping
-    from ucfrec.plugins import load_plugin, plugin_names
-
-    source = trained.record.data
-    # A record may also name a dataset that is not read by an adapter.
-    known = source.dataset in plugin_names("datasets")
-    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
-    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
-    try:
-        files, found = dataset.resolve(paths, given)
-    except InputError:
-        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
-    return files, replace(given, remembered=LogMapping(columns))
 
 
 def environment_given(options: argparse.Namespace) -> "Environment":

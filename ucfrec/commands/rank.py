@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.commands.cards import card_of_ranking
 from ucfrec.commands.options import (
     keep_seen_option,
     log_options,
@@ -65,6 +64,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
+    from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import RUN, TrainedPolicy

@@ -20,12 +20,25 @@ from ucfrec.processes import Interrupted
 if TYPE_CHECKING:
     from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.responder import Responder
+    from ucfrec.recommending.served import Served
     from ucfrec.recommending.web import ServerLimits
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec serve`."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
+    parser.add_argument(
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec "
+        "promote` made current answers, and is followed",
+    )
+    parser.add_argument(
+        "--split",
+        metavar="A=SHARE,B=SHARE",
+        help="answer with several runs of the folder RUN, each for its share of the users, e.g. "
+        "run1=0.9,run2=0.1; the exposures have the arm (default: one run answers all)",
+    )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
@@ -78,7 +91,8 @@ def run(options: argparse.Namespace) -> None:
         ) from None
     import torch
 
-    from ucfrec.runs.record import verified
+    from ucfrec.recommending.served import Served, parse_split
+    from ucfrec.runs.record import RUN, verified
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     if options.threads is not None:
@@ -88,16 +102,27 @@ def run(options: argparse.Namespace) -> None:
     of_server = ServerLimits(
         batch=options.max_batch, queue=options.max_queue, timeout=options.timeout
     )
-    verified(options.run)
-    trained = TrainedPolicy.load(options.run, options.checkpoint)
-    responder = responder_given(options, trained)
-    with exposures_given(options, trained) as exposures:
-        _serve(options, responder, of_server, exposures)
+
+    def make(run: Path) -> "Responder":
+        verified(run)
+        return responder_given(options, TrainedPolicy.load(run, options.checkpoint))
+
+    shares = None if options.split is None else parse_split(options.split)
+    folder = options.run.resolve()
+    if shares is None and (folder / RUN).is_file():
+        folder, shares = folder.parent, {folder.name: 1.0}
+    with (
+        Served(make, folder, shares) as served,
+        exposures_given(options, served.trained) as exposures,
+    ):
+        if shares is None:
+            served.follow()
+        _serve(options, served, of_server, exposures)
 
 
 def _serve(
     options: argparse.Namespace,
-    responder: "Responder",
+    served: "Served",
     of_server: "ServerLimits",
     exposures: "ExposureLog | None",
 ) -> None:
@@ -109,7 +134,7 @@ def _serve(
     # h11 takes one request of a connection after the other and bounds what it keeps of a head;
     # httptools does neither.
     config = uvicorn.Config(
-        application(responder, of_server, _allowed_hosts(options), exposures),
+        application(served, of_server, _allowed_hosts(options), exposures),
         http="h11",
         h11_max_incomplete_event_size=2**16,
         ws="none",
@@ -120,7 +145,7 @@ def _serve(
     )
     with listening_socket(options.host, options.port) as listening:
         try:
-            Server(config, f"ucfrec serve: {responder.trained!r}").run([listening])
+            Server(config, f"ucfrec serve: {served.trained!r}").run([listening])
         except Interrupted:
             # What was asked of a server that is stopped is done.
             print("ucfrec serve: stopped", file=sys.stderr)

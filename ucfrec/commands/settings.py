@@ -37,10 +37,6 @@ def run(options: argparse.Namespace) -> None:
 def settings_text(policy: str, width: int) -> str:
     """Every setting of a training of `policy`, one section per table.
 
-    Args:
-        policy: name of the policy.
-        width: terminal columns of a line.
-
     Raises:
         InputError: no policy has this name.
     """

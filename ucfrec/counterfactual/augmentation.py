@@ -27,7 +27,9 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
-MODELS: Final = ("item-reward", "crm", "csg")
+CRM: Final = "crm"
+"""Folder of the reward model."""
+MODELS: Final = ("item-reward", CRM, "csg")
 """Folders of the checkpoints of `counterfactual_augmentation`; which of them there are depends on
 the settings."""
 _CPU: Final = torch.device("cpu")
@@ -80,7 +82,7 @@ def counterfactual_augmentation(
     sampled = sample_steps(train, limit, seed)
     training = read(train, *sampled)
     held_out = sample_transitions(validation, limit // 10, seed, read)
-    crm, crm_report = fit_crm(training, held_out, crm_config, folder / "crm", seed, mean, device)
+    crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
         csg_config = replace(csg_config, kind="noise")

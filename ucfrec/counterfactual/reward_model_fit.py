@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -21,9 +21,12 @@ from ucfrec.counterfactual.reward_model import (
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
+from ucfrec.fitting.checkpoint import load_trained, load_weights
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.fitting.random_state import random_state_kept
 
+INITIAL: Final = "initial.safetensors"
+"""Weights of an older reward model, in the folder of the new one."""
 _ACTIVE_NATS = 0.01
 _LEAK = 0.1
 _PREDICTS_NOTHING = 0.02
@@ -87,7 +90,8 @@ def fit_crm(
 
     Args:
         validation: held-out transitions, never trained on.
-        folder: of the checkpoints, which training resumes from.
+        folder: of the checkpoints, which training resumes from; with the file `INITIAL` in it, of
+            weights and scales that training begins with.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
 
@@ -104,6 +108,8 @@ def fit_crm(
     model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
     model = model.to(device)
     _set_statistics(model, train, held_out)
+    if mean is None and (folder / INITIAL).exists():
+        load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
     if config.mean_first:

@@ -26,11 +26,9 @@ def load_column(
     """A column of one shard.
 
     Args:
-        store: folder of the store.
         file: of the column, named `SHARD/COLUMN.npy`.
         shape: of each row.
         mmap: whether the file stays mapped instead of being read.
-        sealed: checksums of the store.
 
     Raises:
         InputError: the file is missing or damaged, or holds something else.

@@ -36,8 +36,6 @@ class Columns:
     ) -> None:
         """
         Args:
-            path: folder of the store.
-            record: of the store.
             arrays: columns in memory, by name, used instead of the files of the folder.
             item_states: used instead of the file of the folder.
             return_to_go: what the returns-to-go count; None for the rest of the session.
@@ -108,7 +106,6 @@ class Columns:
         """A copy in which step column `name` is `values`, (N,) or (N, size); files stay as is.
 
         Args:
-            name: of the column.
             values: of all steps.
             return_to_go: what the returns-to-go count; None for what they counted before.
         """
@@ -235,7 +232,6 @@ class Columns:
         """Values of step column `name` at the step indices `index`.
 
         Args:
-            name: of the column.
             index: indices among the N steps of the store, of any shape.
 
         Returns:

@@ -29,7 +29,6 @@ def reward_bit(
     Args:
         store: a store or a view of it.
         flip: probability that a bit is inverted, in [0, 1].
-        seed: of the inversions.
         early: shift the bit one step ahead, d_t = I{r_{t+1} is high}; the last step of an episode,
             which has no next reward, uses its own reward.
 
@@ -66,12 +65,8 @@ def with_observations(
 
     Args:
         store: a whole store in a folder, not a view of some episodes.
-        out: folder of the new store.
         observations: (n_steps, O) in the order of `all_steps`.
         source: added to `source` in `meta.json`, the record of what the store was made from.
-
-    Returns:
-        The new store, opened.
 
     Raises:
         InputError: `out` exists already.

@@ -36,7 +36,6 @@ class UserRows:
         """Collect the rows.
 
         Args:
-            later: a log of items.
             users: (E,) identifier of the user of each of its episodes.
             earlier: a store with the same numbers of users and items; rows that are not before the
                 user's first later row are left out. None for none.
@@ -124,7 +123,6 @@ def _earlier_rows(
     """Owner, time (ms) and source of the earlier rows of users, in the order of the store.
 
     Args:
-        earlier: the store.
         known: (E,) its number of the user of each later episode; −1 for others.
         owners: (E,) that user's number among the later ones.
         begins: (U,) time at which the user's later rows begin.
@@ -179,7 +177,6 @@ class _ContinuedColumns(Columns):
     def __init__(self, rows: UserRows, begin: IntArray, counts: IntArray) -> None:
         """
         Args:
-            rows: of the users.
             begin: (E,) row of the first step of each later episode.
             counts: (E,) rows before it that belong to the session.
         """

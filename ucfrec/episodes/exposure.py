@@ -188,7 +188,6 @@ class Likeness(nn.Module):
         """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`.
 
         Args:
-            values: one column an item.
             profile: see `profile`.
             items: (L,) int64; None for all items.
         """
@@ -304,7 +303,6 @@ class ExposureTerm(nn.Module):
         """Logits (M, L) of `items` with the term; the given ones are overwritten.
 
         Args:
-            logits: one column an item.
             exposed: what was shown before the M steps.
             items: (L,) int64, ascending, each once; None for all items.
         """

@@ -37,7 +37,6 @@ def write_item_table(
     """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically.
 
     Args:
-        path: of the file.
         embeddings: (n_items, D).
         user_features: (n_users, F).
         reward_low: see `ItemStates`.

@@ -192,7 +192,6 @@ class SessionStates:
     def __init__(self, states: ItemStates, sessions: int, memory: int = 0) -> None:
         """
         Args:
-            states: builds the states.
             sessions: N.
             memory: items of a session that `shown` names at least.
         """

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,6 +20,10 @@ from ucfrec.episodes.view import EpisodeView
 from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
 
 __all__ = ["ITEM_STATES", "EpisodeStore"]
 
@@ -56,7 +61,6 @@ class EpisodeStore(EpisodeView):
         """Write a store from arrays in memory, atomically.
 
         Args:
-            path: folder of the store.
             steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
             lengths: (E,) number of steps of each episode, at least 1, with sum N.
             episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
@@ -64,9 +68,6 @@ class EpisodeStore(EpisodeView):
             reward: the expression that computed the rewards, for the record.
             source: what the store was made from, for the record.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
-
-        Returns:
-            The store, opened.
 
         Raises:
             InputError: `path` exists already, an episode has no steps, columns differ in length, or
@@ -101,6 +102,42 @@ class EpisodeStore(EpisodeView):
         require_finite(steps[schema.REWARD])
         values = _with_split(episodes, lengths)
         return cls(Columns.from_arrays(steps, lengths, values, item_states))
+
+    # For notebooks.
+
+    def to_frame(self) -> "pd.DataFrame":
+        """One row per step, with the identifiers of the logs; see `ucfrec.episodes.frame`."""
+        from ucfrec.episodes.frame import store_frame
+
+        return store_frame(self)
+
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """Histogram of the episodes' returns on matplotlib axes; needs ucfrec[plots].
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        try:
+            from matplotlib import pyplot
+        except ModuleNotFoundError:
+            raise InputError("a plot needs matplotlib; install ucfrec[plots]") from None
+        axes = pyplot.subplots()[1] if ax is None else ax
+        axes.hist(self.returns, bins=30)
+        axes.set_xlabel(f"return of an episode (sum of {self.record.reward})")
+        axes.set_ylabel("episodes")
+        return axes
+
+    def _repr_html_(self) -> str:
+        heads = ("", "episodes", "steps", "mean return")
+        views = {name: self.split(name) for name in schema.SPLITS if self.overlay is None}
+        lines = [
+            (name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}")
+            for name, view in {"all": self, **views}.items()
+            if len(view)
+        ]
+        head = "".join(f"<th>{text}</th>" for text in heads)
+        body = "".join(f"<tr><td>{'</td><td>'.join(line)}</td></tr>" for line in lines)
+        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{body}</table>"
 
     # Views.
 

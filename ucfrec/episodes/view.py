@@ -33,9 +33,7 @@ class EpisodeView:
     ) -> None:
         """
         Args:
-            columns: of the store.
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
-            overlay: augmented episodes and action copies.
         """
         self._columns, self._selected = columns, episode_ids
         self.overlay = overlay
@@ -177,7 +175,6 @@ class EpisodeView:
         count this reward. All else is the source's.
 
         Args:
-            name: of the column.
             episodes: positions in the view, of any shape.
             steps: steps of those episodes, from 0, of a shape that broadcasts with `episodes`.
 
@@ -199,7 +196,6 @@ class EpisodeView:
         """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
 
         Args:
-            name: of the column.
             values: at the steps of the sources, changed in place.
             copies: numbers of action copies; below 0 for other episodes.
             steps: steps of them, of the same shape.

@@ -31,10 +31,9 @@ class StoreWriter:
         writer.finish(reward="is_click", source={})
     """
 
-    def __init__(self, folder: Path, shard_steps: int = 2**24) -> None:
+    def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
         """
         Args:
-            folder: to write to.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
         """
         self._folder = folder
@@ -45,7 +44,8 @@ class StoreWriter:
         self._offsets: list[IntArray] = []
         self._episode_values: dict[str, list[Array]] = {}
         self._split_counts = np.zeros((len(schema.SPLITS), 2), dtype=np.int64)
-        self._shards = self._steps_in_shard = self._n_steps = self._n_episodes = 0
+        self._steps_in_shard = self._n_steps = self._n_episodes = 0
+        self._shards = first_shard
 
     def append(
         self,
@@ -153,9 +153,6 @@ class StoreWriter:
             ids: original identifiers (of items, of users) in the order in which the columns number
                 them, by name; they enter the fingerprint.
 
-        Returns:
-            The record of the store.
-
         Raises:
             InputError: no step was appended.
         """
@@ -209,7 +206,6 @@ def require_steps(path: Path | str, lengths: Array) -> IntArray:
     """Check that every episode has at least one step.
 
     Args:
-        path: of the store, for the message.
         lengths: (E,) number of steps of each episode.
 
     Returns:

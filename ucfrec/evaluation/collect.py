@@ -68,7 +68,6 @@ def collect(
     1 s apart. Memory is bounded, because rows are written one row group at a time.
 
     Args:
-        simulator: names the feedback column.
         env: an environment made by `simulator`.
         actor: a behavior policy for `env`.
         sessions: number of sessions, at least 1.

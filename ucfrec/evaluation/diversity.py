@@ -48,7 +48,6 @@ def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> fl
     Args:
         episodes: (M,) sorted episode indices, M at least 1.
         items: (M,) the items of these steps.
-        similarity: of two items.
     """
     _, starts, lengths = np.unique(episodes, return_index=True, return_counts=True)
     # Pairs of all episodes are enumerated at once: each step with all later ones of its episode.

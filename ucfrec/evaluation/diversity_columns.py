@@ -41,9 +41,7 @@ def variety_columns(
     `counts` and `numbers`, which built-in policies do not have.
 
     Args:
-        env: an environment of items.
         recommended: the items of all steps.
-        counts: item counts of the training log.
         numbers: (items of the log,) the environment's index of each item, −1 for items that it
             lacks.
     """

@@ -18,7 +18,7 @@ from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended
 from ucfrec.evaluation.diversity_columns import variety_columns
 from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.metrics import session_metrics
+from ucfrec.evaluation.session_metrics import session_metrics
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
@@ -37,9 +37,6 @@ def evaluate_behavior(
     """Result row of an environment's built-in policy (`random`, `optimal`, …).
 
     Args:
-        environment: the simulated environment.
-        behavior: name of the policy.
-        episodes: number of episodes.
         seed: seed of the environments and of the policy.
 
     Raises:
@@ -67,10 +64,7 @@ def evaluate_policy(
     """Result row of a trained policy.
 
     Args:
-        environment: the simulated environment.
-        trained: the policy.
         name: name of the policy in the row.
-        episodes: number of episodes.
         seed: environment i is seeded with `seed` + i; also of the draws of the rule.
         rule: the decision rule; None for the run's own.
 

@@ -29,11 +29,6 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
     the columns that are true. A Parquet file has a column `item_id` with the numbers of the
     actions, and its other columns are kept.
 
-    Args:
-        source: file or attribute.
-        env: the environment whose attribute is read.
-        n_items: number of its actions.
-
     Returns:
         One row per action in their order, with the column `item_id`: 0, 1, ….
 

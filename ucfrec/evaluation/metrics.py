@@ -1,81 +1,185 @@
-"""Metrics of simulated episodes (R_cum, two versions of R_avg, length) and bootstrap intervals."""
+"""Metrics of recommendations, as functions on data frames.
 
-from dataclasses import dataclass
+`recommended` has one row per item and user: `user_id`, `item_id` and `rank` (from 1), as
+`Recommender.recommend` returns it. `relevant` has the pairs `user_id`, `item_id` of what users
+liked later; a pair counts once. The definitions are those of RecTools where it has the metric, so
+that numbers can be compared. Means are over the users of `relevant` (a user without recommendations
+counts 0), or over those of `recommended` where nothing relevant is asked for.
+"""
+
+from collections.abc import Collection
+from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
-from ucfrec.acting.rollout import Episodes
-from ucfrec.arrays import Float64Array
+from ucfrec.episodes.group_auc import group_auc
+from ucfrec.errors import InputError
+from ucfrec.schema import ITEM_ID, USER_ID
 
-_RESAMPLES = 2000
-
-
-@dataclass(frozen=True)
-class SessionMetrics:
-    """Metrics of a set of episodes; rewards and returns in reward units."""
-
-    R_cum: float
-    """Mean episode return (called R_tra in some papers)."""
-    R_cum_low: float
-    """Lower end of the 95% percentile bootstrap interval of R_cum, over episodes."""
-    R_cum_high: float
-    """Upper end of the same interval."""
-    R_avg_pooled: float
-    """Sum of all rewards divided by the number of all steps (called R_each in some papers)."""
-    R_avg_episode: float
-    """Mean over episodes of the episode's mean reward per step."""
-    length: float
-    """Mean number of steps per episode."""
-    episodes: int
-    """Number of episodes."""
+_RANK: Final = "rank"
+_PAIR: Final = [USER_ID, ITEM_ID]
 
 
-def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
-    """Metrics of the simulated episodes; `seed` seeds the bootstrap."""
-    low, high = bootstrap_interval(played.returns, seed)
-    return SessionMetrics(
-        R_cum=float(played.returns.mean()),
-        R_cum_low=low,
-        R_cum_high=high,
-        R_avg_pooled=float(played.returns.sum() / played.lengths.sum()),
-        R_avg_episode=float((played.returns / played.lengths).mean()),
-        length=float(played.lengths.mean()),
-        episodes=len(played.returns),
-    )
+def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
+    """Share of users with a relevant item among the `k` best.
+
+    Raises:
+        InputError: a column is missing, there are no rows, or `k` is below 1; as all of these.
+    """
+    return float(_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].any().mean())
 
 
-def bootstrap_interval(values: Float64Array, seed: int, level: float = 0.95) -> tuple[float, float]:
-    """Percentile bootstrap interval (low, high) of the mean of `values` (N,), 2,000 resamples."""
-    ((low, high),) = ratio_intervals(values[:, None], np.ones((len(values), 1)), seed, level)
-    return float(low), float(high)
+def precision(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
+    """Share of `k` places that hold a relevant item, mean over users."""
+    return float((_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].count() / k).mean())
 
 
-def ratio_intervals(
-    above: Float64Array, below: Float64Array, seed: int, level: float = 0.95
-) -> Float64Array:
-    """Percentile bootstrap intervals (C, 2) of the column ratios Σ above / Σ below.
+def recall(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
+    """Share of a user's relevant items that are among the `k` best, mean over users."""
+    owner = _hits(recommended, relevant, k).groupby(USER_ID)
+    return float((owner[_RANK].count() / owner.size()).mean())
 
-    Rows are resampled; resamples whose denominator is 0 are excluded.
+
+def mrr(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
+    """Mean over users of 1 / rank of the first relevant item; 0 if none is among the `k` best."""
+    first = _hits(recommended, relevant, k).groupby(USER_ID)[_RANK].min()
+    return float((1 / first).fillna(0.0).mean())
+
+
+def mean_average_precision(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
+    """MAP: the precision at the rank of each relevant item among the `k` best, summed, divided by
+    the number of the user's relevant items; mean over users."""
+    hits = _hits(recommended, relevant, k).sort_values([USER_ID, _RANK])
+    owner = hits.groupby(USER_ID)
+    precisions = (owner.cumcount() + 1) / hits[_RANK]
+    return float((precisions.groupby(hits[USER_ID]).sum() / owner.size()).mean())
+
+
+def ndcg(
+    recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10, achievable: bool = False
+) -> float:
+    """Σ 1 / log2(1 + rank) over a user's relevant items among the `k` best, divided by the ideal;
+    mean over users.
 
     Args:
-        above: (N, C) numerators.
-        below: (N, C) denominators, at least 0.
-        seed: of the resamples.
-        level: coverage of the interval.
+        achievable: the ideal is `k` relevant items (RecTools' default), or with true as many as the
+            user has (RecTools' `divide_by_achievable`, and scikit-learn's `ndcg_score`).
     """
-    ratios = resampled_ratios(above, below, seed)
-    return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
+    hits = _hits(recommended, relevant, k)
+    owner = hits.groupby(USER_ID)
+    gains = (1 / np.log2(1 + hits[_RANK])).groupby(hits[USER_ID]).sum()
+    ideal = np.cumsum(1 / np.log2(np.arange(2, k + 2)))
+    places = owner.size().clip(upper=k).to_numpy() if achievable else np.full(len(gains), k)
+    return float((gains / ideal[places - 1]).mean())
 
 
-def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
-    """Ratios Σ above / Σ below (2000, C) of rows (N, C) drawn with replacement.
+def gauc(scored: pd.DataFrame) -> float:
+    """Probability that a liked item scores higher than another one shown to the same user, mean
+    over users weighted by rows; users with liked items only, or with none, do not count.
 
-    Ratios whose denominator is 0 are NaN.
+    Args:
+        scored: `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
     """
-    generator = np.random.default_rng(seed)
-    # Multinomial counts of the rows replace copies of them, which limits memory to O(N).
-    share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])
-    sums = np.array([generator.multinomial(len(both), share) @ both for _ in range(_RESAMPLES)])
-    numerators, denominators = np.hsplit(sums, 2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(denominators > 0, numerators / denominators, np.nan)
+    _require(scored, "scored", USER_ID, "score", "liked")
+    users, owner = np.unique(scored[USER_ID].to_numpy(), return_inverse=True)
+    scores, liked = scored["score"].to_numpy(np.float64), scored["liked"].to_numpy(bool)
+    above, below = group_auc(scores, liked, owner, len(users))
+    return float(above.sum() / below.sum()) if below.any() else float("nan")
+
+
+def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10) -> float:
+    """Share of the catalogue's items that are among the `k` best of a user."""
+    return float(_top(recommended, k)[ITEM_ID].nunique() / len(catalogue))
+
+
+def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> float:
+    """Mean inverse user frequency of the `k` best, in bits: −log2 of the share of the history's
+    users who have the item, mean over a user's items and then over users.
+
+    Args:
+        history: pairs `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
+    """
+    top = _top(recommended, k)
+    _require(history, "history", *_PAIR)
+    users = history.groupby(ITEM_ID)[USER_ID].nunique()
+    share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
+    bits = pd.Series(-np.log2(share.to_numpy(np.float64)), top.index)
+    return float(bits.groupby(top[USER_ID]).mean().mean())
+
+
+def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) -> float:
+    """Number of features in which two of a user's `k` best items differ (Hamming distance), mean
+    over pairs and then over users; a user with one item counts 0.
+
+    Args:
+        features: one row per item, `item_id` as the index.
+
+    Raises:
+        InputError: an item has no features.
+    """
+    top = _top(recommended, k)
+    places = features.index.get_indexer(pd.Index(top[ITEM_ID]))
+    if (places < 0).any():
+        lacking = top[ITEM_ID][places < 0]
+        raise InputError(
+            f"features: {lacking.nunique():,} recommended items have no row, such as "
+            f"{lacking.iloc[0]}; add them, item_id being the index"
+        )
+    numbered = pd.DataFrame({USER_ID: top[USER_ID], _RANK: top[_RANK], "place": places})
+    pairs = numbered.merge(numbered, on=USER_ID)
+    pairs = pairs[pairs[f"{_RANK}_x"] < pairs[f"{_RANK}_y"]]
+    values = np.stack([pd.factorize(features[name])[0] for name in features], axis=1)
+    differ = (values[pairs["place_x"]] != values[pairs["place_y"]]).sum(axis=1)
+    of_users = pd.Series(differ, pairs[USER_ID].to_numpy()).groupby(level=0).mean()
+    return float(of_users.reindex(top[USER_ID].unique(), fill_value=0.0).mean())
+
+
+def serendipity(
+    recommended: pd.DataFrame,
+    relevant: pd.DataFrame,
+    history: pd.DataFrame,
+    catalogue: Collection[Any],
+    k: int = 10,
+) -> float:
+    """How much earlier relevant items come than by popularity: max(0, p_user − p_any) of relevant
+    items and 0 of others, mean over a user's `k` best and then over users.
+
+    p_user = (n + 1 − rank) / n of n items in the catalogue, and p_any the same by the rank of the
+    item's popularity in the history; 0 for items that it lacks.
+
+    Args:
+        history: pairs `user_id`, `item_id` of the past, rows counted.
+    """
+    top, n = _top(recommended, k), len(catalogue)
+    _require(relevant, "relevant", *_PAIR)
+    _require(history, "history", ITEM_ID)
+    popularity = history[ITEM_ID].value_counts().rank(method="dense", ascending=False)
+    by_all = ((n + 1 - top[ITEM_ID].map(popularity)) / n).fillna(0.0)
+    earlier = ((n + 1 - top[_RANK]) / n - by_all).clip(lower=0.0)
+    pairs = pd.MultiIndex.from_frame(top[_PAIR])
+    hit = pairs.isin(pd.MultiIndex.from_frame(relevant[_PAIR]))
+    return float((earlier * hit).groupby(top[USER_ID]).mean().mean())
+
+
+def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
+    """The rows among the `k` best of each user."""
+    _require(recommended, "recommended", *_PAIR, _RANK)
+    if k < 1:
+        raise InputError(f"k is {k}; give 1 or more")
+    return recommended[recommended[_RANK] <= k]
+
+
+def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataFrame:
+    """One row per relevant pair, with its `rank` if it is among the `k` best, else NaN."""
+    _require(relevant, "relevant", *_PAIR)
+    top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
+    return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
+
+
+def _require(frame: pd.DataFrame, name: str, *columns: str) -> None:
+    lacking = [column for column in columns if column not in frame]
+    if lacking:
+        raise InputError(f"{name} has no column {', '.join(lacking)}; rename the one that it is in")
+    if frame.empty:
+        raise InputError(f"{name} has no rows")

@@ -24,7 +24,7 @@ from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
-from ucfrec.evaluation.metrics import resampled_ratios
+from ucfrec.evaluation.session_metrics import resampled_ratios
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
@@ -121,8 +121,6 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
     has −1 where too few items are left.
 
     Args:
-        ranker: scores the items.
-        later: the log.
         k: number of recommended items per step, at most n_items.
     """
     store, n_items = later.store, len(later.store.item_states.embeddings)
@@ -233,7 +231,6 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Ar
     Args:
         period: the N evaluated steps.
         ranked: a ranker's results at these steps.
-        k: number of recommended items per step.
 
     Returns:
         By measure, (above, below), (U,) each, with one entry per user; the measure's value is
@@ -296,10 +293,7 @@ def compare(
     """Measures of every ranker, with intervals over users and differences from `reference`.
 
     Args:
-        period: the evaluated steps.
         ranked: results by the ranker's name.
-        k: number of recommended items per step.
-        reference: one of these names.
         seed: of the bootstrap, whose resampled users are the same for all rankers.
 
     Returns:

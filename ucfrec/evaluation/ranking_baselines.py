@@ -180,9 +180,7 @@ def recent_rankers(
     """Clicks and click rate with half-lives, which the validation split of the store chooses.
 
     Args:
-        train: the rows to count.
         store: the whole store.
-        liked_of: says which steps were liked.
     """
     first, validation = store.split("train"), store.split("validation")
     if not validation.n_episodes:
@@ -204,7 +202,6 @@ def baselines(
     ALS and BPR are included if the package `implicit` is installed (extra `rank`).
 
     Args:
-        counts: item counts of the training rows.
         train: the training episodes; None if their store is unavailable, which excludes all that
             learn from single rows.
         seed: of the random scores, boosted clicks, ALS and BPR.

@@ -16,6 +16,7 @@ from ucfrec.evaluation.ranking import (
     Compared,
     Later,
     Period,
+    Ranker,
     compare,
     rank_steps,
     rankers_named,
@@ -79,27 +80,15 @@ def ranking_rows(
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
         train: the store of those rows; None excludes item-kNN and ALS.
-        later: the steps to rank.
         users: (E,) identifier of the user of each of its episodes.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.
         liked: which steps were liked; None for the run's own definition. Without `train`, "most
             clicked" and "item click rate" keep the run's own.
     """
-    counts = trained.counts
-    assert counts is not None
-    assert trained.item_states is not None
-    whole = trained.record.refit_of is not None
-    fitted_on = train if train is None or whole else train.split("train")
-    if liked is not None and fitted_on is not None:
-        counts = TrainingCounts.of(fitted_on, liked)
-    liked = liked or LikedByRange(trained.item_states)
-    model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    others = baselines(counts, fitted_on, seed, liked)
-    if train is not None and fitted_on is not None:
-        others += recent_rankers(fitted_on, train, liked)
-    named = rankers_named([*policies, *model, *others])
-    k = min(k, len(counts.shown))
+    named, liked = _rankers(policies, trained, train, seed, liked)
+    assert trained.counts is not None
+    k = min(k, len(trained.counts.shown))
     period = Period.of(later.store, np.asarray(users), liked)
     ranked = {name: rank_steps(ranker, later, k) for name, ranker in named.items()}
     reference = next(iter(named))
@@ -127,6 +116,29 @@ def ranking_rows(
     return [
         _row(one, own.get(one.name), shared) for one in compare(period, ranked, k, reference, seed)
     ]
+
+
+def _rankers(
+    policies: Sequence[PolicyRanker],
+    trained: TrainedPolicy,
+    train: EpisodeStore | None,
+    seed: int,
+    liked: Liked | None,
+) -> tuple[dict[str, Ranker], Liked]:
+    """The policies, the reward model and the baselines by name; and which steps were liked."""
+    counts = trained.counts
+    assert counts is not None
+    assert trained.item_states is not None
+    whole = trained.record.refit_of is not None
+    fitted_on = train if train is None or whole else train.split("train")
+    if liked is not None and fitted_on is not None:
+        counts = TrainingCounts.of(fitted_on, liked)
+    liked = liked or LikedByRange(trained.item_states)
+    model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
+    others = baselines(counts, fitted_on, seed, liked)
+    if train is not None and fitted_on is not None:
+        others += recent_rankers(fitted_on, train, liked)
+    return rankers_named([*policies, *model, *others]), liked
 
 
 def _row(one: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:

@@ -15,15 +15,9 @@ def simulated_store(
     """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
 
     Args:
-        environment: the simulator.
-        folder: holds both folders.
-        sessions: number of sessions.
         seed: seed of the environments and of the behavior policy.
         behavior: name of one of the simulator's built-in policies; None for its
             `logging_behavior`.
-
-    Returns:
-        The path of the store.
     """
     logs, store = folder / "logs", folder / "store"
     simulator = environment.simulator()

@@ -114,9 +114,6 @@ class Record(Entry):
         """Write the record of a complete folder, with the checksums of the other files in it.
 
         A file that is listed already keeps its checksum, so that damage since is not signed off.
-
-        Returns:
-            The record with the list of files.
         """
         return self.with_entries(files=files_of(folder, self.FILE, self.files)).written(folder)
 

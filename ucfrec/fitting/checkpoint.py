@@ -107,9 +107,6 @@ def load_training(
 ) -> dict[str, Any]:
     """Restore `module`, `optimizer` and `average`, in place, from what `save_training` wrote.
 
-    Returns:
-        The counters.
-
     Raises:
         InputError: the file is missing or damaged, or holds weights of another architecture.
     """

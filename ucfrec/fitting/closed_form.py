@@ -10,7 +10,7 @@ from torch import nn
 
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.loop import Fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.fitting.metrics_log import MetricsLog
 
 
@@ -20,6 +20,7 @@ def fit_once(
     folder: Path,
     validate: Callable[[], float] | None,
     describe: str,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Fit `module` by one call of `solve`, or read it from `folder` if that was done before.
 
@@ -52,9 +53,11 @@ def fit_once(
         raise InputError(f"{describe}: the validation loss is {loss}; look for extreme values")
     seconds = time.perf_counter() - start
     log = MetricsLog(folder, 0)
-    log.add(1, {} if validate is None else {"validation_loss": loss})
+    logged = {} if validate is None else {"validation_loss": loss}
+    log.add(1, logged)
     log.close()
     about = {"step": 1, "best_step": 1, "best_validation": loss, "seconds": seconds}
     save_tensors(folder / "best.safetensors", module.state_dict(), about)
     save_tensors(last, module.state_dict(), about)
+    callbacks.validation(1, logged)
     return Fit(1, 1, loss, seconds)

@@ -395,9 +395,6 @@ def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor
     """Scale the gradients so that their joint norm is at most `largest`, 0 for no limit.
 
     Sparse gradients are coalesced.
-
-    Returns:
-        The norm before.
     """
     gradients = []
     for parameter in parameters:

@@ -1,12 +1,13 @@
 """Why rows of a log are dropped: the faults that SQL finds, and what must be left."""
 
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.logs.typed import WANTED, TypedLog, not_finite
 
@@ -16,7 +17,8 @@ DAY_MS: Final = 86_400_000
 REASONS: Final = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
-    "clock_out_of_range": "time before 2000 (or --earliest) or more than a day ahead of now",
+    "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "
+    "more than a day ahead of now",
     "vector_not_finite": "action is missing or holds NaN or infinity",
     "unknown_item": "item is not in the store",
     "duplicate": "repeats user, item or action, and time of another row, which is kept",
@@ -24,6 +26,7 @@ REASONS: Final = {
 }
 """Reason to its description; a row is dropped for the first reason that applies."""
 
+_FINE: Final = ("duplicate", "left_out")
 CLOCK_HINT: Final = (
     "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000'; "
     "for older times, say --earliest 1990-01-01, or earliest in the mapping"
@@ -34,7 +37,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
     """Reason to the SQL condition on a row of `read`; the first that holds counts.
 
     Args:
-        log: any.
         known_items: `items.parquet` of a store: other items are a fault; None for none.
     """
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
@@ -57,12 +59,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
 def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: float) -> None:
     """Check the count of rewards beyond `LARGEST_REWARD`.
 
-    Args:
-        log: for the message.
-        large: how many rewards are beyond it.
-        rows: how many rewards there are.
-        largest: the largest absolute reward.
-
     Raises:
         InputError: there are any.
     """
@@ -74,13 +70,31 @@ def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: floa
         )
 
 
-def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
-    """Check that a row is left.
+def note_dropped(
+    name: str, dropped: Mapping[str, int], read: int, fine: Collection[str] = _FINE
+) -> None:
+    """Warn of the rows that are left out, with their numbers and reasons; silent if none is.
 
     Args:
-        log: for the message.
-        kept: number of rows that are.
-        dropped: number of dropped rows by reason.
+        name: of the data, for the message; empty for none.
+        fine: reasons that need no warning of their own.
+    """
+    counts = {reason: n for reason, n in dropped.items() if n}
+    if not counts.keys() - {*fine}:
+        return
+    total = sum(counts.values())
+    reasons = "; ".join(f"{n:,}: {REASONS.get(reason, reason)}" for reason, n in counts.items())
+    hint = f"; {CLOCK_HINT}" if "clock_out_of_range" in counts else ""
+    origin = f"{name}: " if name else ""
+    warnings.warn(
+        f"{origin}{total:,} of {read:,} rows were excluded ({reasons}{hint})",
+        InputNote,
+        stacklevel=3,
+    )
+
+
+def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
+    """Check that a row is left.
 
     Raises:
         InputError: none is.

@@ -15,7 +15,7 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import CLOCK_HINT, REASONS, require_rows
+from ucfrec.logs.clean import note_dropped, require_rows
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.remembered import settled
@@ -87,6 +87,7 @@ def read_histories(
             batches = sorted_batches(log, None, folder)
             rows = check_sorted(log, batches, duplicates, folder)
         require_rows(log, len(rows.clean), rows.dropped)
+        note_dropped(log.name, rows.dropped, rows.read)
         with explained(connection, tables, folder):
             yield from _by_users(rows, last)
 
@@ -101,8 +102,7 @@ def frame_histories(
 ) -> Iterator[pa.RecordBatch]:
     """`read_histories` of a log in memory, without using the disk.
 
-    Of rows with the same user, item and time one is kept, as in `read_histories`; any other row
-    that `prepare` would drop is an error.
+    Rows that `prepare` would drop are left out, with a warning, as in `read_histories`.
 
     Args:
         frame: one row per interaction.
@@ -117,7 +117,7 @@ def frame_histories(
 
     Raises:
         InputError: `frame` is no data frame or has no rows, a column is missing, repeated or of a
-            wrong type, or a row cannot be used.
+            wrong type, or no row can be used.
     """
     columns = log_table(frame, HISTORIES)
     with engine_in_memory() as connection:
@@ -131,7 +131,7 @@ def frame_histories(
         with explained(connection, log.tables, source):
             rows = check_sorted(log, sorted_batches(log, None, None), duplicates, None)
             require_rows(log, len(rows.clean), rows.dropped)
-            _require_clean(rows.dropped)
+            note_dropped(HISTORIES, rows.dropped, rows.read)
             yield from _by_users(rows, last)
 
 
@@ -171,15 +171,6 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
                 ) from None
             # A reward expression cannot use another column of mixed Python objects.
     return pa.table(columns)
-
-
-def _require_clean(dropped: dict[str, int]) -> None:
-    fine = ("duplicate", "left_out")
-    faults = {reason: n for reason, n in dropped.items() if n and reason not in fine}
-    if faults:
-        rows = "; ".join(f"{n:,} rows: {REASONS[reason]}" for reason, n in faults.items())
-        hint = f"; {CLOCK_HINT}" if "clock_out_of_range" in faults else ""
-        raise InputError(f"{HISTORIES}: {rows}{hint}; correct those rows or leave them out")
 
 
 def _require_items(log: TypedLog) -> None:

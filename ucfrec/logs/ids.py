@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arrays import IntArray
+from ucfrec.errors import InputError
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sorted_rows import CODES, has_codes
@@ -29,7 +30,11 @@ ID_TABLES: Final = (
 
 
 def number_ids(
-    log: TypedLog, measures: Measures, listed: Mapping[str, Sequence[str]], like: Path | None
+    log: TypedLog,
+    measures: Measures,
+    listed: Mapping[str, Sequence[str]],
+    like: Path | None,
+    onto: Path | None = None,
 ) -> None:
     """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
 
@@ -39,6 +44,11 @@ def number_ids(
         log: log with the tables of `ucfrec.logs.sorted_rows.code_tables`.
         listed: log column to feature tables whose column `id` lists more users or items.
         like: a store whose numbers are reused instead (without `train_count`); None for none.
+        onto: a store whose ids keep their numbers, while others follow in sorted order; their
+            `train_count` is added to the log's. None for none.
+
+    Raises:
+        InputError: ids are text in the store `onto` and numbers in the log.
     """
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -58,12 +68,39 @@ def number_ids(
             continue
         ids = [f"SELECT {name} FROM kept_{table}"]
         ids += [f"SELECT id FROM {other}" for other in listed[name]]
+        if onto is not None:
+            _add_ids(log, name, table, onto / file, " UNION ".join(ids))
+            continue
         log.connection.execute(f"""
             CREATE TABLE {table} AS
             SELECT {name}, row_number() OVER (ORDER BY {name}) - 1 AS number,
                 coalesce(train_count, 0) AS train_count
             FROM ({" UNION ".join(ids)}) LEFT JOIN kept_{table} USING ({name})
         """)
+
+
+def _add_ids(log: TypedLog, name: str, table: str, file: Path, ids: str) -> None:
+    """Create a table of the ids in the file of a store, and then those that `ids` selects."""
+    if log.id_type(name) == "BIGINT" and not pa.types.is_integer(
+        pq.read_schema(file).field(name).type
+    ):
+        raise InputError(
+            f"{log.name}: {name} is a number, {file} has text; read it as text too, with --column "
+            f"{name}='CAST({name} AS VARCHAR)'"
+        )
+    options = "file_row_number = true, hive_partitioning = false"
+    log.connection.execute(f"""
+        CREATE TABLE {table} AS
+        WITH old AS (
+            SELECT CAST({name} AS {log.id_type(name)}) AS {name}, file_row_number AS number,
+                train_count FROM read_parquet({text(glob_pattern(file))}, {options})
+        ), new AS (({ids}) EXCEPT SELECT {name} FROM old)
+        SELECT {name}, number, old.train_count + coalesce(k.train_count, 0) AS train_count
+        FROM old LEFT JOIN kept_{table} k USING ({name})
+        UNION ALL
+        SELECT {name}, (SELECT count(*) FROM old) + row_number() OVER (ORDER BY {name}) - 1,
+            coalesce(train_count, 0) FROM new LEFT JOIN kept_{table} USING ({name})
+    """)
 
 
 def _keep(log: TypedLog, measures: Measures, name: str, table: str) -> None:

@@ -229,14 +229,14 @@ def item_embeddings(
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
     combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
-        combined = _predicted(features, trained, cooccurrence, counts)
+        combined = predicted_from_features(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
 
 
-def _predicted(
+def predicted_from_features(
     features: sparse.csr_matrix,
     trained: IntArray,
     cooccurrence: Float64Array,

@@ -22,6 +22,7 @@ from ucfrec.logs.typed import typed_columns
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
 _REQUEST: Final = "request_id"
+ARM: Final = "arm"
 _EXPOSURE: Final = {
     schema.USER_ID: None,
     schema.ITEM_ID: None,
@@ -31,6 +32,7 @@ _EXPOSURE: Final = {
     schema.PROPENSITY: "DOUBLE",
     "run": "VARCHAR",
     "rule": "VARCHAR",
+    ARM: "VARCHAR",
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
 _KEYS: Final = {*_EXPOSURE, FEEDBACK, "row"}
@@ -106,23 +108,31 @@ def join_feedback(
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in table.columns]
+        missing = [name for name in _EXPOSURE if name not in (*table.columns, ARM)]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is no file of exposures; "
                 "name those that serve --exposures or recommend --exposures wrote first"
             )
-    selected = ", ".join(
-        quoted(name) if kind is None else f"CAST({quoted(name)} AS {kind}) AS {quoted(name)}"
-        for name, kind in _EXPOSURE.items()
+    rows = " UNION ALL BY NAME ".join(
+        f"SELECT {_selected(table)} FROM {table.sql}" for table in tables
     )
-    rows = " UNION ALL BY NAME ".join(f"SELECT {selected} FROM {table.sql}" for table in tables)
     connection.execute(f"CREATE TABLE given_exposures AS {rows}")
     connection.execute(
         "CREATE TABLE exposures AS SELECT *, row_number() OVER (ORDER BY timestamp, user_id, "
         f"{_REQUEST}, position, item_id) AS row FROM given_exposures QUALIFY row_number() OVER "
         f"(PARTITION BY user_id, {_REQUEST}, position, item_id ORDER BY timestamp) = 1"
     )
+
+
+def _selected(table: Table) -> str:
+    """The columns of exposures, with their types; the arm is empty where there is none."""
+    columns = []
+    for name, kind in _EXPOSURE.items():
+        value = quoted(name) if name in table.columns else "''"
+        value = value if kind is None else f"CAST({value} AS {kind})"
+        columns.append(f"{value} AS {quoted(name)}")
+    return ", ".join(columns)
 
 
 def _make_feedback(

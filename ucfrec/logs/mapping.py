@@ -156,6 +156,33 @@ class LogMapping:
 
 
 @dataclass(frozen=True)
+class LogFiles:
+    """Log files with what their columns mean, as `ucfrec_datasets.load` returns them."""
+
+    files: tuple[Path, ...]
+    mapping: LogMapping
+    dataset: str = "generic"
+    """Name of the dataset adapter, which is recorded with what is made from the files."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """A public data set as its authors publish it: one archive, zip or tar."""
+
+    url: str
+    homepage: str
+    licence: str
+    checksum: str
+    """`md5:…` or `sha256:…` of the archive."""
+    size: int
+    """Bytes of the archive."""
+    parts: Mapping[str, str]
+    """Name of what can be read at once to its path in the archive; the first is the default."""
+    convert: Callable[[Path], None] | None = None
+    """Makes the files that the adapter reads in the folder of the unpacked archive."""
+
+
+@dataclass(frozen=True)
 class Dataset:
     """A kind of log that a package announces under the entry-point group `ucfrec.datasets`."""
 
@@ -163,6 +190,8 @@ class Dataset:
     """One line for `--help`."""
     resolve: Callable[[Sequence[str | Path], LogMapping], tuple[tuple[Path, ...], LogMapping]]
     """Maps (files, folders and globs; the user's mapping) to (log files; full mapping)."""
+    releases: Mapping[str, Release] = field(default_factory=dict)
+    """Public data sets of this kind, by name."""
 
 
 def columns_given(assignments: Sequence[str]) -> dict[str, str]:

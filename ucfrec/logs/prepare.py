@@ -192,7 +192,7 @@ def prepare(
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
-            _prepared(files, mapping, options, spill, like, keep_unknown) as found,
+            prepared_log(files, mapping, options, spill, like, keep_unknown) as found,
             explained(found.rows.log.connection, found.rows.log.tables, out.parent),
         ):
             log, report = found.rows.log, found.report
@@ -228,7 +228,7 @@ def validate(
     """
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
-    with _prepared(log_files(paths), mapping, options, spill, None) as found:
+    with prepared_log(log_files(paths), mapping, options, spill, None) as found:
         return found.report
 
 
@@ -237,7 +237,7 @@ Features = dict[str, list[str]]
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class PreparedLog:
     """A log that is sorted and counted."""
 
     rows: SortedRows
@@ -256,19 +256,21 @@ class _Prepared:
 
 
 @contextmanager
-def _prepared(
+def prepared_log(
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
     spill: Path,
     like: Path | None,
     keep_unknown: bool = False,
-) -> Iterator[_Prepared]:
-    """The log, sorted and counted, with the tables of its ids."""
+    onto: Path | None = None,
+) -> Iterator[PreparedLog]:
+    """The log, sorted and counted, with the tables of its ids; `onto` is a store whose users and
+    items keep their numbers, and others follow."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     known = None if like is None or keep_unknown else like / ITEMS_FILE
-    inputs = (*files, *_other_inputs(mapping, like))
+    inputs = (*files, *_other_inputs(mapping, like, onto))
     with (
         scratch_folder(spill, "sorted") as scratch,
         engine(inputs, spill, options.memory_limit, shared=True) as connection,
@@ -276,29 +278,20 @@ def _prepared(
         with progress(4, "check the logs", "stages") as stage:
             tables = tuple(open_tables(connection, files, mapping.partitions))
             mapping, reward = settled(connection, tables, mapping, reward)
+            typed = connection, tables, mapping, reward, session_by
             if options.engine == "spark":
-                # Spark is an extra.
-                from ucfrec.logs.spark import sorted_with_spark
+                from ucfrec.logs.spark import sorted_with_spark  # an extra
 
-                log, batches = sorted_with_spark(
-                    connection,
-                    tables,
-                    mapping,
-                    reward,
-                    session_by,
-                    known,
-                    scratch,
-                    options.spark_master,
-                )
+                log, batches = sorted_with_spark(*typed, known, scratch, options.spark_master)
             else:
-                log = typed_log(connection, tables, mapping, reward, session_by, spill)
+                log = typed_log(*typed, spill)
                 with explained(connection, log.tables, spill):
                     batches = sorted_batches(log, known, scratch)
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
                 require_rows(log, len(rows.clean), rows.dropped)
                 note_losses(rows, reward, mapping.where)
-                if like is None:
+                if like is None and onto is None:
                     require_variety(rows)
                 note_equal_times(rows)
                 stage.update()
@@ -308,14 +301,14 @@ def _prepared(
                 note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
-                number_ids(log, measures, features, like)
+                number_ids(log, measures, features, like, onto)
                 _require_known_ids(log, mapping, features)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
                 report |= _remembered(mapping)
                 stage.update()
-        yield _Prepared(rows, spool, cut, measures, features, report, scratch)
+        yield PreparedLog(rows, spool, cut, measures, features, report, scratch)
 
 
 def _cut(
@@ -361,7 +354,7 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
     }
 
 
-def _feature_digests(found: _Prepared) -> dict[str, list[Any]]:
+def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
     """Digests for the fingerprint of the feature tables, if there are any."""
     return {
         f"features of {name}": [feature_digest(found.rows.log.connection, names)]
@@ -382,16 +375,20 @@ def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -
         require_known_ids(log.connection, tables, names, name, kept[name])
 
 
-def _other_inputs(mapping: LogMapping, like: Path | None) -> Iterator[Path]:
+def _other_inputs(
+    mapping: LogMapping, like: Path | None, onto: Path | None = None
+) -> Iterator[Path]:
     """Files that are read in addition to the logs."""
+    for store in (like, onto):
+        if store is not None:
+            yield from (store / file for _, _, file in ID_TABLES if (store / file).is_file())
     if like is not None:
-        yield from (like / file for _, _, file in ID_TABLES)
         return
     for table in (*mapping.user_features, *mapping.item_features):
         yield from log_files(table.files)
 
 
-def _write_states(found: _Prepared, folder: Path, size: int, like: Path | None) -> None:
+def _write_states(found: PreparedLog, folder: Path, size: int, like: Path | None) -> None:
     """Learn the item states, or copy those of the store `like`."""
     # Only a store needs scipy, which takes a moment to import.
     from ucfrec.logs.features import encode_features, item_tags

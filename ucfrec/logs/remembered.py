@@ -25,9 +25,6 @@ def settled(
     have the columns that it needs; if not, the plain name does, and no condition. The column
     `reward` stands for the reward of a log whose columns were mapped.
 
-    Returns:
-        The mapping, with nothing remembered, and the reward.
-
     Raises:
         InputError: a file has neither the remembered column nor the plain one that it must have.
     """

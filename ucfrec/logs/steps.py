@@ -1,8 +1,9 @@
 """Write the steps of a log's episodes to a store, with numbers in place of ids."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -49,19 +50,25 @@ def write_steps(
     spool: Spool,
     numbered: StepNumbers,
     display: Progress,
+    first_shard: int = 0,
+    fill: Mapping[str, float] = MappingProxyType({}),
 ) -> StoreWriter:
     """Write all episodes to the store at `folder`.
 
-    Returns:
-        The writer, not finished.
+    Args:
+        fill: the step columns of the store, with what steps without a value have; others are left
+            out. Empty for those of the log.
     """
-    writer = StoreWriter(folder)
+    writer = StoreWriter(folder, first_shard=first_shard)
     names = [name for name in schema.STEP_DTYPES if name in spool.names]
+    names = [name for name in names if name in fill or not fill]
     users_before, last_user = 0, None
     for found in episodes:
         if not len(found.lengths):
             continue
         steps: dict[str, Array] = {n: found.column(spool, n) for n in names}
+        rows = int(found.lengths.sum())
+        steps |= {n: np.full(rows, value) for n, value in fill.items() if n not in steps}
         if schema.ITEM in steps:
             steps[schema.ITEM] = numbered.items[steps[schema.ITEM]]
         new = np.append(found.users[0] != last_user, found.users[1:] != found.users[:-1])
@@ -69,7 +76,7 @@ def write_steps(
         first_place = int(places[0])
         values = numbered.users.read("number", first_place, int(places[-1]) + 1)
         users_before, last_user = int(places[-1]) + 1, found.users[-1]
-        first = np.zeros(int(found.lengths.sum()), dtype=bool)
+        first = np.zeros(rows, dtype=bool)
         first[np.cumsum(found.lengths) - found.lengths] = True
         each = {
             schema.USER: values[places - first_place],

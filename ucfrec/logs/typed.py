@@ -60,11 +60,6 @@ class TypedLog:
         return schema.ITEM_ID if schema.ITEM_ID in self.columns else schema.ACTION
 
     @property
-    def payload(self) -> tuple[str, ...]:
-        """Log columns other than user, choice and time."""
-        return tuple(c for c in self.columns if c not in (schema.USER_ID, self.key, "timestamp"))
-
-    @property
     def batch_rows(self) -> int:
         """Rows of a batch of its rows."""
         return rows_of_batch(sum(self.vector_size.values()))

@@ -36,8 +36,8 @@ class Subject:
     def rows(self, found: Mapping[str, Estimate], per_step: bool = False) -> list[ResultRow]:
         """The result rows of estimates by name of the estimator, which is the row's method.
 
-        `R_cum` is the mean return, as in `ucfrec.evaluation.metrics`, and `R_step` the mean reward
-        of a step; a row may have no interval.
+        `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the
+        mean reward of a step; a row may have no interval.
 
         Args:
             per_step: whether the estimates are of `step_value`.

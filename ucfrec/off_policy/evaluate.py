@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +39,7 @@ from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
+from ucfrec.results.table import ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 
@@ -74,9 +76,11 @@ class EstimateOptions:
 DEFAULTS = EstimateOptions()
 
 
-@dataclass(frozen=True)
-class OffPolicyReport:
+@dataclass(frozen=True, repr=False)
+class OffPolicyReport(ResultTable):
     """The estimates, and whether to believe them."""
+
+    shown = ("choice", "R_cum", "R_cum_low", "R_cum_high", "effective_sessions", "sessions")
 
     rows: list[ResultRow]
     """One result row for each estimator."""
@@ -95,6 +99,10 @@ class OffPolicyReport:
     """The value per step, where only some steps have propensities."""
     step_rows: Sequence[ResultRow] = ()
     """Its result rows, one for each estimator."""
+
+    def _repr_html_(self) -> str:
+        said = [f"verdict: {self.verdict.headline}", *(f"warning: {w}" for w in self.warnings)]
+        return super()._repr_html_() + "".join(f"<p>{escape(text)}</p>" for text in said)
 
 
 @dataclass(frozen=True)

@@ -101,9 +101,6 @@ def logged_sessions(
     `keep_unknown` they stay, as item −1, and `LoggedSessions.unknown_items` counts them.
 
     Args:
-        run: folder of the run.
-        trained: the policy of the run.
-        files: the log files.
         mapping: which columns of the logs mean what; what it leaves open is as in the training
             logs.
         keep_unknown: keep rows whose item the run does not know.
@@ -191,8 +188,6 @@ def scored_steps(
     """Compute the policy's probabilities at every step of `store`, in order and in batches.
 
     Args:
-        trained: a policy that chooses items.
-        store: the logged steps.
         rule: the decision rule; None for the run's own.
 
     Yields:
@@ -228,7 +223,6 @@ def score(
     """Compute the policy's probability of every logged choice.
 
     Args:
-        trained: a policy that chooses items.
         logged: the logs, without unknown items.
         rule: the decision rule; None for the run's own.
 

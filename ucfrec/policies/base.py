@@ -167,9 +167,7 @@ class SequencePolicy(nn.Module, ABC):
 
         Args:
             train: the training episodes.
-            config: settings of the policy.
             folder: keeps intermediate results, so that a resumed run reuses them.
-            seed: seed of every random draw.
         """
         if config.best_share == 1:
             return train
@@ -188,8 +186,6 @@ class SequencePolicy(nn.Module, ABC):
         Args:
             train: the training episodes, without augmented episodes.
             validation: held-out episodes; None in a refit, which keeps what was `chosen` on them.
-            folder: for intermediate results.
-            seed: of every random draw.
         """
         return None
 
@@ -230,9 +226,6 @@ class SequencePolicy(nn.Module, ABC):
         Args:
             features: (B, K, d) of the windows.
             windows: normalised.
-
-        Returns:
-            The loss, and scalars to log.
         """
         exposed, padded = self.exposed(windows), some_padding(windows.mask)
 

@@ -30,7 +30,6 @@ def require_sound(policy: SequencePolicy, train: EpisodeStore, name: str) -> Non
     Args:
         policy: before its training; put in evaluation mode meanwhile.
         train: the training episodes, of which a few windows are read.
-        name: of the policy, for messages.
 
     Raises:
         InputError: features or predictions depend on the action, the reward or later steps, or

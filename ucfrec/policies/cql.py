@@ -134,9 +134,7 @@ def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) 
 
     Args:
         store: training episodes without augmented episodes.
-        config: settings of CQL.
         folder: keeps the Q function; training resumes from it.
-        seed: seed of every random draw.
     """
     torch.manual_seed(seed)
     network = ConservativeQ(store, config)

@@ -72,5 +72,5 @@ class GSASRecPolicy(SASRecPolicy):
         if n_items <= self.config.negatives:
             return torch.arange(n_items, device=device)
         drawn = torch.randint(n_items, (self.config.negatives,), device=device)
-        found: Tensor = torch.unique(drawn)  # type: ignore[no-untyped-call]
+        found: Tensor = torch.unique(drawn)
         return found

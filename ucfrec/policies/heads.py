@@ -74,10 +74,7 @@ class ItemHead(nn.Module):
     ) -> None:
         """
         Args:
-            dim: width of the features.
-            n_items: number of items.
             embedding_size: of an item's fixed embedding.
-            exposure: what moves the logits, too.
             samples: draws for the softmax of a training batch; 0 for the softmax of all items.
         """
         super().__init__()
@@ -248,7 +245,6 @@ def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 
 
     Args:
         sizes: see `ucfrec.policies.base.SequencePolicy`.
-        dim: width of the features.
         lags: earlier steps that an exposure term of items reads; 0 for no such term.
         samples: see `ItemHead`.
     """

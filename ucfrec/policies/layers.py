@@ -37,7 +37,6 @@ def kept(shape: torch.Size, p: float) -> Tensor:
     """Independent draws, float32 on the CPU: 0 with probability p, otherwise 1 / (1 − p).
 
     Args:
-        shape: of the result.
         p: from 0 to 1, rounded to a multiple of 2⁻¹⁶.
     """
     dropped = round(p * _LEVELS)
@@ -93,7 +92,6 @@ class CausalDepthwise(nn.Conv1d):
         """Map (B, K, d) to (B, K, d).
 
         Args:
-            input: steps in order.
             mask: (B, K) bool, false at steps that count as zeros; None if all count.
         """
         steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)

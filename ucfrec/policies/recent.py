@@ -123,7 +123,6 @@ def decayed_counts(
     Args:
         train: a view of a store of items.
         half_life: hours; infinite, or without times in the store, all steps count alike.
-        liked_of: says which steps were liked.
     """
     n_items = len(train.item_states.embeddings)
     shown, liked = np.zeros(n_items), np.zeros(n_items)

@@ -229,7 +229,6 @@ class SupervisedAttention(nn.Module):
         """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d).
 
         Args:
-            states: the queries.
             tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
             visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
 

@@ -51,10 +51,7 @@ def export(
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
     Args:
-        trained: a policy of items.
-        out: folder to make.
         rule: the decision rule; None for the run's own.
-        k: items that the graph chooses.
 
     Raises:
         InputError: the extra `export` is not installed, the policy cannot be exported, the graph's

@@ -35,11 +35,6 @@ class RuleGraph(nn.Module):
 
     def __init__(self, scorer: Scorer, kind: str, k: int) -> None:
         """
-        Args:
-            scorer: a policy under its rule.
-            kind: of the policy, for messages.
-            k: number of items to choose.
-
         Raises:
             InputError: the policy has vector actions, or scores items in a way of its own.
         """
@@ -202,10 +197,7 @@ def write_graph(
 
     Args:
         module: in evaluation mode.
-        arguments: an example.
-        path: file to write.
         names: of the inputs and of the outputs.
-        kind: of the policy, for messages.
         remedy: what to do where it cannot be exported.
         shapes: sizes that may vary; None for those of the example alone.
 

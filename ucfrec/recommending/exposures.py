@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +25,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 POSITION: Final = "position"
 RUN: Final = "run"
 RULE: Final = "rule"
+ARM: Final = "arm"
 _ROWS: Final = 50_000
 _SECONDS: Final = 60.0
 _MOST_WAITING: Final = 20
@@ -45,6 +46,7 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             (schema.PROPENSITY, pa.float64()),
             (RUN, pa.string()),
             (RULE, pa.string()),
+            (ARM, pa.string()),
         ]
     )
 
@@ -56,9 +58,6 @@ def exposures_written(
     """Yield the same frames, which are also written to a file, whole once the block ends.
 
     Args:
-        path: Parquet file.
-        trained: whose recommendations they are.
-        rule: hash of the decision rule.
         frames: of `recommend`.
     """
     columns, now = exposure_schema(trained), int(time.time() * 1000)
@@ -67,6 +66,7 @@ def exposures_written(
         for frame in frames:
             shown = frame.rename(columns={RANK: POSITION})
             shown[RUN], shown[RULE], shown[schema.TIMESTAMP] = trained.fingerprint, rule, now
+            shown[ARM] = ""
             shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
             writer.write_table(table)
@@ -91,17 +91,17 @@ class ExposureLog:
         trained: TrainedPolicy,
         rows: int = _ROWS,
         seconds: float = _SECONDS,
+        clock: Callable[[], float] = time.time,
     ) -> None:
         """
         Args:
-            folder: made if it is missing.
-            trained: whose answers they are.
             rows: from so many on a file is written.
             seconds: after so long, a file is written if there are any rows.
+            clock: seconds since 1970, when an answer is given.
         """
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._schema = folder, exposure_schema(trained)
-        self._rows, self._seconds = rows, seconds
+        self._rows, self._seconds, self._clock = rows, seconds, clock
         self._waiting: list[tuple[str, int, Answer]] = []
         self._count, self._lost = 0, 0
         self._lock, self._wake, self._closed = threading.Lock(), threading.Event(), False
@@ -110,7 +110,7 @@ class ExposureLog:
 
     def add(self, user_id: int | str, answer: Answer) -> None:
         """Remember an answer that is given now; takes microseconds."""
-        now, size = int(time.time() * 1000), len(answer.items)
+        now, size = int(self._clock() * 1000), len(answer.items)
         with self._lock:
             if self._count > _MOST_WAITING * self._rows:
                 self._lost += size
@@ -183,6 +183,7 @@ class ExposureLog:
                 (REQUEST_ID, answer.request_id),
                 (RUN, answer.run),
                 (RULE, answer.rule),
+                (ARM, answer.arm),
             ):
                 columns[name] += [value] * shown
         return pa.table(columns, self._schema)

@@ -2,10 +2,10 @@
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,8 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.episodes.ids import IdLookup
+from ucfrec.errors import InputError
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
@@ -174,9 +176,6 @@ def histories_of_files(
         mapping: names of the columns; what it leaves open is as in the training log.
         memory_limit: of the process, such as "2GB"; rows spill to disk.
 
-    Returns:
-        The batches.
-
     Raises:
         InputError: a file or a column is missing, or has values that cannot be used.
     """
@@ -204,9 +203,6 @@ def histories_of_frame(
         frame: one row per interaction.
         mapping: names of the columns; what it leaves open is as in the training log.
 
-    Returns:
-        The batches.
-
     Raises:
         InputError: a column is missing, or has values that cannot be used.
     """
@@ -226,6 +222,29 @@ def histories_of_frame(
         duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
+
+
+def of_some_users(batches: Iterable[Histories], users: Sequence[Any]) -> Iterator[Histories]:
+    """The histories of the named users only, in the order of `batches`.
+
+    Raises:
+        InputError: `users` is no list of ids, or one of them has no rows; once all are read.
+    """
+    if isinstance(users, str) or not pd.api.types.is_list_like(users) or not len(users):
+        raise InputError(f"users is {users!r}; give a list of user_ids, or None for all")
+    wanted = IdLookup(pd.unique(np.asarray(users)))
+    found = np.zeros(len(wanted), dtype=bool)
+    for batch in batches:
+        numbers = wanted.numbers(batch.users)
+        found[numbers[numbers >= 0]] = True
+        if (numbers >= 0).any():
+            yield batch.of_users(np.flatnonzero(numbers >= 0))
+    if not found.all():
+        lacking = wanted.ids[~found]
+        raise InputError(
+            f"{len(lacking):,} of {len(wanted):,} users have no rows in the histories, such as "
+            f"{lacking[0]}; leave them out, or add rows"
+        )
 
 
 def _of_owners(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:

@@ -37,7 +37,6 @@ class QueryGraph:
         """
         Args:
             scorer: of a policy; its weights must not change afterwards.
-            kind: of the policy, for messages.
 
         Raises:
             InputError: the extra `export` is not installed, the policy scores items in a way of its

@@ -49,7 +49,6 @@ def recommend(
     users who are not in the training logs, the state is made of their rows alone.
 
     Args:
-        trained: a policy of items.
         batches: the users' histories.
         k: number of items per user, at least 1.
         rule: the decision rule; None for the run's own.
@@ -187,7 +186,6 @@ def best_of(
     items that are excluded, and their propensities (B, k) float64.
 
     Args:
-        rule: the decision rule.
         scores: (B, n_items) of `Scorer.scores`; may be overwritten.
         k: number of items, at most n_items.
         drawn: (B, n_items + 1) of `uniforms`; needed if the rule draws.
@@ -243,7 +241,6 @@ def sessions_of(
     """The sessions of users, each before the step for which items are scored.
 
     Args:
-        trained: the policy.
         histories: U users with the N rows of their latest sessions, whose `item_ids` are the
             policy's numbers of items.
         users: (U,) index of each user in the training store, −1 for others.

@@ -164,8 +164,6 @@ def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
 
     Args:
         kind: `Request` or a subclass.
-        text: JSON.
-        limits: of the request.
 
     Raises:
         InputError: it is no such request, or too large.

@@ -37,6 +37,8 @@ class Answer(NamedTuple):
     """Fingerprint of the run."""
     rule: str
     """Hash of the decision rule."""
+    arm: str = ""
+    """Run of the user's arm, where runs share the users."""
 
     def as_dict(self, user_id: int | str) -> dict[str, Any]:
         """The answer to a request of a user, as a JSON object."""
@@ -46,6 +48,7 @@ class Answer(NamedTuple):
             for item, score, propensity in columns
         ]
         names = {"request_id": self.request_id, "run": self.run, "rule": self.rule}
+        names |= {"arm": self.arm} if self.arm else {}
         return {"user_id": exact_id(user_id), **names, "items": items}
 
 
@@ -91,8 +94,6 @@ class Responder:
     ) -> None:
         """
         Args:
-            trained: a policy of items.
-            limits: of a request.
             rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
             filter_seen: exclude every item that the user has seen.
@@ -127,6 +128,31 @@ class Responder:
         self._items, self._users = trained.items, trained.users
         self._reader = HistoryReader.of(trained)
         self._busy = threading.Lock()
+        self._requests, self._rows = [0, 0], [0, 0]
+
+    def drift(self) -> dict[str, float]:
+        """Share of unknown items among rows of histories, and of unknown users among requests, so
+        far; and the drift that the run's update found, as `update_…`."""
+        update = self.trained.record.update
+        found = {
+            f"update_{name}": float(value)
+            for name, value in ((update and update.drift) or {}).items()
+        }
+        for name, (unknown, every) in (
+            ("unknown_items", self._rows),
+            ("unknown_users", self._requests),
+        ):
+            found[name] = unknown / max(every, 1)
+        return found
+
+    def described(self) -> dict[str, Any]:
+        """What answers, for the health page."""
+        return {
+            "policy": self.trained.record.summary,
+            "rule": str(self.rule),
+            "rule_hash": self.rule.hash,
+            "run": self.trained.fingerprint,
+        }
 
     def close(self) -> None:
         """Release what reading rewards holds."""
@@ -156,6 +182,8 @@ class Responder:
     def _asked(self, number: int, request: Request) -> _Asked:
         history = self._reader.read(request.history, request.user_id)
         known = self._items.numbers(history.item_ids)
+        self._rows[0] += int((known < 0).sum())
+        self._rows[1] += len(known)
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))
             shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
@@ -185,6 +213,8 @@ class Responder:
     def _scored(self, asked: Sequence[_Asked]) -> list[Answer]:
         latest = self._latest(asked)
         users = self._users.numbers(latest.users)
+        self._requests[0] += int((users < 0).sum())
+        self._requests[1] += len(users)
         sessions = sessions_of(self.trained, latest, users, self._scorer.length)
         left_out = [one.left_out for one in asked]
         rows = [np.repeat(np.arange(len(asked)), [len(each) for each in left_out])]

@@ -34,9 +34,9 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
 class Server(uvicorn.Server):
     """A server that says on stdout when it is ready, and where."""
 
-    def __init__(self, config: uvicorn.Config, what: str) -> None:
+    def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
         super().__init__(config)
-        self._what = what
+        self._what, self._page = what, page
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen."""
@@ -44,4 +44,4 @@ class Server(uvicorn.Server):
         for each in sockets or []:
             host, port = each.getsockname()[:2]
             where = f"[{host}]" if ":" in host else host
-            print(f"{self._what}, ready at http://{where}:{port} (page: /docs)", flush=True)
+            print(f"{self._what}, ready at http://{where}:{port} (page: {self._page})", flush=True)

@@ -1,5 +1,6 @@
 """Prometheus metrics of the server."""
 
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from prometheus_client import (
@@ -51,6 +52,16 @@ class ServingMetrics:
             registry=self._registry,
         )
 
+        self.drift: Callable[[], Mapping[str, float]] = dict
+        """Returns what is different in requests, or in the logs of the last update, by name."""
+        self._drift = Gauge(
+            "ucfrec_drift",
+            "Unknown items and users of requests, shares since the run began to answer; and the "
+            "drift that the run's update found (update_…).",
+            ["measure"],
+            registry=self._registry,
+        )
+
     def request(self, status: int, seconds: float) -> None:
         """Count a request that was answered."""
         self._requests.labels(str(status)).inc()
@@ -63,4 +74,7 @@ class ServingMetrics:
 
     def text(self) -> bytes:
         """All metrics in Prometheus' text format."""
+        self._drift.clear()
+        for name, value in self.drift().items():
+            self._drift.labels(name).set(value)
         return generate_latest(self._registry)

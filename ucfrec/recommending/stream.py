@@ -54,9 +54,7 @@ def answer_stream(
     goes on.
 
     Args:
-        responder: answers the requests.
         source: lines of JSON, UTF-8; see `ucfrec.recommending.requests.StreamRequest`.
-        sink: lines of JSON.
         remember: rows that are remembered, of all users together.
         exposures: gets every answer; None for none.
     """

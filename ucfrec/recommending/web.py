@@ -27,6 +27,7 @@ from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
+from ucfrec.recommending.served import Served
 from ucfrec.recommending.serving_metrics import ServingMetrics
 from ucfrec.settings import settings_table
 
@@ -55,6 +56,7 @@ _ANSWER: Final = {
         "request_id": {"type": "string"},
         "run": {"type": "string", "description": "Fingerprint of the run."},
         "rule": {"type": "string", "description": "Hash of the decision rule."},
+        "arm": {"type": "string", "description": "Run of the user's arm, if runs share the users."},
         "items": {"type": "array", "items": _ITEM, "description": "In the order to show."},
     },
 }
@@ -125,7 +127,7 @@ class _RefusalError(Exception):
 
 
 def application(
-    responder: Responder,
+    responder: Responder | Served,
     limits: ServerLimits,
     allowed_hosts: Sequence[str] = ("*",),
     exposures: ExposureLog | None = None,
@@ -133,8 +135,6 @@ def application(
     """The application of one model; it keeps no state but the model and its metrics.
 
     Args:
-        responder: answers the requests.
-        limits: of the server.
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
             addresses, *.example.org for all names below, or * for any.
         exposures: gets every answer; None for none.
@@ -146,6 +146,7 @@ def application(
     metrics = ServingMetrics()
     batcher = Batcher(responder, metrics, limits.batch, limits.queue)
     metrics.waiting.set_function(lambda: batcher.waiting)
+    metrics.drift = responder.drift
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -172,19 +173,10 @@ def application(
         metrics.request(status, time.perf_counter() - began)
         return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
 
-    described = {
-        "status": "ok",
-        "policy": responder.trained.record.summary,
-        "rule": str(responder.rule),
-        "rule_hash": responder.rule.hash,
-        "run": responder.trained.fingerprint,
-        "version": __version__,
-    }
-
     @app.get("/health")
-    async def health() -> dict[str, str]:
+    async def health() -> dict[str, Any]:
         """That the server answers, and with what model."""
-        return described
+        return {"status": "ok", **responder.described(), "version": __version__}
 
     @app.get("/metrics", response_class=Response)
     async def prometheus() -> Response:
@@ -196,7 +188,7 @@ def application(
 
 async def _answered(
     http: HTTPRequest,
-    responder: Responder,
+    responder: Responder | Served,
     batcher: Batcher,
     limits: ServerLimits,
     exposures: ExposureLog | None,

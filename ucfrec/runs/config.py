@@ -72,11 +72,13 @@ def resolve_config(
     settings = [*_from_mapping(presets or {}, "presets")]
     if file is not None:
         settings += _from_mapping(read_toml(file), str(file))
-    if isinstance(overrides, Mapping):
-        settings += _from_mapping(overrides, "settings")
-    else:
-        settings += _from_texts(overrides)
+    settings += _from_overrides(overrides)
     return _build(policy_name, settings, seed)
+
+
+def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
+    """Settings, in any form that `resolve_config` takes, as `{"table.field": value}`."""
+    return {f"{each.table}.{each.key}": each.value for each in _from_overrides(overrides)}
 
 
 def config_from_dict(values: object) -> Config:
@@ -127,6 +129,12 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     except SettingError as error:
         source = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
         raise InputError(f"{source}: {error}" if source else str(error)) from None
+
+
+def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> "Iterator[_Setting]":
+    if isinstance(overrides, Mapping):
+        return _from_mapping(overrides, "settings")
+    return _from_texts(overrides)
 
 
 def _from_texts(texts: Sequence[str]) -> Iterator[_Setting]:

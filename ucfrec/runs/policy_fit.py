@@ -12,7 +12,7 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.closed_form import fit_once
-from ucfrec.fitting.loop import Fit, fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
 
@@ -27,6 +27,7 @@ def fit_policy(
     out: Path,
     config: Config,
     start: Path | None = None,
+    callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Train the policy, or resume its training.
 
@@ -34,8 +35,6 @@ def fit_policy(
         policy: trained in place.
         train: episodes to learn from, with their augmented episodes.
         validation: held-out episodes; None to keep the last weights.
-        out: folder of the run.
-        config: configuration of the run.
         start: weights of another training to go on from; of a policy that is fitted without
             gradients, only what was chosen on held-out episodes is taken from there.
 
@@ -53,7 +52,7 @@ def fit_policy(
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)
     if solve is not None:
         with distributed.leader_first():
-            return fit_once(policy, solve, out / "policy", validate, config.policy_name)
+            return fit_once(policy, solve, out / "policy", validate, config.policy_name, callbacks)
     own = distributed.share(config.train.batch_size)
 
     def draw(generator: np.random.Generator) -> Windows:
@@ -76,6 +75,7 @@ def fit_policy(
         validate=validate,
         describe=config.policy_name,
         rows=lambda windows: float(windows.mask.sum()),
+        callbacks=callbacks,
     )
 
 

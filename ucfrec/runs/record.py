@@ -161,6 +161,52 @@ class RuleRecord(Entry):
         return None if self.estimate is None else (self.estimate.value, self.estimate.error)
 
 
+class Difference(Entry):
+    """What the newest rows say of a new run against the old one, by one measure."""
+
+    measure: Text
+    value: Number
+    """Of the new run less that of the old one."""
+    low: Number
+    """Ends of the 95% interval, over users."""
+    high: Number
+    doubt: Text = ""
+    """Why not to rely on it; empty if nothing is found."""
+
+    @property
+    def sign(self) -> int:
+        """1 if it shows that the new run is better, −1 that it is worse, 0 neither."""
+        return 0 if self.doubt else int(self.low > 0) - int(self.high < 0)
+
+
+class UpdateVerdict(Entry):
+    """Whether a new run is better than the old one (`ucfrec.updating.verdict`)."""
+
+    result: Literal["better", "no significant difference", "worse"]
+    decided_by: Text
+    """The measure that decides."""
+    differences: tuple[Difference, ...]
+    steps: Count
+    """Rows that the runs are compared on, which neither was trained on."""
+    users: Count
+
+
+class Update(Entry):
+    """How a run came from an older one (`ucfrec.updating.update`)."""
+
+    of: Text
+    """Name of the older run."""
+    run: Text
+    """Its fingerprint."""
+    settings_from_nothing: dict[str, Any]
+    """Those of a training that does not start from the weights of another run."""
+    appended: dict[str, Any]
+    """Counts of the new logs; see `ucfrec.logs.append.append_logs`."""
+    drift: dict[str, Any] | None = None
+    """See `ucfrec.updating.drift`."""
+    verdict: UpdateVerdict | None = None
+
+
 class RunRecord(TrainingRecord):
     """The content of `run.json`; entries of stages that have not ended are None."""
 
@@ -188,6 +234,8 @@ class RunRecord(TrainingRecord):
     screening: Screening | None = None
     refit_of: dict[str, Any] | None = None
     """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
+    update: Update | None = None
+    """None for a run that was trained from nothing."""
     augmentation: AugmentationReport | None = None
     policy: Fit | None = None
     reward_model: ItemRewardReport | None = None

@@ -34,9 +34,6 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         first: a finished run.
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
 
-    Returns:
-        The record of the new run.
-
     Raises:
         InputError: `first` is not a finished run on this store, or `out` is another run.
     """
@@ -65,7 +62,10 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
         if (first / REWARD_MODEL / SESSIONS).exists():
             shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
-    chosen = {name: getattr(trained.record, name) for name in ("rule", "reward_model", "screening")}
+    chosen = {
+        name: getattr(trained.record, name)
+        for name in ("rule", "reward_model", "screening", "update")
+    }
     return record.with_entries(**chosen).sealed(out)
 
 

@@ -23,7 +23,7 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
-from ucfrec.fitting.loop import Fit
+from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
@@ -35,6 +35,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
+from ucfrec.runs.warm_start import start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -72,6 +73,8 @@ def train_run(
     more_augmentation: Overlay | None = None,
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
+    initial: Path | None = None,
 ) -> RunRecord:
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
@@ -83,9 +86,7 @@ def train_run(
     the rest, and the others return once the policy is trained.
 
     Args:
-        store: prepared episodes.
         out: run folder, new or interrupted.
-        config: configuration of all stages.
         about: entries of `RunRecord` that the caller adds.
         more_augmentation: augmented training episodes that are used in addition to the
             counterfactual ones.
@@ -94,9 +95,8 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
-
-    Returns:
-        The record of the run: provenance, configuration and the report of every stage.
+        callbacks: what is told of the training of the policy.
+        initial: a run on an older state of the store, whose weights the training begins with.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
@@ -109,23 +109,30 @@ def train_run(
             remove_leftovers_within(out)
         begun = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
+        if initial is not None:
+            start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
             overlay, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, refit_of)
+            fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.with_entries(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
-            with phase("Fitting the user model", 3, PHASES):
-                user_model = _fit_user_model(run)
-            with phase("Selecting the decision rule", 4, PHASES):
-                rule = _choose_rule(run, user_model)
-            record = record.with_entries(reward_model=user_model.reward_report, rule=rule)
+            record = record.with_entries(**_selected(run))
         _write_samples(run)
         seconds = record.wall_time_s + time.perf_counter() - begun
         return record.with_entries(wall_time_s=seconds).sealed(out)
+
+
+def _selected(run: _Inputs) -> dict[str, Any]:
+    """Entries of the record: the user model and the decision rule that is best in it."""
+    with phase("Fitting the user model", 3, PHASES):
+        user_model = _fit_user_model(run)
+    with phase("Selecting the decision rule", 4, PHASES):
+        rule = _choose_rule(run, user_model)
+    return {"reward_model": user_model.reward_report, "rule": rule}
 
 
 def _prepare_inputs(
@@ -200,16 +207,19 @@ def _augment(
 
 
 def _train_policy(
-    run: _Inputs, overlay: Overlay | None, more: Overlay | None, refit_of: Path | None
+    run: _Inputs,
+    overlay: Overlay | None,
+    more: Overlay | None,
+    refit_of: Path | None,
+    callbacks: Callbacks,
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
         overlay = more if overlay is None else overlay.joined(more)
     train = run.train if overlay is None else run.train.with_overlay(overlay)
-    if refit_of is None:
-        return fit_policy(run.policy, train, run.validation, run.out, run.config)
-    start = refit_of / "policy" / "best.safetensors"
-    return fit_policy(run.policy, train, None, run.out, run.config, start)
+    start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
+    validation = run.validation if refit_of is None else None
+    return fit_policy(run.policy, train, validation, run.out, run.config, start, callbacks)
 
 
 def _fit_user_model(run: _Inputs) -> UserModel:

@@ -19,7 +19,6 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
 
     Args:
         scorer: a policy of items under its rule.
-        validation: validation episodes of items.
 
     Returns:
         A JSON object: the `rule` in words, and `sessions` with up to 5 items before the last step

@@ -11,6 +11,7 @@ from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, sc
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
+from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, Screening, read_record
 from ucfrec.runs.run import train_run
@@ -42,20 +43,17 @@ def train_screened(
     how: str | None,
     about: Mapping[str, Any] | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """`ucfrec.runs.run.train_run` after screening.
 
     Args:
-        store: prepared episodes.
         out: run folder; an interrupted run resumes, with the columns it started with.
-        config: of the training.
         how: one of `SCREENINGS`; None to train on the store as it is.
         about: entries that a dataset adapter adds to the record.
         shared: as `train_run` has it, and for screening; a run whose columns are dropped has its
             other stages to itself.
-
-    Returns:
-        The run's record.
+        callbacks: what is told of the training of the policy.
 
     Raises:
         InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no
@@ -70,7 +68,7 @@ def train_screened(
             "another run folder, or give the same options to resume"
         )
     if how is None:
-        return train_run(store, out, config, about, shared=shared)
+        return train_run(store, out, config, about, shared=shared, callbacks=callbacks)
     if screening is None:
         screening = Screening.model_validate({"how": how, **_screened(store, shared)})
     flagged = screening.flagged
@@ -80,14 +78,15 @@ def train_screened(
             "dimensions; the log has too few steps, or too noisy ones, to decide: train without "
             "--screen"
         )
-    entries = {**(about or {}), SCREENING: screening}
+    entries: dict[str, Any] = {**(about or {}), SCREENING: screening}
     if how == "drop":
         kept = without_columns(store, flagged)
-        return train_run(kept, out, config, {**entries, "dropped_observations": flagged})
+        entries["dropped_observations"] = flagged
+        return train_run(kept, out, config, entries, callbacks=callbacks)
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
     more = interventions(train, places, config.seed) if places else None
-    return train_run(store, out, config, entries, more, shared=shared)
+    return train_run(store, out, config, entries, more, shared=shared, callbacks=callbacks)
 
 
 def _screened(store: EpisodeStore, shared: SharedStages) -> dict[str, Any]:

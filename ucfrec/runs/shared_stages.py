@@ -33,11 +33,8 @@ class SharedStages:
         Args:
             inputs: all that the stage depends on: data, settings, seed. Another version of the
                 package makes its own.
-            stage: name of the stage.
-            out: run folder.
             names: files and folders of the stage in `out`, those that are made; the last one marks
                 the stage as finished, and is copied last. No file is ever there in part.
-            make: makes them.
         """
         if self.folder is None:
             make()

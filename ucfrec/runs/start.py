@@ -112,11 +112,7 @@ def begin(
 
     Args:
         store: the whole store.
-        train: episodes to learn from.
         validation: held-out episodes.
-        out: folder of the run.
-        config: configuration of all stages.
-        about: further entries of the record.
     """
     returns_to_go, source = returns_of(store, config), store.record.source
     entries: dict[str, Any] = {
@@ -182,7 +178,6 @@ def reference_losses(counts: TrainingCounts, validation: EpisodeStore) -> dict[s
     """Mean negative log-likelihood (nats) of the logged items over all validation steps.
 
     Args:
-        counts: item counts of the training steps.
         validation: validation episodes, at least one.
 
     Returns:

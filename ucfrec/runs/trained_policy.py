@@ -82,7 +82,6 @@ class TrainedPolicy:
         """Load a policy from a run folder; warns where its training has not ended.
 
         Args:
-            run: the folder.
             checkpoint: `best` (lowest validation loss) or `last` weights.
             in_training: whether the training that has not ended is what asks.
             split: the weights that learned from the training split only, which the other splits can
@@ -265,7 +264,6 @@ class TrainedPolicy:
         """An actor for `episodes` parallel environments.
 
         Args:
-            episodes: number of environments.
             rule: the decision rule; None for the run's own.
             item_numbers: (n_items,) the environment's index of each item, −1 for items that it
                 lacks; None if the `item_ids` are these indices.

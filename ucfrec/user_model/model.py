@@ -65,9 +65,6 @@ class UserModel:
         Args:
             train: training episodes of a store of items.
             validation: held-out episodes of the same store.
-            folder: receives the fitted parts.
-            seed: of rows drawn from large logs.
-            simulated: whether sessions will be simulated.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
@@ -118,7 +115,6 @@ class UserModel:
 
         Args:
             states: (M, S) before the step.
-            shown: what the sessions showed before.
             users: (M,) rows of the training store's users.
             items: (M,) int64.
         """

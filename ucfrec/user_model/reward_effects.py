@@ -227,7 +227,6 @@ def fit_effects(
     """Minimise the summed loss of `design` plus penalties on the effects named in `spreads`.
 
     Args:
-        design: training rows.
         start: effects to start from; missing ones start at 0.
         spreads: of every effect of the fit; see `Design.penalty`.
         fixed: effects that are part of the predictor, and of the result, as they are.

@@ -87,10 +87,8 @@ def fit_item_reward_model(
     Args:
         train: view of a store of items.
         validation: held-out view of the same store.
-        folder: receives the fitted model.
         seed: of the rows drawn from a store with more than `max_rows`.
         max_rows: most rows of each view that are used.
-        effects: those that are tried.
 
     Returns:
         The model, in evaluation mode, and its quality on the validation rows.
@@ -130,9 +128,7 @@ def refit_item_reward_model(
     Args:
         first: folder of `fit_item_reward_model`.
         store: view of the episodes to fit to.
-        folder: receives the fitted model.
         seed: of the rows drawn from a view with more than `max_rows`.
-        max_rows: most rows that are used.
     """
     tensors, about = load_tensors(first / FITTED)
     report = ItemRewardReport(**about)

@@ -170,7 +170,6 @@ class SessionEnd:
         """Probabilities (B, C) that sessions end if they show items.
 
         Args:
-            shown: what they showed before.
             items: (B, C) int64.
             rewards: (B, C) that the items would be given.
             steps: (B,) number of the step.

@@ -29,11 +29,8 @@ class UserSimulator:
     ) -> None:
         """
         Args:
-            model: of rewards and ends.
             store: view of the sessions that are begun; session i is the i-th modulo their number.
-            sessions: number of sessions that differ.
             longest: steps after which a session ends in any case.
-            seed: of all draws.
             times: how often each session is simulated; N is `times` times `sessions`. Session i
                 draws the same numbers as session i modulo `sessions`.
         """

@@ -75,7 +75,6 @@ def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> Training
 
     Args:
         train: view of a store of items whose episodes name their users.
-        folder: receives the fitted effects.
         seed: of the sessions drawn by `sessions_of`.
 
     Raises:

@@ -35,9 +35,6 @@ def add_distractor(
         flip: probability that the bit is flipped; see `ucfrec.episodes.distractor.reward_bit`.
         early: indicate the next reward, as `reward_bit` does.
 
-    Returns:
-        The new store.
-
     Raises:
         InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
     """
@@ -60,9 +57,6 @@ def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> P
         data: folder with the HDF5 files.
         file: name of the HDF5 file without its extension.
         distractor: key of `DISTRACTORS`.
-
-    Returns:
-        Folder of the store.
 
     Raises:
         InputError: the HDF5 file is missing, invalid or not that of the store, or the distractor

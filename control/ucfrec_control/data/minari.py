@@ -110,9 +110,6 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
         identifier: Minari identifier of the new dataset, such as `mujoco/hopper/medium-v0`.
         env_id: environment to record; None for the one recorded in `trajectories`.
 
-    Returns:
-        Folder of the dataset.
-
     Raises:
         InputError: `identifier` is invalid or already exists, or the environment is not registered.
     """

@@ -126,9 +126,6 @@ class Trajectories:
         often ordered by behaviour policy, from weakest to best, so the last trajectories would
         represent a single policy.
 
-        Returns:
-            The new store.
-
         Raises:
             InputError: `out` already exists.
         """

@@ -113,9 +113,6 @@ def _d4rl_ant(folder: Path) -> str:
     """Write Gymnasium's ant with D4RL's time step, motors and contacts to a file in `folder`.
 
     The bodies are the same in both.
-
-    Returns:
-        Path of the file.
     """
     tree = ET.parse(_ANT)
     changes = {

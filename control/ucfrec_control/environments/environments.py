@@ -130,9 +130,6 @@ def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
     Args:
         dataset: the entry `source` of a control store.
         env_id: Gymnasium's identifier of the evaluation's environment.
-
-    Returns:
-        One warning for each difference.
     """
     warnings_ = []
     if dataset["env_id"] not in (None, env_id):

@@ -14,7 +14,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.metrics import bootstrap_interval
+from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.reporting.statistics import summary
 from ucfrec.results.row import ResultRow

@@ -89,9 +89,6 @@ def train_control(
         screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
         shared: as `ucfrec.runs.run.train_run` has it.
 
-    Returns:
-        The run's record.
-
     Raises:
         InputError: as `train_screened`, or the store is not a control store.
     """

@@ -48,9 +48,6 @@ def record_episode(
         target: target return; None for the preset's first.
         distractor: value that every distractor is fixed to.
 
-    Returns:
-        The return of the episode.
-
     Raises:
         InputError: as `evaluate_run`, or `out` exists, or the environment cannot be rendered.
     """

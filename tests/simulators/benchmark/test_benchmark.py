@@ -1,5 +1,6 @@
 """The recommendation benchmark: what it measures, what it reuses, and what its tables say."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
+from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import append_rows, read_rows
 from ucfrec.runs.record import read_record
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
@@ -55,6 +57,25 @@ def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UCFREC_DATA", str(tmp_path / "nothing"))
 
 
+def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> None:
+    # Each run acts by its own rule.
+    runs = {TrainedPolicy.load(path.parent).rule for path in out.rglob(RUN)}
+    told = {f"{rule} ({rule.hash})" for rule in runs}
+    assert {row.rule for row in rows if row.training_seed is not None} == told
+    assert {row.target_return for row in rows if row.method == "dt+shared"} <= {
+        r.target for r in runs
+    }
+    assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
+    records = [read_json(path) for path in out.rglob(RUN)]
+    choices = [record["rule"] for record in records if "rule" in record]
+    own = [each for one in choices for each in one["candidates"] if each["rule"] == one["rule"]]
+    of_dt = [row.metrics for row in rows if row.method == "dt+shared"]
+    assert len(own) == len(choices) == len(of_dt)
+    assert {each["estimated_value"] for each in of_dt} == {each["value"] for each in own}
+    assert {each["estimated_value_error"] for each in of_dt} == {each["error"] for each in own}
+    assert not any("estimated_value" in row.metrics for row in rows if row.method != "dt+shared")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
 def test_rows_are_those_of_the_evaluation_and_are_measured_once(
@@ -84,22 +105,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert (found.value, found.interval) == (played.value, played.interval)
     # Whatever the training seed, the same episodes are reported.
     assert {row.evaluation_seed for row in rows} == {1_000_000}
-    # Each run acts by its own rule.
-    runs = {TrainedPolicy.load(path.parent).rule for path in (tmp_path / "out").rglob(RUN)}
-    told = {f"{rule} ({rule.hash})" for rule in runs}
-    assert {row.rule for row in rows if row.training_seed is not None} == told
-    assert {row.target_return for row in rows if row.method == "dt+shared"} <= {
-        r.target for r in runs
-    }
-    assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
-    records = [read_json(path) for path in (tmp_path / "out").rglob(RUN)]
-    choices = [record["rule"] for record in records if "rule" in record]
-    own = [each for one in choices for each in one["candidates"] if each["rule"] == one["rule"]]
-    of_dt = [row.metrics for row in rows if row.method == "dt+shared"]
-    assert len(own) == len(choices) == len(of_dt)
-    assert {each["estimated_value"] for each in of_dt} == {each["value"] for each in own}
-    assert {each["estimated_value_error"] for each in of_dt} == {each["error"] for each in own}
-    assert not any("estimated_value" in row.metrics for row in rows if row.method != "dt+shared")
+    assert_rules_are_those_of_the_runs(rows, tmp_path / "out")
     configurations = read_configurations(tmp_path)
     dims = {configurations[str(r.config_hash)]["policy"]["dim"] for r in rows if r.config_hash}
     assert dims == {8}

@@ -1,30 +1,26 @@
-"""What the commands add to the model cards of the runs that they measure."""
+"""What measurements of a run add to its model card."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.results.row import ResultRow
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.off_policy.estimators import LOGGED
+from ucfrec.off_policy.evaluate import OffPolicyReport
+from ucfrec.provenance import without_folders
+from ucfrec.reporting.model_card import add_measurement
+from ucfrec.results.row import ResultRow
 
 
-def card_of_evaluation(run: Path, row: "ResultRow") -> None:
+def card_of_evaluation(run: Path, row: ResultRow) -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
-    from ucfrec.reporting.model_card import add_measurement
-
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
     of = f"{row.environment}, {_rule(row)}, checkpoint {row.checkpoint}"
     values = {**_values(row, "R_cum", names), "seed": row.evaluation_seed}
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
-def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
+def card_of_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -> None:
     """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
-    from ucfrec.off_policy.estimators import LOGGED
-    from ucfrec.provenance import without_folders
-    from ucfrec.reporting.model_card import add_measurement
-
     rows = {row.method: row for row in report.rows}
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
@@ -39,11 +35,9 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport")
 
 
 def card_of_ranking(
-    run: Path, row: "ResultRow", measures: Iterable[str], on: str, said: Sequence[str] = ()
+    run: Path, row: ResultRow, measures: Iterable[str], on: str, said: Sequence[str] = ()
 ) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
-    from ucfrec.reporting.model_card import add_measurement
-
     intervals = row.details["intervals"]
     values: dict[str, object] = {}
     for name in (*measures, "coverage"):
@@ -56,13 +50,11 @@ def card_of_ranking(
     add_measurement(run, "ucfrec rank", of, values, said)
 
 
-def _rule(row: "ResultRow") -> str:
-    from ucfrec.acting.decision import DecisionRule
-
+def _rule(row: ResultRow) -> str:
     return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
 
 
-def _values(row: "ResultRow", main: str, names: Iterable[str]) -> dict[str, object]:
+def _values(row: ResultRow, main: str, names: Iterable[str]) -> dict[str, object]:
     """The named values, `main` with its interval."""
     line = row.as_line()
     found = {name: line[name] for name in names if line.get(name) is not None}

@@ -1,0 +1,146 @@
+"""A grown store has all rows of its logs once, with the old numbers, and reads no old log."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.support.later import NEW, later_log, later_mapping
+from tests.support.tagged import ITEMS, USERS, tagged_log, tagged_store
+from ucfrec import schema
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.logs.append import AppendOptions, append_logs
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+
+
+def rows_of(path: Path) -> list[tuple[int, int, int, float]]:
+    """All rows of a store, with the identifiers of its users and items, sorted."""
+    store = EpisodeStore.open(path)
+    users, items = (
+        pq.read_table(path / f"{name}.parquet")[f"{name[:-1]}_id"].to_numpy()
+        for name in ("users", "items")
+    )
+    places = store.all_steps()
+    of_steps = users[store.episode_values(schema.USER).astype(int)[places[0]]]
+    columns = [
+        of_steps,
+        items[store.step_values(schema.ITEM, *places)],
+        *(store.step_values(name, *places) for name in (schema.TIMESTAMP, schema.REWARD)),
+    ]
+    return sorted(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def rows_in(*logs: pd.DataFrame) -> list[tuple[int, int, int, float]]:
+    frame = pd.concat(logs)[["user_id", "item_id", "timestamp", "reward"]]
+    return sorted(frame.itertuples(index=False, name=None))
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `store` and the one that was grown from it, `grown`."""
+    folder = tmp_path_factory.mktemp("grown")
+    tagged_store(folder)
+    (folder / "log.parquet").unlink()  # no old log is read again
+    later_log().to_parquet(folder / "later.parquet")
+    mapping = later_mapping(folder)
+    append_logs(folder / "store", [folder / "later.parquet"], folder / "grown", mapping)
+    return folder
+
+
+def test_every_row_is_there_once_and_old_numbers_stay(grown: Path) -> None:
+    assert rows_of(grown / "grown") == rows_in(tagged_log(), later_log())
+    for name, new in (("users", USERS + NEW), ("items", ITEMS + NEW)):
+        old, all_ids = (
+            pq.read_table(grown / store / f"{name}.parquet")[f"{name[:-1]}_id"].to_pylist()
+            for store in ("store", "grown")
+        )
+        assert all_ids[: len(old)] == old
+        assert len(all_ids) == len(set(all_ids)) == new
+    assert main(["verify", str(grown / "grown"), str(grown / "store")]) == 0
+
+
+def test_old_rows_train_and_the_newest_are_held_out(grown: Path) -> None:
+    store = EpisodeStore.open(grown / "grown")
+    ends = [
+        store.split(name).step_values(schema.TIMESTAMP, *store.split(name).all_steps())
+        for name in schema.SPLITS
+    ]
+    assert ends[0].max() < ends[1].min() <= ends[1].max() < ends[2].min()
+    assert len(ends[1]) == len(ends[2]) == 60
+    counts = store.split("train").item_counts()
+    assert pq.read_table(grown / "grown" / "items.parquet")["train_count"].to_pylist() == [*counts]
+
+
+def test_old_shards_are_shared_and_old_vectors_stay(grown: Path) -> None:
+    old, new = (EpisodeStore.open(grown / name) for name in ("store", "grown"))
+    shard = "shard-00000/item.npy"
+    assert (grown / "store" / shard).samefile(grown / "grown" / shard)
+    vectors = new.item_states.embeddings.numpy()
+    np.testing.assert_array_equal(vectors[:ITEMS], old.item_states.embeddings.numpy())
+    # New items have the tags of items 0 to 5, which the tables call by other numbers.
+    tags = new.item_states.tags.numpy()
+    for item in range(ITEMS, ITEMS + NEW):
+        assert {*tags[item]} == {*tags[item - 12]}
+        distance = np.linalg.norm(vectors[:ITEMS] - vectors[item], axis=1)
+        assert item % 4 == distance.argmin() % 4
+
+
+def test_the_same_logs_count_once(grown: Path, tmp_path: Path) -> None:
+    mapping, logs = later_mapping(grown), [grown / "later.parquet"]
+    again = append_logs(grown / "store", logs, grown / "grown", mapping)
+    assert again["new_items"] == NEW
+    later_log(seed=2).to_parquet(tmp_path / "next.parquet")
+    both = [*logs, tmp_path / "next.parquet"]
+    with pytest.warns(match="end of an updated store"):
+        report = append_logs(grown / "grown", both, tmp_path / "third", mapping)
+    assert report["dropped"]["clock_out_of_range"] == 300
+    assert rows_of(tmp_path / "third") == rows_in(tagged_log(), later_log(), later_log(seed=2))
+    with pytest.raises(InputError, match="store of other logs"):
+        append_logs(grown / "store", both, grown / "grown", mapping)
+
+
+@settings(max_examples=8)
+@given(hours=st.integers(3, 60))
+def test_a_window_forgets_the_sessions_that_ended_before(
+    grown: Path, tmp_path_factory: pytest.TempPathFactory, hours: int
+) -> None:
+    out = tmp_path_factory.mktemp("window") / "store"
+    window = AppendOptions(window_ms=hours * 3_600_000)
+    logs, mapping = [grown / "later.parquet"], later_mapping(grown)
+    report = append_logs(grown / "store", logs, out, mapping, window)
+    found, every = rows_of(out), rows_in(tagged_log(), later_log())
+    cut = later_log().timestamp.max() - window.window_ms if window.window_ms else 0
+    assert {row for row in every if row[2] >= cut} <= {*found} <= {*every}
+    assert len(found) == len(every) - report["expired_steps"]
+    store = EpisodeStore.open(out)
+    # Sessions stay whole: the latest step of each old one is inside.
+    places = store.all_steps()
+    times = store.step_values(schema.TIMESTAMP, *places)
+    assert all(times[places[0] == e].max() >= cut for e in range(store.n_episodes))
+    counts = store.split("train").item_counts()
+    assert pq.read_table(out / "items.parquet")["train_count"].to_pylist() == [*counts]
+
+
+def test_propensities_may_begin_with_the_new_logs(grown: Path, tmp_path: Path) -> None:
+    later_log(propensity=True).to_parquet(tmp_path / "later.parquet")
+    append_logs(grown / "store", [tmp_path / "later.parquet"], tmp_path / "store")
+    store = EpisodeStore.open(tmp_path / "store")
+    known = ~np.isnan(store.step_values(schema.PROPENSITY, *store.all_steps()))
+    assert known.sum() == 300
+
+
+def test_text_and_numbers_are_not_mixed(tmp_path: Path) -> None:
+    log = tagged_log().assign(item_id=lambda frame: frame.item_id.astype(str) + "x")
+    log.to_parquet(tmp_path / "log.parquet")
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", PrepareOptions())
+    later_log().to_parquet(tmp_path / "later.parquet")
+    with pytest.raises(InputError, match="item_id is a number"):
+        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
+    assert not (tmp_path / "grown").exists()

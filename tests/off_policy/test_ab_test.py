@@ -1,0 +1,91 @@
+"""The difference of two arms: what is planted is found, and looking often finds nothing else."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.off_policy.ab_test import always_valid, compare_arms
+
+
+def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFrame:
+    """Items shown to users who click more or less often, a fifth of them in arm b."""
+    rng = np.random.default_rng(seed)
+    user = np.repeat(np.arange(users), per_user)
+    rate = rng.beta(1, 4, users)[user] * np.where(user % 5 == 0, 1 + lift, 1)
+    clicks = (rng.random(len(user)) < rate).astype(int)
+    arm = np.where(user % 5 == 0, "b", "a")
+    return pd.DataFrame({"user_id": user.astype(str), "arm": arm, "feedback": clicks})
+
+
+def test_a_planted_difference_is_found_with_its_size(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log(8000, 0.4).to_parquet(tmp_path / "log.parquet")
+    arguments = ["compare", str(tmp_path / "log.parquet"), "--expected", "0.05"]
+    assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert found["arms"] == ["a", "b"]
+    assert found["low"] < 0.2 * 0.4 < found["high"]
+    assert found["always_low"] < found["low"]
+    assert found["always_low"] > 0
+    assert "b is better than a" in capsys.readouterr().out
+
+
+def test_rows_of_one_user_count_as_one(tmp_path: Path) -> None:
+    log(500, 0.0).to_parquet(tmp_path / "log.parquet")
+    once = compare_arms([tmp_path / "log.parquet"])
+    frame = log(500, 0.0)
+    pd.concat([frame] * 4).to_parquet(tmp_path / "again.parquet")
+    assert compare_arms([tmp_path / "again.parquet"]).error == pytest.approx(once.error)
+
+
+def test_users_in_both_arms_and_rows_without_one_are_left_out(tmp_path: Path) -> None:
+    frame = log(200, 0.0)
+    both = frame[frame.user_id == "1"].assign(arm="b")
+    pd.concat([frame, both, frame.assign(arm="")]).to_parquet(tmp_path / "log.parquet")
+    found = compare_arms([tmp_path / "log.parquet"])
+    assert (found.in_both, found.users) == (1, (159, 40))
+    named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
+    assert named.difference == pytest.approx(-found.difference)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"arm": "a"}, "two arms"),
+        ({"feedback": "x"}, "no number"),
+        ({"arm": None}, "two arms"),
+    ],
+)
+def test_logs_without_two_arms_are_refused(
+    tmp_path: Path, change: dict[str, str], message: str
+) -> None:
+    log(50, 0.0).assign(**change).to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match=message):
+        compare_arms([tmp_path / "log.parquet"])
+    log(50, 0.0).to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="no column clicks"):
+        compare_arms([tmp_path / "log.parquet"], "clicks")
+
+
+def test_looking_every_day_finds_a_difference_that_is_not_there_in_few_tests() -> None:
+    """40 looks at tests without a difference; the interval of a planned end is wrong in many."""
+    rng = np.random.default_rng(0)
+    tests, looks, users = 600, 40, 50
+    values = rng.exponential(size=(tests, 2, looks * users)) - 1
+    wrong = {"always": np.zeros(tests, dtype=bool), "planned": np.zeros(tests, dtype=bool)}
+    for look in range(1, looks + 1):
+        seen = values[:, :, : look * users]
+        difference = seen[:, 1].mean(1) - seen[:, 0].mean(1)
+        variance = (seen.var(axis=2) / seen.shape[2]).sum(axis=1)
+        for test in range(tests):
+            low, high = always_valid(difference[test], variance[test], 0.1)
+            wrong["always"][test] |= not low <= 0 <= high
+        wrong["planned"] |= np.abs(difference) > 1.96 * np.sqrt(variance)
+    assert wrong["always"].mean() <= 0.05
+    assert wrong["planned"].mean() > 0.2

@@ -1,0 +1,111 @@
+"""The pointer to the served run: only runs with a verdict, atomically, and back again."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.support.killed import kills
+from tests.support.served import trained_run
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.runs.promoted import POINTER, promote, promote_back, promoted
+from ucfrec.runs.record import Difference, RunRecord, Update, UpdateVerdict
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    return trained_run(tmp_path_factory.mktemp("promoted"))
+
+
+def runs(trained: TrainedPolicy, folder: Path, *names: str) -> Path:
+    for name in names:
+        shutil.copytree(trained.folder, folder / name)
+    return folder
+
+
+def updated(run: Path, of: TrainedPolicy, result: str) -> Path:
+    """Give a run a verdict against another one."""
+    difference = Difference(measure="ndcg_liked", value=0.1, low=0.0, high=0.2)
+    verdict = UpdateVerdict.model_validate(
+        {"result": result, "decided_by": "x", "differences": [difference], "steps": 9, "users": 3}
+    )
+    update = Update(
+        of="a", run=of.fingerprint, settings_from_nothing={}, appended={}, verdict=verdict
+    )
+    RunRecord.read(run).with_entries(update=update).written(run)
+    return run
+
+
+def current(folder: Path) -> str | None:
+    found = promoted(folder)
+    return None if found is None else found.current
+
+
+def test_a_first_run_needs_no_verdict_and_later_ones_do(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path, "a", "b", "c")
+    promote(folder / "a")
+    with pytest.raises(InputError, match="no verdict"):
+        promote(folder / "b")
+    with pytest.raises(InputError, match="worse than a"):
+        promote(updated(folder / "b", trained, "worse"))
+    assert current(folder) == "a"
+    promote(updated(folder / "b", trained, "no significant difference"))
+    assert current(folder) == "b"
+    promote(folder / "c", force=True)
+    promote(folder / "c")  # again: nothing changes
+    found = promoted(folder)
+    assert found is not None
+    assert (found.current, found.previous) == ("c", ("a", "b"))
+
+
+def test_a_verdict_against_another_run_does_not_count(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path, "a", "b")
+    record = RunRecord.read(folder / "a").with_entries(seed=5)
+    record.with_entries(fingerprint="another store").written(folder / "a")
+    promote(folder / "a")
+    with pytest.raises(InputError, match="was compared with a, not with the current run a"):
+        promote(updated(folder / "b", trained, "better"))
+
+
+def test_back_returns_as_often_as_there_was_a_run(trained: TrainedPolicy, tmp_path: Path) -> None:
+    folder = runs(trained, tmp_path, "a", "b")
+    with pytest.raises(InputError, match="no run was current before"):
+        promote_back(folder)
+    promote(folder / "a")
+    assert main(["promote", str(folder / "b"), "--force"]) == 0
+    assert main(["promote", str(folder), "--back"]) == 0
+    assert current(folder) == "a"
+    assert main(["promote", str(folder), "--back"]) == 2
+    assert current(folder) == "a"
+
+
+def test_a_damaged_run_or_pointer_is_refused(trained: TrainedPolicy, tmp_path: Path) -> None:
+    folder = runs(trained, tmp_path, "a", "b")
+    promote(folder / "a")
+    weights = folder / "b" / "policy" / "best.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"?")
+    with pytest.raises(InputError, match=r"best\.safetensors"):
+        promote(folder / "b", force=True)
+    assert current(folder) == "a"
+    outside = {"files": {}, "current": "a", "previous": ["../a"]}
+    for wrong in (outside, {"files": {}, "current": 3}, {"files": {}}):
+        (folder / POINTER).write_text(json.dumps(wrong))
+        with pytest.raises(InputError, match=POINTER):
+            promote_back(folder)
+
+
+def test_a_promotion_killed_at_any_moment_leaves_a_whole_pointer(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path, "run", "other")
+    promote(folder / "run")
+    assert kills("promote", folder) >= 10
+    promote(folder / "other", force=True)
+    assert current(folder) == "other"

@@ -1,0 +1,154 @@
+"""A search goes on where it ended, gives the same trials again, and writes what training takes."""
+
+import json
+import sqlite3
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+import optuna
+import pytest
+
+from tests.recommending.test_recommend import random_log
+from ucfrec import EpisodeStore
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.tuning.objective import measured
+from ucfrec.tuning.space import Dimension, Search
+from ucfrec.tuning.study import BEST, STUDY, Plan, finished, tune
+
+FIXED = {
+    "train.validate_every": 2,
+    "policy.context": 3,
+    "rule.sessions": 2,
+    "rule.quantiles": [1.0],
+    "rule.temperatures": [0.0],
+}
+SPACE = {
+    "train.learning_rate": Dimension(low=1e-3, high=1e-1, log=True),
+    "train.steps": Dimension(low=2, high=6),
+    "policy.dim": Dimension((4, 8)),
+    "rule.reward_weights": Dimension((0.0, 2.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tuning")
+    random_log().to_parquet(folder / "log.parquet")
+    options = PrepareOptions(session_by="gap", gap_minutes=20)
+    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    return folder / "store"
+
+
+def plan(store: Path, out: Path, policies: tuple[str, ...] = ("dt",), metric: str = "gauc") -> Plan:
+    return Plan(store, out, Search(policies, FIXED, metric == "value", 0, SPACE), metric, k=5)
+
+
+def values(study: optuna.Study) -> list[tuple[float | None, Mapping[str, object]]]:
+    return [(trial.value, trial.params) for trial in finished(study)]
+
+
+@pytest.fixture(scope="module")
+def found(store: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, optuna.Study]:
+    searched = plan(store, tmp_path_factory.mktemp("found") / "tuned", ("dt", "item-rate"), "ndcg")
+    return searched, tune(searched, 6)
+
+
+def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]) -> None:
+    searched, study = found
+    assert len(finished(study)) == 6
+    best = searched.out / BEST
+    assert {path.name for path in searched.out.iterdir()} == {BEST, STUDY, "stages"}
+    trained = TrainedPolicy.load(best)
+    store = EpisodeStore.open(searched.store)
+    assert measured(trained, store, "ndcg", 5) == study.best_value
+    assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
+
+
+def test_a_search_goes_on_and_the_same_search_gives_the_same_trials(
+    store: Path, tmp_path: Path
+) -> None:
+    first = values(tune(plan(store, tmp_path / "a"), 3))
+    assert values(tune(plan(store, tmp_path / "a"), 3)) == first  # nothing is left to do
+    more = values(tune(plan(store, tmp_path / "a"), 5))
+    assert more[:3] == first
+    assert len({json.dumps(params) for _, params in more}) == 5
+    assert values(tune(plan(store, tmp_path / "b"), 3)) == first
+    with pytest.raises(InputError, match="is a search with another metric;"):
+        tune(plan(store, tmp_path / "a", metric="value"), 6)
+
+
+def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
+    study = tune(plan(store, tmp_path / "tuned"), 4, workers=2)
+    assert len(finished(study)) == 4
+    assert (tmp_path / "tuned" / BEST / RunRecord.FILE).exists()
+
+
+def test_a_killed_trial_is_run_again(store: Path, tmp_path: Path) -> None:
+    searched = plan(store, tmp_path / "tuned")
+    tune(searched, 1)
+    with sqlite3.connect(searched.out / STUDY) as study:  # as a process that was killed leaves it
+        study.execute("UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
+        study.execute("DELETE FROM trial_values")
+    resumed = tune(searched, 1)
+    states = [trial.state.name for trial in resumed.trials]
+    assert states == ["FAIL", "COMPLETE"]
+    assert resumed.trials[0].params == resumed.trials[1].params
+
+
+def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
+    rates = {
+        "train.learning_rate": Dimension((0.03, 1e-6)),
+        "policy.dropout": Dimension(low=0.0, high=0.5),
+    }
+    fixed = {**FIXED, "train.steps": 12, "policy.dim": 8, "rule.choose": False}
+    search = Search(("dt",), fixed, False, 0, rates)
+    study = tune(Plan(store, tmp_path / "tuned", search, "gauc", 5), 12)
+    ended = [trial for trial in study.trials if trial.state.name == "PRUNED"]
+    assert ended
+    assert all(max(trial.intermediate_values) <= 12 for trial in ended)
+    assert study.trials.index(ended[0]) >= 4
+
+
+def test_the_command_writes_settings_that_train_takes(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = tmp_path / "space.toml"
+    space.write_text("[train]\nsteps = [2, 3]\n[policy]\ndropout = {low = 0.0, high = 0.2}\n")
+    fixed = [f"--set={name}={value}" for name, value in FIXED.items()]
+    out = tmp_path / "tuned"
+    given = ["tune", str(store), "--out", str(out), "--policy", "dt", "--trials", "4"]
+    assert main([*given, "--space", str(space), *fixed, "--set", "policy.dim=8"]) == 0
+    printed = capsys.readouterr().out
+    assert "next: ucfrec ope" in printed
+    settings = tomllib.loads((out / "best.toml").read_text(encoding="utf-8"))
+    assert settings["policy"]["dim"] == 8
+    config = resolve_config("dt", out / "best.toml")
+    assert config == RunRecord.read(out / BEST).config
+    page = (out / "tuning.md").read_text(encoding="utf-8")
+    assert "## Importance" in page
+    assert page.count("\n| ") >= 4
+
+
+def test_what_cannot_be_searched(store: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"policy.dim is 0"):
+        Search(("dt",), {}, True, 0, {"policy.dim": Dimension((0,))})
+    with pytest.raises(InputError, match="no policy is called 'nothing'"):
+        Search(("nothing",), {}, True, 0)
+    for values_of, message in (
+        ({}, "give a list of choices, or low and high"),
+        ({"low": 2, "high": 1}, "give the lower one first"),
+        ({"low": 0.0, "high": 1.0, "log": True}, "above 0 with log"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Dimension(**values_of)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="0 trials and 1 workers"):
+        tune(plan(store, tmp_path / "tuned"), 0)
+    unchosen = Search(("item-rate",), {"rule.choose": False}, True, 0)
+    with pytest.raises(InputError, match=r"no trial could be measured: .*use --metric ndcg"):
+        tune(Plan(store, tmp_path / "tuned", unchosen), 1)

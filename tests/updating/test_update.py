@@ -1,0 +1,149 @@
+"""An updated run knows the new rows, starts from the old weights, and says how it compares."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.killed import kills
+from tests.support.later import NEW, later_log, later_mapping
+from tests.support.served import SETTINGS, trained_run
+from tests.support.tagged import ITEMS
+from ucfrec import Recommender
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_tensors
+from ucfrec.logs.append import AppendOptions
+from ucfrec.runs.record import RunRecord
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.updating.update import UpdateOptions, update_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`run`, and `run2`, its update with `later.parquet`."""
+    folder = tmp_path_factory.mktemp("updated")
+    trained_run(folder)
+    later_log(propensity=True).to_parquet(folder / "later.parquet")
+    mapping = later_mapping(folder)
+    update_run(folder / "run", [folder / "later.parquet"], folder / "run2", mapping=mapping)
+    return folder
+
+
+def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None:
+    old, record = TrainedPolicy.load(folder / "run"), RunRecord.read(folder / "run2")
+    update = record.update
+    assert update is not None
+    assert update.drift is not None
+    assert update.verdict is not None
+    assert (update.of, update.run) == ("run", old.fingerprint)
+    assert update.appended["new_items"] == update.appended["new_users"] == NEW
+    log = later_log(propensity=True)
+    assert update.drift["unknown_items"] == pytest.approx((log.item_id >= ITEMS).mean())
+    assert update.drift["observed"] == pytest.approx(log.reward[log.item_id < ITEMS].mean())
+    assert {each.measure for each in update.verdict.differences} == {
+        "ndcg_liked", "reward per step"
+    }  # fmt: skip
+    assert update.verdict.steps == 60
+    assert record.finished.steps < old.record.finished.steps
+    assert record.rule is not None
+    assert main(["verify", str(folder / "run2")]) == 0
+
+
+def test_the_updated_run_recommends_new_items(folder: Path) -> None:
+    trained = TrainedPolicy.load(folder / "run2")
+    assert trained.item_ids is not None
+    assert trained.item_ids.tolist() == list(range(ITEMS + NEW))
+    later_log().to_parquet(folder / "histories.parquet")
+    arguments = ["recommend", str(folder / "run2"), str(folder / "histories.parquet")]
+    out = folder / "out.parquet"
+    assert main([*arguments, "--k", "30", "--keep-seen", "--out", str(out)]) == 0
+
+
+def test_an_update_of_an_update_has_the_settings_of_the_first_run(folder: Path) -> None:
+    later_log(seed=2).to_parquet(folder / "next.parquet")
+    mapping = later_mapping(folder)
+    third = update_run(folder / "run2", [folder / "next.parquet"], folder / "run3", mapping=mapping)
+    second = RunRecord.read(folder / "run2")
+    assert second.update is not None
+    assert third.update is not None
+    assert third.update.settings_from_nothing == second.update.settings_from_nothing
+    assert third.config == second.config
+
+
+def test_the_same_command_goes_on_and_another_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapping = later_mapping(folder)
+    before = RunRecord.read(folder / "run2")
+    logs = [folder / "later.parquet"]
+    again = update_run(folder / "run", logs, folder / "run2", mapping=mapping)
+    assert (again.update, again.rule, again.policy) == (before.update, before.rule, before.policy)
+    name = "policy/best.safetensors"
+    assert again.files[name] == before.files[name]
+    later_log(seed=3).to_parquet(tmp_path / "other.parquet")
+    with pytest.raises(InputError, match="store of other logs"):
+        update_run(folder / "run", [tmp_path / "other.parquet"], folder / "run2", mapping=mapping)
+    assert main(["update", str(folder / "later.parquet"), str(logs[0]), "--out", "x"]) == 2
+    assert "run folder" in capsys.readouterr().err
+
+
+def test_the_command_says_what_was_read_and_what_is_better(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["update", str(folder / "run"), str(folder / "later.parquet")]
+    arguments += ["--out", str(tmp_path / "run2"), "--window", "20d", "--split", "0.5,0.25,0.25"]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "new rows      300 of 300 read (0 not newer" in said
+    assert "drift " in said
+    assert "verdict " in said
+    record = RunRecord.read(tmp_path / "run2")
+    assert record.update is not None
+    assert record.update.verdict is not None
+    assert record.update.verdict.steps == 75
+    assert main([*arguments[:5], "--window", "soon"]) == 2
+    assert "--window soon is no time" in capsys.readouterr().err
+
+
+def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:
+    settings = [*SETTINGS, "augment.copies=1", "crm.epochs=12"]
+    Recommender("ucf", settings).fit(EpisodeStore.open(folder / "store"), tmp_path / "run")
+    logs = [folder / "later.parquet"]
+    record = update_run(tmp_path / "run", logs, tmp_path / "run2")
+    assert record.augmentation is not None
+    assert record.config.crm.epochs == 2
+    old = load_tensors(tmp_path / "run" / "crm" / "cvae" / "best.safetensors")[0]
+    new = load_tensors(tmp_path / "run2" / "crm" / "cvae" / "best.safetensors")[0]
+    assert torch.equal(old["state_mean"], new["state_mean"])
+    assert any(not torch.equal(old[name], new[name]) for name in old)
+
+
+def test_logs_that_leave_nothing_to_compare_on_are_refused(folder: Path, tmp_path: Path) -> None:
+    options = UpdateOptions(AppendOptions(split=(0.5, 0.5, 0.0)))
+    with pytest.raises(InputError, match="no test rows"):
+        update_run(folder / "run", [folder / "later.parquet"], tmp_path / "run2", options=options)
+    assert not (tmp_path / "run2").exists()
+
+
+def test_a_seed_and_a_share_of_the_steps_may_be_given(folder: Path, tmp_path: Path) -> None:
+    options = UpdateOptions(share=0.5, seed=7)
+    logs = [folder / "later.parquet"]
+    record = update_run(folder / "run", logs, tmp_path / "run2", options=options)
+    assert record.config.seed == 7
+    assert record.config.train.steps == 10
+    assert np.isfinite(record.finished.best_validation)
+
+
+def test_an_update_killed_at_any_moment_ends_as_if_left_alone(folder: Path) -> None:
+    assert kills("update", folder) >= 3
+    alone, killed = (RunRecord.read(folder / name) for name in ("run2", "killed"))
+    assert killed.update == alone.update
+    assert killed.rule == alone.rule
+    for name in ("policy/best.safetensors", "refit/policy/best.safetensors"):
+        expected, found = (load_tensors(folder / run / name)[0] for run in ("run2", "killed"))
+        assert expected.keys() == found.keys()
+        assert all(torch.equal(expected[key], found[key]) for key in expected)
+    assert main(["verify", str(folder / "killed"), str(folder / "killed-store")]) == 0

@@ -1,0 +1,92 @@
+"""The verdict finds a better and a worse run, and doubts what the log cannot tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ucfrec import Recommender
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.runs.record import UpdateVerdict
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.updating.verdict import compare_runs, describe
+
+ITEMS = 12
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    """A policy of item rates on a log of uniform draws, in which low items are liked."""
+    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("verdict")
+    rows = 4000
+    log = pd.DataFrame({"user_id": np.arange(rows) // 5, "item_id": rng.integers(ITEMS, size=rows)})
+    log["timestamp"] = 1_700_000_000_000 + np.arange(rows) * 1000
+    log["reward"] = (rng.random(rows) < 0.8 - 0.06 * log.item_id) * 1.0
+    log["propensity"] = 1 / ITEMS
+    log.to_parquet(folder / "log.parquet")
+    options = PrepareOptions(split=(0.6, 0.1, 0.3))
+    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    Recommender("item-rate").fit(EpisodeStore.open(folder / "store"), folder / "run")
+    return TrainedPolicy.load(folder / "run")
+
+
+def verdict(
+    new: TrainedPolicy, old: TrainedPolicy, rows: EpisodeStore | None = None
+) -> UpdateVerdict:
+    store = EpisodeStore.open(new.folder.parent / "store")
+    return compare_runs(new, old, rows or store.split("test"), 0)
+
+
+def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
+    """A run that shows the items which are liked least."""
+    policy = TrainedPolicy.load(trained.folder).policy
+    for name, value in policy.state_dict().items():
+        if value.shape == (ITEMS,) and value.is_floating_point() and "count" not in name:
+            value.copy_(-value)
+    return replace(trained, policy=policy)
+
+
+def test_a_better_and_a_worse_run_are_told_apart(trained: TrainedPolicy) -> None:
+    rule = DecisionRule(trained.rule.target, temperature=0.3)
+    good = replace(trained, rule=rule)
+    bad = replace(reversed_of(trained), rule=rule)
+    for new, old, result, sign in ((good, bad, "better", 1), (bad, good, "worse", -1)):
+        found = verdict(new, old)
+        assert (found.result, found.decided_by) == (result, "reward per step")
+        assert all(each.sign == sign for each in found.differences)
+        assert describe(found).count("for" if sign > 0 else "against") >= 2
+
+
+def test_a_run_is_level_with_itself(trained: TrainedPolicy) -> None:
+    found = verdict(trained, trained)
+    assert found.result == "no significant difference"
+    assert all(each.value == 0 for each in found.differences)
+
+
+def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store").split("test")
+    places = store.all_steps()
+    steps = {n: store.step_values(n, *places) for n in ("item", "reward", "timestamp")}
+    episodes = {n: store.episode_values(n) for n in ("user", "terminated")}
+    bare = EpisodeStore.from_arrays(steps, store.lengths, episodes, trained.item_states)
+    found = verdict(trained, reversed_of(trained), bare)
+    assert (found.result, found.decided_by) == ("better", "ndcg_liked")
+    assert len(found.differences) == 1
+
+
+def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store").split("test")
+    places = store.all_steps()
+    steps = {n: store.step_values(n, *places) for n in store.record.columns}
+    steps["propensity"] = steps["propensity"] * 5
+    episodes = {n: store.episode_values(n) for n in ("user", "terminated")}
+    wrong = EpisodeStore.from_arrays(steps, store.lengths, episodes, trained.item_states)
+    rule = DecisionRule(trained.rule.target, temperature=0.3)
+    found = verdict(replace(trained, rule=rule), replace(trained, rule=rule), wrong)
+    assert (found.result, found.decided_by) == ("no significant difference", "reward per step")
+    assert "where 1 is expected" in found.differences[-1].doubt
+    assert "not reliable" in describe(found)

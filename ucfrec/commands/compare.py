@@ -1,0 +1,62 @@
+"""`ucfrec compare`: the difference between two runs that shared the traffic."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.commands.options import memory_option
+from ucfrec.errors import InputError
+from ucfrec.files.remote import Input, uri_or_path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec compare`."""
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        type=uri_or_path(Input, str),
+        metavar="LOGS",
+        help="logs of `ucfrec join`, whose exposures `serve --split` wrote",
+    )
+    parser.add_argument(
+        "--column",
+        default="feedback",
+        help="feedback that counts, a number of each shown item (default: feedback, its rows)",
+    )
+    parser.add_argument(
+        "--arms", metavar="A,B", help="compare B with A (default: the two arms that there are)"
+    )
+    parser.add_argument(
+        "--expected",
+        type=float,
+        metavar="DIFFERENCE",
+        help="difference per shown item that the interval at any time is shortest for; fix it "
+        "before the test (default: 5%% of the value of A)",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers as JSON")
+    memory_option(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec compare` and print both arms and their difference.
+
+    Raises:
+        InputError: a log cannot be used, or there are not two arms.
+    """
+    from dataclasses import asdict
+
+    from ucfrec.files.atomic import write_json
+    from ucfrec.off_policy.ab_test import compare_arms
+
+    arms = None
+    if options.arms is not None:
+        first, _, second = (part.strip() for part in options.arms.partition(","))
+        if not (first and second):
+            raise InputError(f"--arms {options.arms}: write two names, A,B")
+        arms = first, second
+    if options.expected is not None and not options.expected > 0:
+        raise InputError(f"--expected is {options.expected}; give a difference above 0")
+    limit = options.memory_limit
+    found = compare_arms(options.logs, options.column, arms, options.expected, limit)
+    print(f"{found}\n\n{found.conclusion}")
+    if options.json is not None:
+        write_json(options.json, asdict(found))

@@ -1,0 +1,56 @@
+"""`ucfrec datasets`: list public data sets, or download one."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.errors import InputError
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec datasets`."""
+    parser.add_argument(
+        "name", nargs="?", metavar="NAME", help="data set to load (default: list them)"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        metavar="DIR",
+        help="where its archive lies or is downloaded to, and is unpacked",
+    )
+    parser.add_argument(
+        "--part", help="of open-bandit: logging policy and campaign (default: random/all)"
+    )
+    parser.epilog = "Downloads need ucfrec[datasets] (pooch). Mind the licence of each data set."
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec datasets`: print the list, or how the loaded logs are prepared.
+
+    Raises:
+        InputError: there is no such data set, no folder is named, or it cannot be downloaded.
+    """
+    from ucfrec.logs.releases import find_release, load_release
+    from ucfrec.plugins import load_plugin, plugin_names
+    from ucfrec.reporting.tables import text_table
+
+    adapters = {name: load_plugin("datasets", name) for name in plugin_names("datasets")}
+    if options.name is None:
+        lines = [
+            (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)
+            for adapter, dataset in adapters.items()
+            for name, release in dataset.releases.items()
+        ]
+        print(text_table(("name", "--dataset", "archive", "licence", "from"), lines))
+        print("\nnext: ucfrec datasets NAME --folder DIR")
+        return
+    adapter = find_release(adapters, options.name)
+    if options.folder is None:
+        raise InputError(f"no folder is named; add --folder DIR for the files of {options.name}")
+    logs = load_release(adapter, adapters[adapter], options.name, options.folder, options.part)
+    release = adapters[adapter].releases[options.name]
+    part = release.parts[options.part or next(iter(release.parts))]
+    print(
+        f"{options.name}: {len(logs.files)} log files; {release.licence}, {release.homepage}\n"
+        f"next: ucfrec prepare '{options.folder / options.name / part}' --dataset {adapter} "
+        "--out store"
+    )

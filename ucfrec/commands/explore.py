@@ -1,0 +1,79 @@
+"""`ucfrec explore`: try out one or two policies in the browser."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from ucfrec.errors import InputError
+from ucfrec.processes import Interrupted
+
+_OWN_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec explore`."""
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        type=Path,
+        metavar="RUN",
+        help="run folder of `ucfrec train`; two are shown side by side",
+    )
+    parser.add_argument(
+        "--items",
+        type=Path,
+        metavar="FILE",
+        help="item features to show: Parquet or CSV with a column item_id; title (or name) and "
+        "image_url (or image) are shown as such (default: none)",
+    )
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        action="extend",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict "
+        "(default: none)",
+    )
+    parser.add_argument("--port", type=int, default=8081, help="0 for a free one (default: 8081)")
+    parser.epilog = "Answers this machine only. Needs ucfrec[serve]."
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec explore` until Ctrl-C or TERM.
+
+    Raises:
+        InputError: a run or file cannot be used, the extra `serve` is not installed, or the port
+            cannot be listened on.
+    """
+    try:
+        import uvicorn
+
+        from ucfrec.exploring.web import application
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"exploring needs {error.name}, which is not installed; install ucfrec[serve]"
+        ) from None
+    from ucfrec.exploring.page import Explorer
+    from ucfrec.recommending.server import Server, listening_socket
+    from ucfrec.reporting.samples import read_features
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    features = None if options.items is None else read_features(options.items)
+    runs = [TrainedPolicy.load(run) for run in options.runs]
+    explorer = Explorer(runs, features, options.results)
+    config = uvicorn.Config(
+        application(explorer, _OWN_NAMES),
+        http="h11",
+        h11_max_incomplete_event_size=2**16,
+        ws="none",
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+    )
+    with listening_socket("127.0.0.1", options.port) as listening:
+        try:
+            Server(config, "ucfrec explore", page="/").run([listening])
+        except Interrupted:
+            print("ucfrec explore: stopped", file=sys.stderr)

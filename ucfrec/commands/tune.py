@@ -1,0 +1,120 @@
+"""`ucfrec tune`: search the settings of a training on validation rows."""
+
+import argparse
+from pathlib import Path
+
+from ucfrec.errors import InputError
+from ucfrec.policies.registry import policy_names
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec tune`."""
+    parser.add_argument("store", type=Path, metavar="STORE", help="episode store to train on")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the search; a search in it goes on",
+    )
+    parser.add_argument(
+        "--policy",
+        action="append",
+        metavar="NAME",
+        help=f"policy: {', '.join(policy_names())}; repeatable to search the policy too "
+        "(default: ucf)",
+    )
+    parser.add_argument(
+        "--trials",
+        type=int,
+        default=30,
+        metavar="N",
+        help="trainings that the search has at the end (default: 30)",
+    )
+    _search_options(parser)
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the search and of every training (default: 0)"
+    )
+    parser.epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
+
+
+def _search_options(parser: argparse.ArgumentParser) -> None:
+    """Add what is searched, for what, and how."""
+    parser.add_argument(
+        "--metric",
+        choices=("value", "ndcg", "gauc"),
+        default="value",
+        help="what is maximised: the return of a session in the user model, or NDCG or GAUC on "
+        "validation rows (default: value)",
+    )
+    parser.add_argument(
+        "--k", type=int, default=10, help="items recommended, of --metric ndcg (default: 10)"
+    )
+    parser.add_argument(
+        "--space",
+        type=Path,
+        metavar="TOML",
+        help="settings to search, one table per section; each a list of choices or "
+        "{low = …, high = …, log = true} (default: rate, steps, width, context and dropout of "
+        "networks; also the reward weight with ndcg and gauc)",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="TABLE.FIELD=VALUE",
+        help="a setting that all trials have, e.g. train.steps=2000; repeatable (default: none)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="trainings side by side, each in a process (default: 1)",
+    )
+    parser.add_argument(
+        "--no-pruning",
+        action="store_true",
+        help="train every trial to its end (default: end those whose validation loss is above the "
+        "median of earlier ones)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec tune` and print the best settings.
+
+    Raises:
+        InputError: the store, a policy or a setting cannot be used, Optuna is not installed, or
+            the folder holds another search.
+    """
+    from ucfrec.reporting.tables import text_table
+    from ucfrec.runs.config import settings_given
+    from ucfrec.tuning.report import BEST_TOML, PAGE, importances, write_report
+    from ucfrec.tuning.space import Search, read_space
+    from ucfrec.tuning.study import BEST, Plan, finished, tune
+
+    if options.k < 1:
+        raise InputError(f"--k is {options.k}; recommend at least 1 item")
+    search = Search(
+        tuple(dict.fromkeys(options.policy or ["ucf"])),
+        settings_given(options.set),
+        options.metric == "value",
+        options.seed,
+        None if options.space is None else read_space(options.space),
+    )
+    out = options.out
+    plan = Plan(options.store, out, search, options.metric, options.k, not options.no_pruning)
+    study = tune(plan, options.trials, options.workers)
+    write_report(study, plan)
+    best, found = study.best_trial, importances(study)
+    lines = [
+        (name, f"{value:.4g}" if isinstance(value, float) else value, f"{found.get(name, 0):.2f}")
+        for name, value in best.params.items()
+    ]
+    print(text_table(("setting", "best", "importance"), lines))
+    print(
+        f"\n{options.metric} {study.best_value:.6g} in trial {best.number}, of "
+        f"{len(finished(study))} trials; selected on validation rows\n"
+        f"settings: {out / BEST_TOML}\nall trials: {out / PAGE}\n"
+        f"next: ucfrec ope {out / BEST}, its value on the test split, which no trial has seen"
+    )

@@ -1,0 +1,125 @@
+"""`ucfrec update`: bring a run up to date with new logs."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Final
+
+from ucfrec.commands.options import log_options, logs_given, memory_option
+from ucfrec.errors import InputError
+
+_DAY_MS: Final = 86_400_000
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `ucfrec update`."""
+    parser.add_argument(
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="finished run on the older logs; or a folder of runs, for the one that was promoted",
+    )
+    log_options(parser).metavar = "NEW_LOGS"
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="RUN2",
+        help="folder of the new run; an interrupted update in it goes on",
+    )
+    parser.add_argument(
+        "--store",
+        type=Path,
+        metavar="STORE",
+        help="folder of the store with the new rows (default: RUN2-store, beside RUN2)",
+    )
+    parser.add_argument(
+        "--window",
+        metavar="TIME",
+        help="exclude sessions that ended longer ago, before the end of the new logs, e.g. 60d or "
+        "12h (default: keep all)",
+    )
+    parser.add_argument(
+        "--split",
+        metavar="TRAIN,VALIDATION,TEST",
+        help="shares of the new rows in order of time (default: 0.6,0.2,0.2); older rows train",
+    )
+    parser.add_argument(
+        "--no-refit",
+        action="store_true",
+        help="once the runs are compared, do not go on learning from the validation and test rows "
+        "(default: RUN2 acts by the weights that learned from all rows)",
+    )
+    parser.add_argument("--seed", type=int, help="of everything random (default: that of RUN)")
+    parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
+    memory_option(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec update` and print what was read, the drift and the verdict.
+
+    Raises:
+        InputError: the run or the logs cannot be used, or --out holds something else.
+    """
+    import torch
+
+    from ucfrec.logs.append import SPLIT, AppendOptions
+    from ucfrec.logs.prepare import parse_split
+    from ucfrec.reporting.model_card import write_card
+    from ucfrec.runs.promoted import promoted
+    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+    from ucfrec.updating import drift, verdict
+    from ucfrec.updating.update import UpdateOptions, update_run
+
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    run = options.run
+    if not (run / RUN).is_file() and (current := promoted(run)) is not None:
+        run = current.run(run)
+    files, mapping = logs_given(options, TrainedPolicy.load(run))
+    append = AppendOptions(
+        window_ms=None if options.window is None else window_ms(options.window),
+        split=SPLIT if options.split is None else parse_split(options.split),
+        memory_limit=options.memory_limit,
+    )
+    record = update_run(
+        run,
+        files,
+        options.out,
+        store=options.store,
+        mapping=mapping,
+        options=UpdateOptions(append, seed=options.seed, refit=not options.no_refit),
+    )
+    write_card(options.out)
+    update = record.update
+    assert update is not None
+    assert update.drift is not None
+    assert update.verdict is not None
+    read = update.appended
+    print(
+        f"new rows      {read['steps']:,} of {read['rows_read']:,} read"
+        f" ({read['not_newer']:,} not newer than the store); {read['new_users']:,} new users, "
+        f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows excluded"
+    )
+    print(record.describe())
+    print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")
+    print(f"\nrun: {options.out}")
+    if update.verdict.result == "worse":
+        print("next: keep the old run; more new rows, or train from nothing with ucfrec train")
+    else:
+        print(f"next: ucfrec promote {options.out}, if `serve` follows its folder")
+
+
+def window_ms(given: str) -> int:
+    """Milliseconds of a time such as `60d` or `12h`.
+
+    Raises:
+        InputError: it is written otherwise, or is 0.
+    """
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([hd])", given.strip())
+    milliseconds = 0 if found is None else round(float(found[1]) * _DAY_MS)
+    if found is not None and found[2] == "h":
+        milliseconds //= 24
+    if not milliseconds:
+        raise InputError(f"--window {given} is no time; write e.g. 60d or 12h")
+    return milliseconds

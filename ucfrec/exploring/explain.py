@@ -1,0 +1,199 @@
+"""Why a policy recommends what it does to one user: parts of the scores, and excluded items."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
+from ucfrec.acting.sessions import Sessions
+from ucfrec.errors import InputError
+from ucfrec.recommending.histories import Histories
+from ucfrec.recommending.recommend import RANK, recommend, sessions_of
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+POLICY, EXPOSURE, REWARD, LOOKAHEAD = "policy", "exposure", "reward weight", "lookahead"
+PARTS: Final = (POLICY, EXPOSURE, REWARD, LOOKAHEAD)
+_ALMOST_NONE: Final = 1e-9
+"""A lookahead that changes no score, but has rewards counted in the units of a lookahead."""
+_EXCLUDED: Final = 10
+_MOST_ROWS: Final = 1000
+
+
+@dataclass(frozen=True)
+class Card:
+    """One recommended item."""
+
+    item_id: Any
+    rank: int
+    propensity: float
+    """Probability of the item at its position, given those before it."""
+    parts: Mapping[str, float]
+    """What each of `PARTS` adds to its score, relative to the mean of all items (nats)."""
+
+    @property
+    def score(self) -> float:
+        """The sum of the parts."""
+        return sum(self.parts.values())
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """An item that is not recommended although its score is high."""
+
+    item_id: Any
+    rank: int
+    """Among all items by score, from 1."""
+    reason: str
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What one user is recommended, and why."""
+
+    rows: tuple[tuple[Any, float], ...]
+    """Items that the user was shown, with their rewards, the latest first."""
+    cards: tuple[Card, ...]
+    excluded: tuple[Excluded, ...]
+    """Those of the best items by score that are not recommended, best first."""
+
+
+def explain(
+    trained: TrainedPolicy, rule: DecisionRule, user: Histories, k: int, filter_seen: bool
+) -> Explained:
+    """The recommendations of `ucfrec recommend` for one user, with their reasons.
+
+    Args:
+        filter_seen: whether items that the user has seen are excluded.
+
+    Raises:
+        InputError: the rule does not fit the policy, or an item of the history is not known.
+    """
+    (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen)
+    sessions, ids = _session(trained, user), trained.item_ids
+    assert ids is not None
+    parts = _parts(trained.scorer(rule), sessions)
+    numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
+    cards = tuple(
+        Card(
+            row[schema.ITEM_ID],
+            row[RANK],
+            row[schema.PROPENSITY],
+            {name: float(part[number]) for name, part in parts.items()},
+        )
+        for number, row in zip(numbers, frame.to_dict("records"), strict=True)
+    )
+    rows = tuple(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
+    excluded = _excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
+    return Explained(rows, cards, tuple(excluded))
+
+
+def pasted_history(text: str) -> pd.DataFrame:
+    """The history that someone pasted: a row per line, `item_id` or `item_id, reward`, the latest
+    last, as a frame of one user whose rows are a minute apart.
+
+    Raises:
+        InputError: there are too many rows, or a reward is no number.
+    """
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if len(lines) > _MOST_ROWS:
+        raise InputError(f"the history has {len(lines):,} rows; paste at most {_MOST_ROWS:,}")
+    items, rewards = [], []
+    for number, line in enumerate(lines, start=1):
+        item, comma, reward = line.rpartition(",")
+        items.append(item.strip() if comma else line)
+        try:
+            rewards.append(float(reward) if comma else 0.0)
+        except ValueError:
+            rewards.append(np.nan)
+        if not np.isfinite(rewards[-1]) or abs(rewards[-1]) > schema.LARGEST_REWARD:
+            raise InputError(
+                f"line {number} of the history is {line[:60]!r}; write item_id, or item_id, reward"
+            )
+    now = int(time.time() * 1000)
+    times = now - 60_000 * np.arange(len(items), 0, -1)
+    frame = pd.DataFrame({schema.USER_ID: "pasted", schema.ITEM_ID: items})
+    return frame.assign(timestamp=times, session_id=0, reward=rewards)
+
+
+def _session(trained: TrainedPolicy, user: Histories) -> Sessions:
+    """The user's latest session, before the step that is decided."""
+    numbered = replace(user, item_ids=trained.items.numbers(user.item_ids))
+    latest = numbered.latest_session(trained.record.session_gap_ms)
+    users = trained.users.numbers(user.users)
+    return sessions_of(trained, latest, users, trained.scorer().length)
+
+
+def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:
+    """The rule without filters and draws."""
+    nothing = {"tag_window": 0, "tag_run": 0, "exclude_seen": False, "temperature": 0.0}
+    return replace(rule, **{**nothing, "explore": 0.0, **changes})
+
+
+def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
+    """(n_items,) of each of `PARTS`, less its mean over all items."""
+    rule, states = scorer.rule, scorer.states
+    assert states is not None
+
+    def scores(**changes: Any) -> Tensor:
+        return scorer.under(_plain(rule, **changes)).scores(sessions, empty=True)[0].double()
+
+    of_policy = scores(reward_weight=0.0, lookahead=0.0)
+    with_rewards = scores(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
+    parts = {
+        POLICY: of_policy,
+        EXPOSURE: torch.zeros_like(of_policy),
+        REWARD: with_rewards - of_policy,
+        LOOKAHEAD: scores() - with_rewards,
+    }
+    alone = scorer.under(_plain(rule, reward_weight=0.0, lookahead=0.0))
+    history = alone.with_target(sessions.history(states, scorer.policy.config.context))
+    query = alone.query(history)
+    if query.policy is not None:
+        none = torch.zeros_like(query.policy.repeated)
+        query = query._replace(policy=query.policy._replace(repeated=none, alike=none))
+        parts[POLICY] = alone.scores_of(query, history, empty=True)[0].double()
+        parts[EXPOSURE] = of_policy - parts[POLICY]
+    return {name: part - part.mean() for name, part in parts.items()}
+
+
+def _excluded(
+    trained: TrainedPolicy,
+    rule: DecisionRule,
+    user: Histories,
+    sessions: Sessions,
+    filter_seen: bool,
+    scores: Any,
+) -> list[Excluded]:
+    """The best of the items that filters exclude."""
+    reasons: dict[int, str] = {}
+
+    def exclude(numbers: Any, reason: str) -> None:
+        for number in np.asarray(numbers).tolist():
+            reasons.setdefault(number, reason)
+
+    if filter_seen:
+        seen = trained.items.numbers(user.seen_ids)
+        exclude(seen[seen >= 0], "the user has seen it")
+    if rule.exclude_seen:
+        shown = sessions.items[0]
+        exclude(shown[shown >= 0], "this session has shown it")
+    for name, words in (
+        ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),
+        ("tag_run", f"the last {rule.tag_run} items had its main tag"),
+    ):
+        if limit := getattr(rule, name):
+            filtered = trained.scorer(_plain(rule, **{name: limit})).scores(sessions, empty=True)[0]
+            exclude(torch.isneginf(filtered).nonzero()[:, 0], words)
+    order = torch.argsort(scores, descending=True).tolist()
+    ids = trained.item_ids
+    assert ids is not None
+    ranked = [(rank, number) for rank, number in enumerate(order, start=1) if number in reasons]
+    return [Excluded(ids[number], rank, reasons[number]) for rank, number in ranked[:_EXCLUDED]]

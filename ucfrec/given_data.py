@@ -1,0 +1,206 @@
+"""Data as callers of the Python API give it: frames, files, stores."""
+
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files.locks import scratch_folder
+from ucfrec.logs.clean import note_dropped
+from ucfrec.logs.histories import log_table
+from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
+from ucfrec.plugins import load_plugin
+from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
+from ucfrec.runs.later_logs import later_logs
+from ucfrec.runs.record import store_of
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
+"""A frame with one row per interaction; or files, folders and globs."""
+_FRAME: Final = "frame.parquet"
+_KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
+_OPTIONS: Final = (
+    (r" or --max-session \d+", ""),
+    (r"--column (\w+)=('[^']*'|\.\.\.)", r"mapping=LogMapping({'\1': \2})"),
+    (r"--column (\w+)=", r"mapping=LogMapping({'\1': ''})"),
+    (r"--where (\"[^\"]*\")", r"mapping=LogMapping(where=\1)"),
+    (r"--time-format ('[^']*')", r"mapping=LogMapping(time_format=\1)"),
+    (r"--earliest ([\d-]+)", r"mapping=LogMapping(earliest='\1')"),
+    (r"--time-format", "LogMapping.time_format"),
+    (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
+    (r"--liked", "liked"),
+)
+"""Options of commands in messages, and what they are in Python."""
+
+
+def store_given(
+    data: EpisodeStore | Logs, mapping: LogMapping | None, scratch: Path, options: Mapping[str, Any]
+) -> EpisodeStore:
+    """The store that `data` is, or one prepared from the logs in it.
+
+    Args:
+        data: a store or its folder, or logs.
+        mapping: of the columns of logs; None for none.
+        scratch: folder for the prepared store.
+        options: fields of `PrepareOptions`, of logs.
+
+    Raises:
+        InputError: the data cannot be used, or `mapping` or `options` come with a store.
+    """
+    prepared = isinstance(data, (str, Path)) and (Path(data) / "meta.json").is_file()
+    if isinstance(data, EpisodeStore) or prepared:
+        if options or mapping is not None:
+            raise InputError(f"{data} is prepared already; prepare its logs with other options")
+        return data if isinstance(data, EpisodeStore) else EpisodeStore.open(str(data))
+    given, dataset = mapping or LogMapping(), options.get("dataset", "generic")
+    if isinstance(data, LogFiles):
+        files, given, dataset = data.files, given.over(data.mapping), data.dataset
+    elif _are_paths(data):
+        adapter: Dataset = load_plugin("datasets", dataset)
+        files, given = adapter.resolve(_paths(data), given)
+    else:
+        files = (_written(data, scratch),)
+    with in_words_of_python(files[0] if files[0].parent == scratch else None):
+        named = PrepareOptions(**{**options, "dataset": dataset})
+        report = prepare(files, given, scratch / "store", named)
+    (scratch / _FRAME).unlink(missing_ok=True)
+    note_dropped("", report["dropped"], report["rows_read"], fine=())
+    return EpisodeStore.open(scratch / "store")
+
+
+@contextmanager
+def logs_given(
+    trained: TrainedPolicy, logs: Logs | None, mapping: LogMapping | None, keep_unknown: bool
+) -> Iterator[LoggedSessions]:
+    """Later logs of a policy, or None for the test split of its store.
+
+    Args:
+        trained: the policy.
+        logs: the logs.
+        mapping: of their columns; what it leaves open is as in the training log.
+        keep_unknown: see `logged_sessions`.
+
+    Raises:
+        InputError: the logs cannot be used.
+    """
+    if logs is None:
+        if mapping is not None:
+            raise InputError("mapping is of logs, and none are given; leave it out")
+        yield held_out_sessions([trained])
+        return
+    with ExitStack() as stack:
+        files, given, frame = stack.enter_context(files_given(trained, logs, mapping))
+        with in_words_of_python(frame):
+            read = logged_sessions(trained.folder, trained, files, given, keep_unknown)
+            logged = stack.enter_context(read)
+        note_dropped("", logged.report["dropped"], logged.report["rows_read"])
+        yield logged
+
+
+@contextmanager
+def files_given(
+    trained: TrainedPolicy, logs: Logs, mapping: LogMapping | None
+) -> Iterator[tuple[tuple[Path, ...], LogMapping, Path | None]]:
+    """Later logs of a policy as files: the files, the mapping, and the file of a frame, which lasts
+    as long as the block; None for files.
+
+    Raises:
+        InputError: a path is missing, or the frame cannot be used.
+    """
+    given = mapping or LogMapping()
+    if isinstance(logs, LogFiles):
+        yield logs.files, given.over(logs.mapping), None
+    elif _are_paths(logs):
+        yield *later_logs(trained, _paths(logs), given), None
+    else:
+        with scratch_folder(Path(gettempdir()), "frame") as scratch:
+            file = _written(logs, scratch)
+            yield (file,), given, file
+
+
+def histories_given(
+    trained: TrainedPolicy,
+    frame: pd.DataFrame | None,
+    mapping: LogMapping | None,
+    users: Sequence[Any] | None,
+) -> Iterator[Histories]:
+    """Histories of users: of a frame, or None for what the store of the run has of them.
+
+    Raises:
+        InputError: the frame cannot be used, the store is gone, or a user has no rows.
+    """
+    if frame is None:
+        frame = _stored(trained, users)
+        mapping = LogMapping({name: name for name in _KEYS if name in frame})
+    histories = histories_of_frame(trained, frame, mapping or LogMapping())
+    return histories if users is None else of_some_users(histories, users)
+
+
+def _stored(trained: TrainedPolicy, users: Sequence[Any] | None) -> pd.DataFrame:
+    """The rows of the run's store, of some users or all."""
+    store = store_of(trained.folder, trained.record)
+    if store is None:
+        raise InputError(
+            f"{trained.folder}: its store {trained.record.store} is gone or has changed; give the "
+            "histories of the users as a frame"
+        )
+    if users is not None:
+        numbers = trained.users.numbers(np.asarray(list(users)))
+        kept = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
+        if not kept.any():
+            raise InputError(f"none of the {len(users):,} users is in the store of the run")
+        store = store.select(kept.to_numpy().nonzero()[0])
+    names = (schema.PROPENSITY, schema.IS_RANDOM, schema.SPLIT)
+    return store.to_frame().drop(columns=list(names), errors="ignore")
+
+
+def _written(frame: Any, scratch: Path) -> Path:
+    """A frame as a file that is read like any log."""
+    file = scratch / _FRAME
+    pq.write_table(log_table(frame, "data"), file)
+    return file
+
+
+def _are_paths(logs: object) -> bool:
+    several = isinstance(logs, Sequence) and all(isinstance(one, (str, Path)) for one in logs)
+    return isinstance(logs, (str, Path)) or several
+
+
+def _paths(logs: Any) -> list[str | Path]:
+    return [logs] if isinstance(logs, (str, Path)) else list(logs)
+
+
+@contextmanager
+def in_words_of_python(file: Path | None = None) -> Iterator[None]:
+    """Let errors and warnings of the block name arguments, not a scratch file or options.
+
+    Args:
+        file: scratch file of the argument `data`.
+    """
+
+    def translated(message: object) -> str:
+        text = str(message) if file is None else str(message).replace(str(file), "data")
+        for option, python in _OPTIONS:
+            text = re.sub(option, python, text)
+        return text
+
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        try:
+            yield
+        except InputError as error:
+            raise InputError(translated(error)) from None
+    for each in noted:
+        warnings.warn(each.category(translated(each.message)), stacklevel=5)

@@ -1,0 +1,73 @@
+"""Items that a trained policy sees as similar to others."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ucfrec import schema
+from ucfrec.errors import InputError
+from ucfrec.recommending.recommend import RANK, SCORE
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+SIMILAR_ITEM: Final = "similar_item_id"
+_ITEMS_AT_ONCE = 1024
+
+
+def similar_items(
+    trained: TrainedPolicy, items: Sequence[Any] | None = None, k: int = 10
+) -> pd.DataFrame:
+    """The `k` most similar other items of each item, by the cosine of the items' vectors.
+
+    The vectors are those by which the policy scores items; of a policy that scores items in a way
+    of its own, such as `item-knn`, the store's embeddings of the items.
+
+    Args:
+        items: item_ids; None for all.
+
+    Returns:
+        `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
+
+    Raises:
+        InputError: the policy's actions are vectors, an item is not known, or `k` is below 1.
+    """
+    if k < 1:
+        raise InputError(f"k is {k}; give 1 or more")
+    vectors = F.normalize(_vectors(trained), dim=1)
+    ids = trained.item_ids
+    assert ids is not None
+    wanted = np.arange(len(ids)) if items is None else trained.items.numbers(np.asarray(items))
+    if (wanted < 0).any():
+        first = np.asarray(items)[wanted < 0][0]
+        raise InputError(
+            f"{int((wanted < 0).sum())} of {len(wanted)} items are not in the training data, such "
+            f"as {first}; leave them out"
+        )
+    k = min(k, len(ids) - 1)
+    frames = []
+    for begin in range(0, len(wanted), _ITEMS_AT_ONCE):
+        numbers = torch.from_numpy(wanted[begin : begin + _ITEMS_AT_ONCE])
+        cosines = (vectors[numbers] @ vectors.T).scatter(1, numbers.unsqueeze(1), -torch.inf)
+        best = cosines.topk(k, dim=1)
+        columns = {
+            schema.ITEM_ID: ids[numbers.numpy().repeat(k)],
+            RANK: np.tile(np.arange(1, k + 1), len(numbers)),
+            SIMILAR_ITEM: ids[best.indices.numpy().ravel()],
+            SCORE: best.values.numpy().ravel(),
+        }
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _vectors(trained: TrainedPolicy) -> Tensor:
+    """(n_items, d)."""
+    scorer = trained.item_scorer(replace(trained.rule, reward_weight=0.0, lookahead=0.0))
+    if scorer.has_factors:
+        return torch.from_numpy(scorer.vectors()[:, :-1])
+    assert trained.item_states is not None
+    return trained.item_states.embeddings

@@ -1,0 +1,105 @@
+"""Which run of a folder of runs is served: a small file that `ucfrec promote` replaces atomically.
+
+The file names the current run and those before it, the latest last.
+"""
+
+from pathlib import Path
+from typing import ClassVar, Final
+
+from pydantic import Field
+
+from ucfrec.errors import InputError
+from ucfrec.files.locks import claim
+from ucfrec.files.record import Record, Text
+from ucfrec.runs.record import RunRecord, read_record, verified
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+POINTER: Final = "promoted.json"
+_MOST: Final = 1000
+"""Earlier runs that are remembered."""
+
+
+class Promoted(Record):
+    """The content of the pointer file."""
+
+    FILE: ClassVar[str] = POINTER
+    KIND: ClassVar[str] = f"a folder of runs that are served: it has no {POINTER}; promote one"
+    REMEDY: ClassVar[str] = "promote a run again"
+
+    current: Text
+    """Name of the run folder, beside the file."""
+    previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
+
+    def run(self, folder: Path) -> Path:
+        """The folder of the current run.
+
+        Raises:
+            InputError: the name is not that of a folder beside the file.
+        """
+        if self.current in ("", ".", "..") or Path(self.current).name != self.current:
+            raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
+        return folder / self.current
+
+
+def promoted(folder: Path) -> Promoted | None:
+    """What the pointer file of a folder says; None if there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    return Promoted.read(folder) if (folder / POINTER).is_file() else None
+
+
+def promote(run: Path, force: bool = False) -> Promoted:
+    """Make a run the current one of the folder that it lies in.
+
+    Args:
+        run: a finished run, all of whose files are compared with their checksums.
+        force: whatever its verdict against the current run is.
+
+    Raises:
+        InputError: the run is not finished or damaged, or, without `force`, is not an update of
+            the current run or worse than that.
+    """
+    run = run.resolve()
+    verified(run)
+    folder, record = run.parent, read_record(run)
+    with claim(folder / POINTER, wait=True):
+        before = promoted(folder)
+        if before is not None and before.current == run.name:
+            return before
+        previous: tuple[str, ...] = ()
+        if before is not None:
+            if not force:
+                _require_verdict(run, record, before.run(folder))
+            previous = (*before.previous, before.current)[-_MOST:]
+        return Promoted(files={}, current=run.name, previous=previous).written(folder)
+
+
+def promote_back(folder: Path) -> Promoted:
+    """Return to the run that was current before the current one.
+
+    Raises:
+        InputError: there is none, or it is gone or damaged.
+    """
+    with claim(folder / POINTER, wait=True):
+        before = promoted(folder)
+        if before is None or not before.previous:
+            raise InputError(f"{folder}: no run was current before; promote one")
+        back = Promoted(files={}, current=before.previous[-1], previous=before.previous[:-1])
+        verified(back.run(folder))
+        return back.written(folder)
+
+
+def _require_verdict(run: Path, record: RunRecord, current: Path) -> None:
+    remedy = "compare them, and add --force to promote it all the same"
+    update = record.update
+    if update is None or update.verdict is None:
+        raise InputError(f"{run} has no verdict against the current run {current.name}; {remedy}")
+    if update.run != TrainedPolicy.load(current, split=True).fingerprint:
+        raise InputError(
+            f"{run} was compared with {update.of}, not with the current run {current.name}; "
+            f"{remedy}"
+        )
+    if update.verdict.result == "worse":
+        raise InputError(f"{run} is worse than {current.name} by its verdict; {remedy}")

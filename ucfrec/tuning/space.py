@@ -1,0 +1,170 @@
+"""Which settings a search varies, and over which values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import read_toml
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.registry import policy_class
+from ucfrec.runs.config import TABLES, Config, resolve_config
+
+if TYPE_CHECKING:
+    from optuna import Trial
+
+POLICY: Final = "policy"
+"""Name of the choice among policies; settings have a dot."""
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """Values of one setting: some choices, or a range.
+
+    Raises:
+        InputError: it is neither, or its ends are in the wrong order.
+    """
+
+    choices: tuple[Value, ...] = ()
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    """Whether the range is searched in powers."""
+
+    def __post_init__(self) -> None:
+        if bool(self.choices) == (self.low is not None and self.high is not None):
+            raise InputError("give a list of choices, or low and high")
+        low, high = self.low or 0.0, self.high or 0.0
+        if not self.choices and (low >= high or (self.log and low <= 0)):
+            raise InputError(
+                f"low is {low:g} and high {high:g}; give the lower one first, above 0 with log = "
+                "true"
+            )
+
+    @property
+    def example(self) -> Value:
+        """One of the values."""
+        return self.choices[0] if self.choices else self.low or 0
+
+    def suggest(self, trial: "Trial", name: str) -> Value:
+        """The value of this setting in a trial."""
+        if self.choices:
+            return cast(Value, trial.suggest_categorical(name, self.choices))
+        low, high = self.low, self.high
+        if isinstance(low, int) and isinstance(high, int):
+            return trial.suggest_int(name, low, high, log=self.log)
+        assert low is not None
+        assert high is not None
+        return trial.suggest_float(name, low, high, log=self.log)
+
+
+Space = Mapping[str, Dimension]
+"""Setting, as `table.field`, to its values."""
+NETWORK: Final[Space] = {
+    "train.learning_rate": Dimension(low=1e-4, high=3e-3, log=True),
+    "train.steps": Dimension(low=500, high=10_000, log=True),
+    "policy.dim": Dimension((32, 64, 128, 256)),
+    "policy.context": Dimension((5, 10, 20, 50)),
+    "policy.dropout": Dimension(low=0.0, high=0.3),
+}
+"""Of policies that are trained step by step."""
+NEIGHBORS: Final[Space] = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
+REWARD_WEIGHTS: Final[Space] = {
+    "rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0)),
+}
+
+
+def default_space(policy: str, by_value: bool) -> Space:
+    """The settings that matter for a policy.
+
+    Args:
+        by_value: whether trials are measured by the estimated value. The training then searches
+            the reward weight itself in every trial, so it is no setting of the search.
+    """
+    policy_type = policy_class(policy)
+    space: Space = {} if by_value else REWARD_WEIGHTS
+    if policy_type.closed_form is SequencePolicy.closed_form:
+        space = {**NETWORK, **space}
+        if policy_type.Config().context == 1:  # it reads no history
+            space = {name: each for name, each in space.items() if name != "policy.context"}
+    if hasattr(policy_type.Config(), "neighbors"):
+        space = {**NEIGHBORS, **space}
+    return space
+
+
+def read_space(path: Path) -> Space:
+    """Read a TOML file with the tables of a configuration, whose fields are lists of choices or
+    ranges `{low = …, high = …, log = true}`.
+
+    Raises:
+        InputError: it has another form.
+    """
+    space = {}
+    for table, fields in read_toml(path).items():
+        if table not in TABLES or not isinstance(fields, dict):
+            raise InputError(f"{path}: no table is called {table!r}; use {', '.join(TABLES)}")
+        for field, values in fields.items():
+            name = f"{table}.{field}"
+            try:
+                named = values if isinstance(values, dict) else {"choices": tuple(values)}
+                space[name] = Dimension(**{**named, "choices": tuple(named.get("choices", ()))})
+            except TypeError:
+                raise InputError(
+                    f"{path}: {name}: write a list of choices, or {{low = …, high = …, log = true}}"
+                ) from None
+            except InputError as error:
+                raise InputError(f"{path}: {name}: {error}") from None
+    return space
+
+
+@dataclass(frozen=True)
+class Search:
+    """Policies, their spaces, and the settings that all trials have.
+
+    Raises:
+        InputError: a policy is unknown, or a value of a space is not allowed.
+    """
+
+    policies: tuple[str, ...]
+    fixed: Mapping[str, Any]
+    """Setting to value."""
+    by_value: bool
+    seed: int
+    given: Space | None = None
+    """The space of every policy; None for each policy's default one."""
+
+    def __post_init__(self) -> None:
+        for policy in self.policies:
+            for name, dimension in self.space(policy).items():
+                self.config(policy, {name: dimension.example})
+
+    def space(self, policy: str) -> Space:
+        """The settings that vary: those of the space that are not fixed."""
+        space = default_space(policy, self.by_value) if self.given is None else self.given
+        return {name: each for name, each in space.items() if name not in self.fixed}
+
+    def config(self, policy: str, values: Mapping[str, Value]) -> Config:
+        """The configuration with some values; a single value of a list stands for the list."""
+        plain = resolve_config(policy)
+        settings: dict[str, Any] = dict(self.fixed)
+        for name, value in values.items():
+            table, _, field = name.partition(".")
+            of_list = isinstance(getattr(getattr(plain, table), field, None), tuple)
+            settings[name] = (value,) if of_list else value
+        config = resolve_config(policy, None, settings, self.seed)
+        warmup = config.train.warmup_steps
+        if "train.warmup_steps" not in settings and config.train.steps < 4 * warmup:
+            # A training that ends in its warm-up never reaches the learning rate of the trial.
+            shorter = replace(config.train, warmup_steps=config.train.steps // 10)
+            config = replace(config, train=shorter)
+        return config
+
+    def suggest(self, trial: "Trial") -> tuple[str, dict[str, Value]]:
+        """The policy and settings of a trial."""
+        policy = self.policies[0]
+        if len(self.policies) > 1:
+            policy = trial.suggest_categorical(POLICY, self.policies)
+        values = {name: each.suggest(trial, name) for name, each in self.space(policy).items()}
+        return policy, values

@@ -1,0 +1,248 @@
+"""The search itself: trials of an Optuna study in a folder, in one or several processes."""
+
+import shutil
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import torch
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files.locks import claimed
+from ucfrec.fitting.loop import Callbacks
+from ucfrec.processes import pool_of_processes, without_ctrl_c
+from ucfrec.progress import labelled
+from ucfrec.provenance import config_hash
+from ucfrec.runs.config import Config
+from ucfrec.runs.run import train_run
+from ucfrec.runs.shared_stages import SharedStages
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.tuning.objective import METRICS, measured
+from ucfrec.tuning.space import POLICY, Search
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.trial import FrozenTrial
+
+STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
+_NAME: Final = "ucfrec"
+_COMPARED: Final = 4
+"""Earlier trials of the same policy from which on a trial may be ended early."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A search: where, over what, by what."""
+
+    store: Path
+    out: Path
+    search: Search
+    metric: str = "value"
+    """One of `ucfrec.tuning.objective.METRICS`."""
+    k: int = 10
+    """Items recommended, of the metric "ndcg"."""
+    prune: bool = True
+    """Whether trials are ended early whose validation loss is above the median of the others'."""
+
+    @property
+    def storage(self) -> str:
+        """Address of the study's SQLite file."""
+        return f"sqlite:///{self.out / STUDY}"
+
+
+def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
+    """Search until the study has so many finished trials; goes on where an earlier call ended.
+
+    The best run lies in `plan.out / "best"`; those of other trials are deleted.
+
+    Args:
+        trials: number of finished trials that the study has at the end, those ended early too.
+        workers: processes that train trials side by side.
+
+    Raises:
+        InputError: Optuna is not installed, the folder holds another search, the metric or the
+            numbers are out of range, or no trial could be measured.
+    """
+    optuna = _optuna()
+    if plan.metric not in METRICS:
+        raise InputError(f"the metric is {plan.metric!r}; use {', '.join(METRICS)}")
+    if trials < 1 or workers < 1:
+        raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
+    store = EpisodeStore.open(plan.store)
+    with claimed(plan.out, "tuned"):
+        plan.out.mkdir(parents=True, exist_ok=True)
+        study: Study = optuna.create_study(
+            storage=plan.storage, study_name=_NAME, direction="maximize", load_if_exists=True
+        )
+        _require_same(study, plan, store)
+        _ended_again(study)
+        left = trials - len(finished(study))
+        shares = [len(part) for part in np.array_split(range(max(left, 0)), workers)]
+        _searched(plan, [(n, share) for n, share in enumerate(shares) if share], len(study.trials))
+        _keep_best(study, plan)
+    return study
+
+
+def finished(study: "Study") -> "list[FrozenTrial]":
+    """The trials that were measured or ended early."""
+    return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
+
+
+def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
+    """The configuration of a trial."""
+    values = dict(trial.params)
+    policy = values.pop(POLICY, plan.search.policies[0])
+    return plan.search.config(policy, values)
+
+
+def _optuna() -> Any:
+    try:
+        import optuna
+    except ModuleNotFoundError:
+        raise InputError("a search needs Optuna; install ucfrec[tune]") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
+    return optuna
+
+
+def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
+    """Check that the study is of the same store, settings and metric, or begin it."""
+    search = plan.search
+    spaces = {policy: search.space(policy) for policy in search.policies}
+    about = {
+        "store": store.record.fingerprint,
+        "metric": plan.metric,
+        "k": plan.k,
+        "search": config_hash(
+            {"fixed": dict(search.fixed), "seed": search.seed}
+            | {name: {n: asdict(d) for n, d in space.items()} for name, space in spaces.items()}
+        ),
+    }
+    before = study.user_attrs.get("about")
+    if before is None:
+        study.set_user_attr("about", about)
+    elif before != about:
+        changed = ", ".join(name for name in about if before.get(name) != about[name])
+        raise InputError(
+            f"{plan.out} is a search with another {changed}; name another folder, or give the same "
+            "options to go on"
+        )
+
+
+def _ended_again(study: "Study") -> None:
+    """Trials that a killed or interrupted process left are run once more, first of all."""
+    import optuna
+
+    again = set(study.user_attrs.get("again", []))
+    for trial in study.trials:
+        if trial.state.name == "RUNNING":
+            study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+        elif trial.state.name != "FAIL":
+            continue
+        if trial.number not in again and trial.params and "error" not in trial.user_attrs:
+            study.enqueue_trial(trial.params)
+            again.add(trial.number)
+    study.set_user_attr("again", sorted(again))
+
+
+def _searched(plan: Plan, shares: Sequence[tuple[int, int]], begun: int) -> None:
+    if len(shares) <= 1:
+        for worker, share in shares:
+            _run_trials(plan, worker, share, begun)
+        return
+    threads = partial(torch.set_num_threads, max(1, torch.get_num_threads() // len(shares)))
+    with pool_of_processes(len(shares), threads) as pool:
+        with without_ctrl_c():
+            ended = [pool.submit(_run_trials, plan, *share, begun) for share in shares]
+        for each in ended:
+            each.result()
+
+
+def _run_trials(plan: Plan, worker: int, count: int, begun: int) -> None:
+    """Run some trials one after the other; also in a process of its own."""
+    optuna = _optuna()
+    # A search that goes on must not draw the first points once more.
+    sampler = optuna.samplers.TPESampler(seed=plan.search.seed + begun + 1000 * worker)
+    study = optuna.load_study(storage=plan.storage, study_name=_NAME, sampler=sampler)
+    store = EpisodeStore.open(plan.store)
+    objective = partial(_objective, plan, store)
+    study.optimize(objective, n_trials=count, catch=(InputError,))
+
+
+def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
+    import optuna
+
+    def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
+        if plan.prune and "validation_loss" in logged:
+            trial.report(logged["validation_loss"], step)
+            if _hopeless(trial.study, trial.number, policy):
+                raise optuna.TrialPruned
+
+    policy, values = plan.search.suggest(trial)
+    trial.set_user_attr(POLICY, policy)
+    run: Path | None = None
+    try:
+        config = plan.search.config(policy, values)
+        run = plan.out / f"{TRIAL}{config_hash(asdict(config))}"
+        shared, heard = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
+        with labelled(f"trial {trial.number}"):
+            train_run(store, run, config, shared=shared, callbacks=heard)
+            found = measured(TrainedPolicy.load(run), store, plan.metric, plan.k)
+    except InputError as error:
+        trial.set_user_attr("error", str(error))
+        _remove(run)
+        raise
+    except optuna.TrialPruned:
+        _remove(run)
+        raise
+    if any(each.value is not None and each.value >= found for each in _complete(trial.study)):
+        _remove(run)
+    return found
+
+
+def _remove(run: Path | None) -> None:
+    if run is not None:
+        shutil.rmtree(run, ignore_errors=True)
+
+
+def _complete(study: "Study") -> "list[FrozenTrial]":
+    return [each for each in study.trials if each.state.name == "COMPLETE"]
+
+
+def _hopeless(study: "Study", number: int, policy: str) -> bool:
+    """Whether the loss of a trial is above the median of earlier ones of its policy at that step.
+
+    Losses of different policies are not of the same quantity.
+    """
+    trials = study.get_trials(deepcopy=False)
+    curve = trials[number].intermediate_values
+    step = max(curve)
+    others = [
+        each.intermediate_values[step]
+        for each in trials
+        if each.number != number
+        and each.user_attrs.get(POLICY) == policy
+        and step in each.intermediate_values
+    ]
+    return len(others) >= _COMPARED and curve[step] > float(np.median(others))
+
+
+def _keep_best(study: "Study", plan: Plan) -> None:
+    """Move the best run to its place and delete those of the other trials."""
+    if not _complete(study):
+        errors = dict.fromkeys(
+            t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error")
+        )
+        reason = next(iter(errors), "all were ended early; search more of them")
+        raise InputError(f"no trial could be measured: {reason}")
+    name = f"{TRIAL}{config_hash(asdict(config_of(plan, study.best_trial)))}"
+    if (plan.out / name).is_dir():
+        _remove(plan.out / BEST)
+        (plan.out / name).rename(plan.out / BEST)
+    for folder in plan.out.glob(f"{TRIAL}*"):
+        _remove(folder)

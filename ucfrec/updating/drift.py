@@ -1,0 +1,137 @@
+"""How much new rows differ from those that a run was trained on."""
+
+from typing import Any, Final
+
+import numpy as np
+
+from ucfrec import schema
+from ucfrec.arrays import Array, Float64Array
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.updating.new_rows import as_known
+from ucfrec.user_model.reward_report import calibration, fit_line, scores_of
+from ucfrec.user_model.reward_rows import RewardRows
+
+_GROUPS: Final = 10
+_PRIOR: Final = 0.5
+"""Added to every count, so that no group is empty."""
+_MOST_STEPS: Final = 100_000
+LARGE: Final = 0.25
+"""Population stability index from which on a distribution counts as another one; below 0.1 it
+counts as the same (Siddiqi, Credit Risk Scorecards, 2006)."""
+
+
+def stability_index(old: Array, new: Array) -> float:
+    """Population stability index of counts (G,) in the same groups: Σ (q − p) ln(q / p).
+
+    Example: shares of 50% and 50% that become 60% and 40% have 0.041.
+    """
+    p, q = ((counts + _PRIOR) / (counts + _PRIOR).sum() for counts in (old, new))
+    return float(((q - p) * np.log(q / p)).sum())
+
+
+def popularity_index(old: Array, new: Array) -> float:
+    """`stability_index` of items in groups of about equal old popularity.
+
+    Args:
+        old: (n_items,) training steps that showed each item.
+        new: (n_items,) of the new rows.
+    """
+    order = np.argsort(-old, kind="stable")
+    before = np.cumsum(old[order]) - old[order]
+    group = np.minimum(_GROUPS * before // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)
+    counts = (np.bincount(group, each[order], _GROUPS) for each in (old, new))
+    return stability_index(*counts)
+
+
+def reward_index(old: Float64Array, new: Float64Array) -> float:
+    """`stability_index` of rewards in groups between deciles of the old ones."""
+    edges = np.unique(np.quantile(old, np.linspace(0, 1, _GROUPS + 1)[1:-1], method="lower"))
+    counts = (
+        np.bincount(np.searchsorted(edges, each, side="left"), minlength=len(edges) + 1)
+        for each in (old, new)
+    )
+    return stability_index(*counts)
+
+
+def drift(
+    old: TrainedPolicy, before: EpisodeStore, added: EpisodeStore, counts: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    """What is different in new rows.
+
+    Args:
+        before: its training episodes.
+        added: the new episodes of the grown store.
+        counts: of `ucfrec.logs.append.append_logs`.
+        seed: of the rows that are drawn from many.
+
+    Returns:
+        `unknown_items`, `unknown_users`: share of the new rows. `item_popularity`, `rewards`:
+        population stability indices, the first of known items. `predicted`, `observed`,
+        `calibration_error`, `slope`: of the run's reward model on new rows of known items, absent
+        without a reward model.
+    """
+    few = added.select(_some_episodes(added, seed))
+    known = as_known(few, old)
+    items = known.step_values(schema.ITEM, *known.all_steps())
+    assert old.counts is not None
+    shown = old.counts.shown.numpy()
+    rows = np.sort(np.random.default_rng(seed).integers(before.n_steps, size=_MOST_STEPS))
+    rewards = before.step_values(schema.REWARD, *before.locate(rows)).astype(np.float64)
+    new = known.step_values(schema.REWARD, *known.all_steps()).astype(np.float64)
+    steps = max(counts["steps"], 1)
+    found: dict[str, Any] = {
+        "unknown_items": counts["new_item_steps"] / steps,
+        "unknown_users": counts["new_user_steps"] / steps,
+        "item_popularity": popularity_index(
+            shown, np.bincount(items[items >= 0], None, len(shown))
+        ),
+        "rewards": reward_index(rewards, new),
+    }
+    return found | _calibration(old, known, seed)
+
+
+def _some_episodes(view: EpisodeStore, seed: int) -> Array:
+    """Episodes, in order, of about `_MOST_STEPS` steps, drawn from all."""
+    drawn = np.random.default_rng(seed).permutation(view.n_episodes)
+    last = int(np.searchsorted(np.cumsum(view.lengths[drawn]), _MOST_STEPS))
+    return np.sort(drawn[: last + 1])
+
+
+def _calibration(old: TrainedPolicy, known: EpisodeStore, seed: int) -> dict[str, float]:
+    model = old.reward_model
+    if model is None:
+        return {}
+    rows = RewardRows.of(known, model.reach, _MOST_STEPS, seed)
+    keep = (rows.items >= 0).nonzero()[:, 0]
+    if not len(keep):
+        return {}
+    rows = RewardRows(
+        *(rows.items[keep], rows.users[keep], rows.shown.at(keep), rows.states[keep]),
+        *(rows.rewards[keep], rows.observations),
+    )
+    scores = scores_of(model, rows)[0]
+    predicted, observed = model.expected(scores).double().numpy(), rows.rewards.double().numpy()
+    slope, _ = fit_line(scores, model.target(rows.rewards), bool(model.binary))
+    return {
+        "predicted": float(predicted.mean()),
+        "observed": float(observed.mean()),
+        "calibration_error": calibration(predicted, observed).error,
+        "slope": slope,
+    }
+
+
+def describe(found: dict[str, Any]) -> str:
+    """The drift in a few lines."""
+    lines = [
+        f"drift         {found['unknown_items']:.1%} of the new rows have new items, "
+        f"{found['unknown_users']:.1%} new users",
+        "              population stability index: item popularity "
+        f"{found['item_popularity']:.3f}, rewards {found['rewards']:.3f} (above {LARGE:g}: large)",
+    ]
+    if "predicted" in found:
+        lines.append(
+            f"              the old run's reward model predicts {found['predicted']:.4g}, observed "
+            f"{found['observed']:.4g}; calibration slope {found['slope']:.3g}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,169 @@
+"""Update a run with new logs: grow its store, train on from its weights, compare both runs."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files.locks import claimed
+from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.logs.append import AppendOptions, append_logs
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.record import RunRecord, Update, store_of
+from ucfrec.runs.refit import refit_within
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.warm_start import SHARE, warm_settings
+from ucfrec.updating.drift import drift
+from ucfrec.updating.verdict import compare_runs
+
+STORE_SUFFIX: Final = "-store"
+"""Added to the name of the run, it is the default name of the grown store beside it."""
+
+
+@dataclass(frozen=True)
+class UpdateOptions:
+    """How `update_run` updates."""
+
+    append: AppendOptions = field(default_factory=AppendOptions)
+    """How the store grows."""
+    share: float = SHARE
+    """Steps of the training, as a share of those of a training from nothing."""
+    seed: int | None = None
+    """Of everything random; None for that of the run."""
+    refit: bool = True
+    """Go on learning from the newest rows, too, once the runs are compared; see
+    `ucfrec.runs.refit`."""
+
+
+@random_state_kept()
+def update_run(
+    run: Path,
+    paths: Sequence[str | Path],
+    out: Path,
+    *,
+    store: Path | None = None,
+    mapping: LogMapping | None = None,
+    options: UpdateOptions | None = None,
+) -> RunRecord:
+    """Make a run that has learned from new logs, too; an interrupted update goes on.
+
+    The settings are those of the run. Its policy and augmentation models start from its weights,
+    with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
+    split is the second newest part of the new rows, the test split, on which the runs are compared,
+    the newest. Once they are compared, the new run goes on learning from these rows, too. Neither
+    the run nor its store is changed.
+
+    Args:
+        run: a finished run on a store of logs of items, which must be there.
+        paths: new log files, folders and globs.
+        out: folder of the new run, new or interrupted.
+        store: folder of the grown store; None for one beside `out`, with `-store` added.
+        mapping: as of `ucfrec.logs.append.append_logs`.
+        options: None for the defaults.
+
+    Returns:
+        The record of the new run; `update` has the drift of the new rows and the verdict.
+
+    Raises:
+        InputError: the run or the logs cannot be used, or `out` or `store` is something else.
+    """
+    options, trained = options or UpdateOptions(), TrainedPolicy.load(run, split=True)
+    before = _store_before(run, trained)
+    grown = store or out.with_name(out.name + STORE_SUFFIX)
+    with claimed(grown, "updated"):
+        counts = append_logs(before.path, paths, grown, mapping, options.append)
+    opened = _opened(grown, trained)
+    full = _from_nothing(trained.record)
+    config = warm_settings(full, options.share)
+    if options.seed is not None:
+        config = replace(config, seed=options.seed)
+    update = Update(
+        of=run.resolve().name,
+        run=trained.fingerprint,
+        settings_from_nothing=asdict(full),
+        appended=_numbers(counts),
+    )
+    about = {"update": update, "dropped_observations": trained.dropped}
+    record = train_run(opened, out, config, about, initial=run)
+    if record.update is None or record.update.run != trained.fingerprint:
+        raise InputError(f"{out} is no update of {run}; name another run folder")
+    if record.update.verdict is None:
+        record = _compared(out, record, trained, before, opened, counts)
+    if options.refit:
+        refit_within(EpisodeStore.open(grown), out)
+    return record
+
+
+def _compared(
+    out: Path,
+    record: RunRecord,
+    trained: TrainedPolicy,
+    before: EpisodeStore,
+    opened: EpisodeStore,
+    counts: dict[str, Any],
+) -> RunRecord:
+    """Write the drift of the new rows and the verdict to the record of the new run."""
+    assert record.update is not None
+    seed, first = record.config.seed, opened.n_episodes - counts["episodes"]
+    added = opened.select(np.arange(first, opened.n_episodes))
+    found = drift(trained, before.split("train"), added, counts, seed)
+    new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
+    verdict = compare_runs(new, acting, opened.split("test"), seed)
+    update = record.update.model_copy(update={"drift": found, "verdict": verdict})
+    return record.with_entries(update=update).written(out)
+
+
+def _opened(path: Path, trained: TrainedPolicy) -> EpisodeStore:
+    """A store as the run sees it, with rows to choose a rule and to compare on.
+
+    Raises:
+        InputError: there are none.
+    """
+    store = EpisodeStore.open(path)
+    for split in ("validation", "test"):
+        if not store.split(split).n_episodes:
+            raise InputError(
+                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
+                "give more rows, or another --split and --store"
+            )
+    return store.without_observation_dimensions(trained.dropped) if trained.dropped else store
+
+
+def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
+    if trained.item_states is None or trained.counts is None:
+        raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
+    if trained.record.policy is None:
+        raise InputError(f"{run} is not finished; train it to its end first")
+    store = store_of(run, trained.record)
+    if store is None:
+        raise InputError(
+            f"{run}: its store {trained.record.store} is gone or has changed; move the run "
+            "together with its store, or prepare all logs and train again"
+        )
+    return store
+
+
+def _from_nothing(record: RunRecord) -> Config:
+    """The settings that a training from nothing had, of which the run is an update or refit."""
+    config: Config = record.config
+    if record.update is not None:
+        return config_from_dict(record.update.settings_from_nothing)
+    if record.refit_of is not None:
+        # In place of the settings of the rule's choice, it has the rule.
+        others = ("rule", "weights")
+        given = {name: value for name, value in record.refit_of.items() if name not in others}
+        return replace(config_from_dict(given), rule=replace(config.rule, choose=True))
+    return config
+
+
+def _numbers(counts: dict[str, Any]) -> dict[str, Any]:
+    names = ("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps")
+    return {name: counts[name] for name in (*names, "expired_steps")} | {
+        "not_newer": counts["dropped"]["clock_out_of_range"]
+    }

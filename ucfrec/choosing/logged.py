@@ -13,7 +13,7 @@ from ucfrec.acting.scorer import Scorer, logged_history
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.weights import effective_number, pareto_tail, tail_size
+from ucfrec.episodes.weights import effective_number
 from ucfrec.progress import progress
 
 SHOWN = 10
@@ -66,9 +66,9 @@ class Evidence:
     """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
     weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
     the number. None without propensities."""
-    tail: float = 0.0
-    """Shape of the tail of the users' weights (`pareto_tail`), plus a standard error; above 0.5 no
-    interval stands."""
+    spread: float = 0.0
+    """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
+    than the weights how heavy their tail is: few sessions may lack the heavy ones."""
     value: float | None = None
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None
@@ -148,8 +148,7 @@ class LoggedEvidence:
         enough = 2 * min(effective_number(each) for each in halves)
         if not below.any():
             return Evidence(rate, likelihood, 0.0)
-        shape, size = pareto_tail(below), tail_size(len(below))
-        tail = 0.0 if shape is None else shape + (1 + shape) / size**0.5
+        spread = float(sums[np.isfinite(sums)].var())
         value = above.sum() / below.sum()
         error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return Evidence(rate, likelihood, enough, tail, float(value), float(error))
+        return Evidence(rate, likelihood, enough, spread, float(value), float(error))

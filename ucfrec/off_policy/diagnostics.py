@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.weights import effective_number, pareto_tail
+from ucfrec.episodes.weights import effective_number
 from ucfrec.off_policy.estimators import step_totals
 from ucfrec.off_policy.intervals import cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -193,6 +193,36 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
     passed = bool(mean - 1 <= max(_TOLERANCE, limit * error))
     return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
+
+
+def pareto_tail(weights: Float64Array) -> float | None:
+    """Shape k of a generalised Pareto distribution fitted to the largest weights.
+
+    From 0.5 on the variance is infinite; from 0.7 on a mean, and its interval, is unreliable
+    whatever the sample (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted by Zhang &
+    Stephens, Technometrics 2009.
+
+    Args:
+        weights: (n,).
+
+    Returns:
+        None where the largest fifth, or 3√n, have fewer than ten different values: no tail.
+    """
+    size = int(min(0.2 * len(weights), 3 * len(weights) ** 0.5))
+    ordered = np.sort(weights)
+    excess = ordered[len(weights) - size :] - ordered[max(len(weights) - size - 1, 0)]
+    excess = excess[excess > 0]
+    if len(np.unique(excess)) < 10:
+        return None
+    excess = excess / excess[-1]
+    n, grid = len(excess), 30 + int(len(excess) ** 0.5)
+    quartile = excess[int(n / 4 + 0.5) - 1]
+    theta = 1 + (1 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3 * quartile)
+    shapes = np.log1p(-theta[:, None] * excess).mean(axis=1)
+    likelihood = n * (np.log(-theta / shapes) - shapes - 1)
+    posterior = np.exp(likelihood - likelihood.max())
+    best = float((theta * posterior).sum() / posterior.sum())
+    return float(np.log1p(-best * excess).mean())
 
 
 def identification_bounds(

@@ -22,7 +22,7 @@ from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import roll_out
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.calibration import UserCalibration, half_of
+from ucfrec.user_model.calibration import half_of
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator
 from ucfrec.user_model.training_users import sessions_of
@@ -220,7 +220,7 @@ class RuleSearch:
         value, within = sum(values) / 2, sum(each.error**2 for each in found) ** 0.5 / 2
         error = max(within, abs(values[0] - values[1]) / 2)
         optimism = None if checked is None else (checked.optimism, checked.optimism_error)
-        return ValueEstimate(value, error, values, optimism, _doubts(value, error, checked))
+        return ValueEstimate(value, error, values, optimism, _doubts(value, error, self.users))
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
@@ -281,16 +281,16 @@ def _warning(search: RuleSearch, best: SimulatedRule) -> str:
     return "".join(f"; WARNING: {each}" for each in said)
 
 
-def _doubts(value: float, error: float, checked: UserCalibration | None) -> tuple[str, ...]:
+def _doubts(value: float, error: float, users: UserModel) -> tuple[str, ...]:
     """Why the estimated value may be off by more than a tenth."""
-    said = []
+    said, checked, training = [], users.calibration_report, users.training_users
     if error > _FAR_OFF * abs(value):
         said.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-    if checked is not None:
-        if abs(checked.optimism) > max(_FAR_OFF, checked.optimism_error):
-            said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
-        if not checked.weighted:
-            said.append("the log has no propensities: its policy may have known more of the users")
+    if checked is not None and abs(checked.optimism) > max(_FAR_OFF, checked.optimism_error):
+        said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
+    weighted = training is not None and training.report.weighted
+    if not (weighted if checked is None else checked.weighted):
+        said.append("the log has no propensities: its policy may have known more of the users")
     return tuple(said)
 
 

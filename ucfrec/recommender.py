@@ -177,28 +177,20 @@ class Recommender:
             InputError: the data cannot be used, options for logs were given with a store, or `out`
                 is a run on other data or settings.
         """
-        log_options = {
-            "reward": reward,
-            "session_by": session_by,
-            "gap_minutes": gap_minutes,
-            "split": split,
-            "dataset": dataset,
-        }
-        options = {name: value for name, value in log_options.items() if value is not None}
-        temporary = Path(tempfile.gettempdir())
-        callbacks = Callbacks(on_step, on_validation)
+        names = ("reward", "session_by", "gap_minutes", "split", "dataset")
+        values = (reward, session_by, gap_minutes, split, dataset)
+        options = {n: v for n, v in zip(names, values, strict=True) if v is not None}
         with ExitStack() as scratch:
             # Whoever fits next removes what is left, should this process be killed.
-            folder = scratch.enter_context(scratch_folder(temporary, "run"))
+            folder = scratch.enter_context(scratch_folder(Path(tempfile.gettempdir()), "run"))
             store = store_given(data, mapping, folder, options)
             out = folder / "run" if out is None else Path(out)
-            record = train_screened(store, out, self.config, screen, callbacks=callbacks)
-            if refit:
-                refit_within(store, out)
+            record = train_screened(
+                store, out, self.config, screen, callbacks=Callbacks(on_step, on_validation)
+            )
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
-            write_card(out)
-            trained = TrainedPolicy.load(out)
+            trained = _completed(store, out, refit)
             kept = scratch.pop_all() if any(folder.iterdir()) else ExitStack()
         self._remove_scratch()
         self._remove_scratch = weakref.finalize(self, kept.close)
@@ -548,6 +540,14 @@ class Recommender:
 
 UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
+
+
+def _completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:
+    """The policy of a trained run, refitted to all rows if asked for, with its model card."""
+    if refit:
+        refit_within(store, out)
+    write_card(out)
+    return TrainedPolicy.load(out)
 
 
 def _named(logs: Logs | None) -> str:

@@ -26,7 +26,7 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.evaluation.ranking import Steps
+from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import logged_sessions, scored_steps
@@ -332,14 +332,14 @@ def test_played_scored_ranked_and_recommended_alike(
         store, ranker = logged.store, PolicyRanker(trained, given, "ucf")
         batches = list(scored_steps(trained, store, given))
         (batch,) = batches
+        later = Later.alone(store, np.array(logged.users))
         ends = np.flatnonzero(np.append(np.diff(batch.episodes) > 0, True))
         for user, found in expected.items():
             last = max(end for end in ends if logged.users[batch.episodes[end]] == user)
             rows = np.arange(last - len(found) + 1, last + 1)
             scored = batch.log_probabilities[rows].exp().numpy()
             np.testing.assert_allclose(scored, found, rtol=1e-3, atol=1e-6)
-            steps = (batch.episodes[rows], batch.steps[rows])
-            ranked = ranker.scores(Steps(store, *steps, np.full(len(rows), -1)))
+            ranked = ranker.scores(later.steps(rows, filter_seen=False))
             again = given.log_probabilities(ranked).exp().numpy()
             np.testing.assert_allclose(again, found, rtol=1e-3, atol=1e-6)
 

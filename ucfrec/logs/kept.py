@@ -149,8 +149,8 @@ def in_hashed_order(
     else:
         key = np.zeros(len(places), dtype=np.uint64)
         for column in rows[schema.ACTION][kept][places].view(np.uint32).T:
-            key = _mixed(key + column)
-    key = _mixed(key + _mixed(hashes.of_users(users[places]) + times[places].view(np.uint64)))
+            key = mixed(key + column)
+    key = mixed(key + mixed(hashes.of_users(users[places]) + times[places].view(np.uint64)))
     ordered = kept.copy()
     ordered[places] = kept[places[np.lexsort((key, groups))]]
     return ordered, len(places)
@@ -167,8 +167,9 @@ def _digest(text: str) -> int:
     return xxhash.xxh3_64_intdigest(text.encode("utf-8", "surrogatepass"))
 
 
-def _mixed(values: Digests) -> Digests:
-    """The finaliser of SplitMix64: every bit of the result depends on all of a value."""
+def mixed(values: Digests) -> Digests:
+    """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
+    values have different results."""
     values = values + np.uint64(0x9E3779B97F4A7C15)
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.errors import InputError
+from ucfrec.logs.kept import mixed
 from ucfrec.logs.sessions import Cut, Episodes, episodes
 from ucfrec.logs.spool import BLOCK, Spool
 
@@ -248,10 +249,8 @@ def sampled_rewards(spool: Spool, cut: Cut, log_end: int, steps: int) -> Array:
 
 def _hash(users: Array, times: Array) -> npt.NDArray[np.uint64]:
     """A number for each row that depends on its user and time: the finaliser of SplitMix64."""
-    mixed = users.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + times.astype(np.uint64)
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
-    return mixed ^ (mixed >> np.uint64(31))
+    own = (users.astype(np.uint64) - np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    return mixed(own + times.astype(np.uint64))
 
 
 def binned_rewards(

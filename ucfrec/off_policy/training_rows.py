@@ -10,6 +10,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.logs.kept import mixed
 from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -77,13 +78,5 @@ def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
             store.step_values(schema.ITEM, episodes, steps),
             store.step_values(schema.TIMESTAMP, episodes, steps),
         ):
-            keys = _mixed(keys ^ values.astype(np.int64).view(np.uint64))
+            keys = mixed(keys ^ values.astype(np.int64).view(np.uint64))
         yield keys
-
-
-def _mixed(keys: KeyArray) -> KeyArray:
-    """Spread numbers over all 64 bits; different inputs give different outputs (SplitMix64)."""
-    keys = keys + np.uint64(0x9E3779B97F4A7C15)
-    keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(keys ^ (keys >> np.uint64(31)))

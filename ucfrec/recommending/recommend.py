@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.ids import IdLookup
 from ucfrec.errors import InputError
+from ucfrec.logs.kept import mixed
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -281,16 +281,9 @@ def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
     of_users, of_requests = (
         pd.util.hash_array(np.asarray(ids).astype(str).astype(object)) for ids in (users, requests)
     )
+    step = np.uint64(0x9E3779B97F4A7C15)
     with np.errstate(over="ignore"):
-        key = of_users + _mixed(of_requests + np.uint64(0x9E3779B97F4A7C15))
-        state = _mixed(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
-        state = state + np.arange(1, count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        state = _mixed(state)
+        key = of_users + mixed(of_requests) - step
+        state = mixed(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
+        state = mixed(state + np.arange(count, dtype=np.uint64) * step)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
-
-
-def _mixed(state: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """SplitMix64's finalizer."""
-    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return state ^ (state >> np.uint64(31))

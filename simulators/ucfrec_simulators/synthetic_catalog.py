@@ -301,7 +301,7 @@ def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
     Raises:
         InputError: `env` is not a SyntheticCatalog.
     """
-    knobs = {"error": 1.0, "temperature": 4.0, "epsilon": 0.1, "variety": 0.0}
+    knobs = {"error": 0.5, "temperature": 5.0, "epsilon": 0.1, "variety": 0.0}
     return SoftmaxGuess(_catalog(env), seed, **knobs)
 
 

@@ -89,7 +89,6 @@ def test_tastes_are_found(tmp_path: Path) -> None:
     liked = rows.items.numpy() % KINDS == kind[rows.users.numpy()]
     found = chances(users, rows)
     assert "affinity" in {tried.effect for tried in users.report.effects if tried.kept}
-    assert not users.report.weighted  # weights of 1 lower no loss
     assert found[liked].mean() == pytest.approx(LIKED, abs=0.15)
     assert found[~liked].mean() == pytest.approx(OTHER, abs=0.05)
 

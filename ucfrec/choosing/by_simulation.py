@@ -22,7 +22,7 @@ from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import roll_out
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.calibration import UserCalibration, half_of
+from ucfrec.user_model.calibration import half_of
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator
 from ucfrec.user_model.training_users import sessions_of
@@ -37,6 +37,9 @@ _FEWEST: Final = 10
 """Sessions of a half of the users that can disagree."""
 _FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
+_WIDEST: Final = 0.4
+"""Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
+(Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
 _NEAR_THE_LOG: Final = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
@@ -135,7 +138,11 @@ class RuleSearch:
 
     def allowed(self, candidate: SimulatedRule) -> bool:
         """Whether the log supports what the candidate did, and can evaluate it."""
-        return self.supported(candidate) and candidate.effective_users >= self.least_users
+        evidence = candidate.evidence
+        if not self.least_users or evidence is None:
+            return self.supported(candidate) and not self.least_users
+        enough = candidate.effective_users >= self.least_users and evidence.spread <= _WIDEST
+        return self.supported(candidate) and enough
 
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
@@ -213,7 +220,7 @@ class RuleSearch:
         value, within = sum(values) / 2, sum(each.error**2 for each in found) ** 0.5 / 2
         error = max(within, abs(values[0] - values[1]) / 2)
         optimism = None if checked is None else (checked.optimism, checked.optimism_error)
-        return ValueEstimate(value, error, values, optimism, _doubts(value, error, checked))
+        return ValueEstimate(value, error, values, optimism, _doubts(value, error, self.users))
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
@@ -267,22 +274,23 @@ def _warning(search: RuleSearch, best: SimulatedRule) -> str:
         said.append("the log supports no candidate, this one shows the most different items")
     elif not search.allowed(best):
         said.append(
-            f"no candidate leaves {search.least_users:g} effective users of the log, this one "
-            f"{best.effective_users:.0f}: the log is too small to evaluate it"
+            f"no candidate leaves {search.least_users:g} effective users of the log with weights "
+            f"of little spread; this one leaves {best.effective_users:.0f}: the log is too small "
+            "to evaluate it"
         )
     return "".join(f"; WARNING: {each}" for each in said)
 
 
-def _doubts(value: float, error: float, checked: UserCalibration | None) -> tuple[str, ...]:
+def _doubts(value: float, error: float, users: UserModel) -> tuple[str, ...]:
     """Why the estimated value may be off by more than a tenth."""
-    said = []
+    said, checked, training = [], users.calibration_report, users.training_users
     if error > _FAR_OFF * abs(value):
         said.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-    if checked is not None:
-        if abs(checked.optimism) > max(_FAR_OFF, checked.optimism_error):
-            said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
-        if not checked.weighted:
-            said.append("the log has no propensities: its policy may have known more of the users")
+    if checked is not None and abs(checked.optimism) > max(_FAR_OFF, checked.optimism_error):
+        said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
+    weighted = training is not None and training.report.weighted
+    if not (weighted if checked is None else checked.weighted):
+        said.append("the log has no propensities: its policy may have known more of the users")
     return tuple(said)
 
 

@@ -13,6 +13,7 @@ from ucfrec.acting.scorer import Scorer, logged_history
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.weights import effective_number
 from ucfrec.progress import progress
 
 SHOWN = 10
@@ -65,6 +66,9 @@ class Evidence:
     """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
     weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
     the number. None without propensities."""
+    spread: float = 0.0
+    """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
+    than the weights how heavy their tail is: few sessions may lack the heavy ones."""
     value: float | None = None
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None
@@ -140,15 +144,11 @@ class LoggedEvidence:
             np.bincount(self._users, each).astype(np.float64)
             for each in (weights * returns, weights)
         )
-        enough = min(_effective(below[half::2]) for half in (0, 1)) * 2
+        halves = [each for each in (below[::2], below[1::2]) if len(each)]
+        enough = 2 * min(effective_number(each) for each in halves)
         if not below.any():
             return Evidence(rate, likelihood, 0.0)
+        spread = float(sums[np.isfinite(sums)].var())
         value = above.sum() / below.sum()
         error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return Evidence(rate, likelihood, enough, float(value), float(error))
-
-
-def _effective(weights: Float64Array) -> float:
-    """(Σw)² / Σw² (Kish 1965)."""
-    total = float(weights.sum())
-    return total**2 / float(np.square(weights).sum()) if total else 0.0
+        return Evidence(rate, likelihood, enough, spread, float(value), float(error))

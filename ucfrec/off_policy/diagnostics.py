@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.estimators import effective_number, step_totals
+from ucfrec.episodes.weights import effective_number
+from ucfrec.off_policy.estimators import step_totals
 from ucfrec.off_policy.intervals import cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
 

@@ -31,6 +31,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.weights import effective_number
 from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
@@ -167,15 +168,6 @@ def _summary(terms: Terms, interval: Interval | None) -> Estimate:
         largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
         parameter=terms.parameter,
     )
-
-
-def effective_number(weights: Float64Array) -> float:
-    """(Σw)² / Σw²: as many equal weights estimate a mean as well (Kish 1965)."""
-    top = weights.max()
-    if top == 0:
-        return 0.0
-    shares = weights / top
-    return float(shares.sum() ** 2 / (shares**2).sum())
 
 
 def step_totals(steps: LoggedSteps, weights: Float64Array) -> Float64Array:

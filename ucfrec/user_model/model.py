@@ -72,7 +72,9 @@ class UserModel:
         """
         require_blas_memory()
         reward, report = fit_item_reward_model(train, validation, folder, seed)
-        users = fit_training_users(train, folder, seed) if simulated and train.has_users else None
+        users = None
+        if simulated and train.has_users:
+            users = fit_training_users(train, folder, seed, weighted=report.new_users)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))

@@ -6,17 +6,17 @@ counts as liked and goes on paying. Here tastes are there before a session begin
 users, and nothing that acts knows them.
 
 Logs of policies that knew more of their users than the log shows make what they showed look better
-than it is for anybody else. Where the log has all propensities p, tastes are therefore evaluated on
-rows weighted by 1 / (p · items), cut off at 10, as if all items had been shown alike (inverse
-propensity weighting). They are also fitted to weighted rows where this lowers the weighted loss on
-rows held back by more than its standard error; elsewhere the weights only add noise. So that a few
-rows of large weight do not pass for much knowledge of a user's tastes, the weights of each user's
-rows are scaled to add up to their effective number (Pfeffermann et al., 1998, "Weighting for
-unequal selection probabilities in multilevel models").
+than it is for anybody else. Where the log has all propensities p, and users are new, rows are
+therefore weighted by 1 / (p · items), cut off at 10, as if all items had been shown alike (inverse
+propensity weighting). So that a few rows of large weight do not pass for much knowledge of a user's
+tastes, the weights of each user's rows are scaled to add up to their effective number (Pfeffermann
+et al., 1998, "Weighting for unequal selection probabilities in multilevel models"). Known users are
+calibrated on weighted validation rows instead (`ucfrec.user_model.calibration`), and their tastes
+fitted without weights, which there only cost data.
 """
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -30,7 +30,7 @@ from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
-from ucfrec.progress import Progress, progress
+from ucfrec.progress import progress
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
 from ucfrec.user_model.reward_fit import EffectSearch, reward_model_sizes, set_statistics
@@ -68,7 +68,9 @@ class TrainingUsers:
     report: TrainingUsersReport
 
 
-def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> TrainingUsers:
+def fit_training_users(
+    train: EpisodeStore, folder: Path, seed: int, weighted: bool = True
+) -> TrainingUsers:
     """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
     Effects are chosen as in `ucfrec.user_model.reward_fit`, on a fifth of the rows.
@@ -76,6 +78,7 @@ def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> Training
     Args:
         train: view of a store of items whose episodes name their users.
         seed: of the sessions drawn by `sessions_of`.
+        weighted: whether rows are weighted by propensities, if there are any.
 
     Raises:
         InputError: all training rewards are equal, or the file is damaged.
@@ -93,41 +96,24 @@ def fit_training_users(train: EpisodeStore, folder: Path, seed: int) -> Training
     # What the session shows of tastes is known already: states are features and observations.
     of_session = train.item_states.size - train.item_states.user_features.shape[1]
     model.state_std[:of_session] = torch.inf
-    weights = propensity_weights(sessions, episodes, steps, len(model.item))
-    design = Design.of(model, rows)
-    weighted = design if weights is None else replace(design, weights=weights)
-    kinds = (design,) if weights is None else (design, weighted)
-    with progress(len(kinds) * len(EFFECTS), "training users", "effects") as bar:
-        searches = [_searched(each, bar) for each in kinds]
-    held_out, search = searches[-1].held_out, searches[0]
-    if weights is not None and _is_better(searches[1], search, held_out):
-        search, design = searches[1], weighted
-    tried = search.report()
+    weights = None
+    if weighted:
+        weights = propensity_weights(sessions, episodes, steps, len(model.item))
+    design = Design.of(model, rows, weights)
+    search = EffectSearch(design, design).of_training()
+    with progress(len(EFFECTS), "training users", "effects") as bar:
+        for name in EFFECTS:
+            search.add(name)
+            bar.update()
+    tried, held_back = search.report(), search.held_out
     spreads = {each.effect: each.spread for each in tried if each.kept}
     model.set_effects(fit_effects(design, design.mean_effect(), spreads), design.of_content)
-    scores = held_out.predictor(search.effects)
-    line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
-    by_weight = search is not searches[0]
-    report = TrainingUsersReport(line, tried, len(rows), weighted.count, by_weight)
+    scores = held_back.predictor(search.effects)
+    line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
+    report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)
     folder.mkdir(parents=True, exist_ok=True)
     save_tensors(path, model.state_dict(), dataclasses.asdict(report))
     return TrainingUsers(model.eval(), report)
-
-
-def _searched(design: Design, bar: Progress) -> EffectSearch:
-    """The effects of a design, chosen on a fifth of its rows."""
-    search = EffectSearch(design, design).of_training()
-    for name in EFFECTS:
-        search.add(name)
-        bar.update()
-    return search
-
-
-def _is_better(search: EffectSearch, other: EffectSearch, held_out: Design) -> bool:
-    """Whether it lowers the loss of another on held-out rows by more than a standard error."""
-    losses = [held_out.loss(held_out.predictor(each.effects)) for each in (other, search)]
-    decrease = (losses[0] - losses[1]).double()
-    return bool(decrease.mean() > decrease.std(correction=0) / len(decrease) ** 0.5)
 
 
 def sessions_of(train: EpisodeStore, seed: int) -> EpisodeStore:

@@ -40,7 +40,7 @@ def fast(trained: TrainedPolicy) -> Responder:
 def test_answers_are_those_of_torch(
     trained: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = [*requests_of(histories()), {"user_id": "new"}]
+    asked = [*requests_of(histories()), {"user_id": "new", "request_id": "1"}]
     graph, alone = fast._scorer._engine, []
 
     def counted(sessions: Sessions) -> Any:

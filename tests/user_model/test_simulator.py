@@ -14,7 +14,7 @@ from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
-from ucfrec.user_model.simulator import UserSimulator
+from ucfrec.user_model.simulator import LoggedRewards, UserSimulator
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,41 @@ def test_rewards_are_drawn_with_the_models_calibrated_probabilities(store: Episo
         assert rewards.mean() == pytest.approx(float(expected), abs=0.03)
         assert set(np.unique(rewards)) <= {0.0, 1.0}
         assert len(going) == 4000
+
+
+@pytest.mark.parametrize("kind", ["clicks", "shop", "watch time", "negative"])
+def test_drawn_rewards_are_logged_ones_with_the_expected_mean(kind: str) -> None:
+    """Paying the mean itself would end the sessions of a shop as often as after a purchase."""
+    rng, n = np.random.default_rng(0), 20_000
+    logged = {
+        "clicks": rng.random(n) < 0.3,
+        "shop": rng.choice([0, 1, 3, 8], n, p=[0.55, 0.3, 0.1, 0.05]),
+        "watch time": rng.gamma(0.5, 3, n),
+        "negative": rng.normal(-3, 1, n),
+    }[kind].astype(np.float64)
+    rewards = LoggedRewards.of(Logged(logged))  # type: ignore[arg-type]
+    low, high = np.quantile(rewards.values, [0.05, 0.95])
+    for mean in np.linspace(low, high, 7):
+        drawn = rewards.drawn(np.full(100_000, mean), rng.random(100_000))
+        assert drawn.mean() == pytest.approx(mean, abs=0.02 * np.ptp(rewards.values))
+        assert set(drawn) <= set(rewards.values)
+    same = rewards.drawn(np.full(100_000, logged.mean()), rng.random(100_000))
+    assert same.std() == pytest.approx(logged.std(), rel=0.1)
+
+
+class Logged:
+    """The rewards of a store, in two batches."""
+
+    def __init__(self, rewards: np.ndarray[Any, Any]) -> None:
+        self.rewards = rewards
+
+    def step_batches(self) -> list[tuple[slice, None]]:
+        half = len(self.rewards) // 2
+        return [(slice(half), None), (slice(half, None), None)]
+
+    def step_values(self, name: str, rows: slice, _: None) -> np.ndarray[Any, Any]:
+        assert name == "reward"
+        return self.rewards[rows]
 
 
 def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: EpisodeStore) -> None:

@@ -1,7 +1,11 @@
 """Sessions simulated in a user model."""
 
+from dataclasses import dataclass
+from typing import Final
+
 import numpy as np
 import torch
+from scipy.special import softmax
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
@@ -9,6 +13,61 @@ from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import SessionStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
+
+_GROUPS: Final = 32
+"""Most rewards to draw from."""
+
+
+@dataclass(frozen=True)
+class LoggedRewards:
+    """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
+    expected reward. Paying the mean itself would be wrong where what follows, as the end of the
+    session, is not linear in the reward."""
+
+    values: Float64Array
+    """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
+    log_shares: Float64Array
+    """(K,) log of their shares of the steps."""
+    slopes: Float64Array
+    """(G,) ascending, per unit of reward."""
+    means: Float64Array
+    """(G,) mean reward under each slope."""
+
+    @classmethod
+    def of(cls, store: EpisodeStore) -> "LoggedRewards":
+        """Those of all steps of a store."""
+        found = [
+            np.unique(store.step_values(schema.REWARD, *steps), return_counts=True)
+            for steps in store.step_batches()
+        ]
+        rewards, place = np.unique(np.concatenate([each for each, _ in found]), return_inverse=True)
+        counts = np.bincount(place, np.concatenate([each for _, each in found]))
+        values, counts = rewards[::-1].astype(np.float64), counts[::-1]
+        if len(values) > _GROUPS:
+            middle = (counts.cumsum() - counts / 2) / counts.sum()
+            groups = np.unique((_GROUPS * middle).astype(int), return_inverse=True)[1]
+            sums, counts = np.bincount(groups, counts * values), np.bincount(groups, counts)
+            values = sums / counts
+        log_shares = np.log(counts / counts.sum())
+        slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
+        return cls(values, log_shares, slopes, _shares(log_shares, slopes, values) @ values)
+
+    def drawn(self, expected: Float64Array, uniform: Float64Array) -> Float64Array:
+        """Rewards (M,) with the means `expected` (M,), from `uniform` (M,) in [0, 1)."""
+        if len(self.values) == 2:
+            high, low = self.values
+            drawn: Float64Array = np.where(uniform < (expected - low) / (high - low), high, low)
+            return drawn
+        slopes = np.interp(expected, self.means, self.slopes)
+        bounds = _shares(self.log_shares, slopes, self.values).cumsum(axis=1)[:, :-1]
+        drawn = self.values[(uniform[:, None] >= bounds).sum(axis=1)]
+        return drawn
+
+
+def _shares(log_shares: Float64Array, slopes: Float64Array, values: Float64Array) -> Float64Array:
+    """(M, K) shares of the values (K,) under slopes (M,)."""
+    shares: Float64Array = softmax(log_shares + slopes[:, None] * values, axis=1)
+    return shares
 
 
 class UserSimulator:
@@ -36,9 +95,7 @@ class UserSimulator:
         """
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
-        rewards = (store.step_values(schema.REWARD, *steps) for steps in store.step_batches())
-        outcomes = np.unique(np.concatenate([np.unique(each) for each in rewards]))
-        self._outcomes = outcomes if len(outcomes) == 2 else None
+        self._logged = LoggedRewards.of(store)
         n, lags = sessions * times, model.rewarding.lags
         self._numbers, self._steps = np.arange(n) % sessions, np.zeros(n, dtype=np.int64)
         self._episodes = self._numbers % store.n_episodes
@@ -74,10 +131,8 @@ class UserSimulator:
         """
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         states = self._states.current(torch.from_numpy(self.observations()))
-        rewards = self._model.expected(states, self._shown, self._states.users, items)
-        if self._outcomes is not None:
-            low, high = self._outcomes
-            rewards = np.where(self._draws() < (rewards - low) / (high - low), high, low)
+        expected = self._model.expected(states, self._shown, self._states.users, items)
+        rewards = self._logged.drawn(expected, self._draws())
         ends = self._model.session_end.probabilities(self._shown, items, rewards, self._steps)
         paid = torch.from_numpy(rewards)
         self._states.record(items, paid)

@@ -442,7 +442,10 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
 def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
     estimate, tried = choice.estimate, len(choice.candidates)
     if estimate is None:
-        how = f"It ranked best of {tried} rules in the validation period.\n"
+        how = (
+            f"It ranked best of {tried} rules in the validation period.\n"
+            f"              Selected by the {choice.chosen_by}{choice.warning}"
+        )
     else:
         how = (
             f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, "
@@ -450,13 +453,13 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
             f"{estimate.value:.4g} ± {estimate.error:.2g} per session, estimated; logged sessions "
             f"have {logged:.4g}.\n"
             f"{_describe_estimate(estimate, choice.halves_agree)}"
-        )
+            f"{choice.warning.replace('; WARNING', '              WARNING')}"
+        ).rstrip()
     return (
         f"user model    held-out loss {model.loss:.4f}, "
         f"{model.item_loss - model.loss:.4f} below that of item effects alone\n"
         f"decision rule {choice.rule}\n"
         f"              {how}"
-        f"              Selected by the {choice.chosen_by}{choice.warning}"
     )
 
 

@@ -5,7 +5,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from scipy.special import softmax
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
@@ -66,8 +65,8 @@ class LoggedRewards:
 
 def _shares(log_shares: Float64Array, slopes: Float64Array, values: Float64Array) -> Float64Array:
     """(M, K) shares of the values (K,) under slopes (M,)."""
-    shares: Float64Array = softmax(log_shares + slopes[:, None] * values, axis=1)
-    return shares
+    shares = torch.from_numpy(log_shares + slopes[:, None] * values).softmax(dim=1)
+    return np.asarray(shares)
 
 
 class UserSimulator:

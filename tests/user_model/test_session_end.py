@@ -93,7 +93,7 @@ def test_sessions_that_all_end_or_never_do_are_a_constant() -> None:
         assert (report.kept, report.loss) == ("constant", {"constant": 0.0})
 
 
-def test_the_last_step_of_a_users_last_session_tells_nothing() -> None:
+def test_only_the_last_step_of_a_cut_session_tells_nothing() -> None:
     columns = {
         "item": np.zeros(9, dtype=np.int64),
         "reward": np.arange(9, dtype=np.float32),
@@ -106,9 +106,25 @@ def test_the_last_step_of_a_users_last_session_tells_nothing() -> None:
     lengths = np.array([2, 3, 2, 2])
     store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
     logged = LoggedEnds.of(store, 2, 100, 0)
-    # Excluded: step 4 (user 0's last session), 6 (cut, not terminated) and 8 (user 1's last).
-    assert logged.rewards.tolist() == [0, 1, 2, 3, 5, 7]
-    assert logged.ended.tolist() == [False, True, False, False, False, False]
+    # Excluded: step 6, of the session that is not terminated.
+    assert logged.rewards.tolist() == [0, 1, 2, 3, 4, 5, 7, 8]
+    assert logged.ended.tolist() == [False, True, False, False, True, False, False, True]
+
+
+@pytest.mark.parametrize("sessions", [1, 3])
+def test_the_share_of_steps_that_end_sessions_is_the_logged_one(sessions: int) -> None:
+    """However few sessions a user has: the last one of each ends like any other."""
+    generator = np.random.default_rng(0)
+    lengths = generator.geometric(0.4, 6000)
+    n = int(lengths.sum())
+    columns = {"item": generator.integers(2, size=n), "reward": np.zeros(n, dtype=np.float32)}
+    states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
+    episodes = {"user": np.arange(6000) // sessions, "terminated": np.ones(6000, dtype=bool)}
+    store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
+    logged = LoggedEnds.of(store, 2, n, 0)
+    end, _ = SessionEnd.fit(Likeness.of(states), logged, logged, 0)
+    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    assert found.mean() == pytest.approx(0.4, abs=0.02)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -10,7 +10,6 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -55,14 +54,10 @@ class LoggedEnds:
     def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
         """Steps of a view of a store of items, at most `most` of them, drawn at random.
 
-        The last step of a user's last session, and of a session that was cut, is excluded: the
-        log may simply have ended there.
+        The last step of a session that is not terminated is excluded: the log may simply have ended
+        there.
         """
-        users = store.episode_values(schema.USER) if store.has_users else np.arange(len(store))
-        last_session = np.zeros(len(store), dtype=bool)
-        last_session[len(store) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
-        # Of an episode whose end is unknown, all steps but the last are known.
-        known = store.lengths - (last_session | ~store.terminated)
+        known = store.lengths - ~store.terminated
         ends = np.cumsum(known)
         numbers = np.arange(int(ends[-1]))
         if len(numbers) > most:

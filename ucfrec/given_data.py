@@ -13,6 +13,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
@@ -59,7 +60,7 @@ def store_given(
     Raises:
         InputError: the data cannot be used, or `mapping` or `options` come with a store.
     """
-    prepared = isinstance(data, (str, Path)) and (Path(data) / "meta.json").is_file()
+    prepared = isinstance(data, (str, Path)) and (Path(data) / StoreRecord.FILE).is_file()
     if isinstance(data, EpisodeStore) or prepared:
         if options or mapping is not None:
             raise InputError(f"{data} is prepared already; prepare its logs with other options")

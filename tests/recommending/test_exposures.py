@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pandas as pd
@@ -49,7 +50,7 @@ def test_what_waits_is_written_when_the_log_is_closed(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:
     given = answers(trained)
-    with ExposureLog(tmp_path / "shown", trained) as log:
+    with closing(ExposureLog(tmp_path / "shown", trained)) as log:
         for user, answer in given.items():
             log.add(user, answer)
         assert not list((tmp_path / "shown").iterdir())
@@ -60,7 +61,7 @@ def test_files_rotate_by_size_and_by_time(trained: TrainedPolicy, tmp_path: Path
     given = answers(trained)
 
     def files_before_the_end(folder: Path, **limits: float) -> int:
-        with ExposureLog(folder, trained, **limits) as log:  # type: ignore[arg-type]
+        with closing(ExposureLog(folder, trained, **limits)) as log:  # type: ignore[arg-type]
             for user, answer in given.items():
                 log.add(user, answer)
                 time.sleep(0.1)
@@ -80,7 +81,7 @@ def test_a_folder_that_cannot_be_written_loses_nothing_once_it_can(
     trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given, folder = answers(trained), tmp_path / "shown"
-    with ExposureLog(folder, trained, rows=1, seconds=0.05) as log:
+    with closing(ExposureLog(folder, trained, rows=1, seconds=0.05)) as log:
         folder.rmdir()
         folder.write_text("in the way")
         for user, answer in given.items():

@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.recommending.requests import Request
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.served import Served, arm_of, parse_split
-from ucfrec.runs.promoted import promote, promote_back
+from ucfrec.runs.promoted import POINTER, promote, promote_back
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -45,7 +46,7 @@ def answers(served: Served, users: int = 200) -> list[Answer]:
 
 
 def test_users_are_divided_by_their_shares_and_stay_where_they_are(folder: Path) -> None:
-    with Served(make, folder, {"run": 0.75, "other": 0.25}) as served:
+    with closing(Served(make, folder, {"run": 0.75, "other": 0.25})) as served:
         found = answers(served, 2000)
         shares = Counter(answer.arm for answer in found)
         assert shares["other"] / 2000 == pytest.approx(0.25, abs=0.04)
@@ -71,7 +72,7 @@ def test_shares_that_are_none_are_refused(given: str) -> None:
 
 
 def test_a_promoted_run_answers_between_two_batches(folder: Path) -> None:
-    with Served(make, folder, None) as served:
+    with closing(Served(make, folder, None)) as served:
         served.follow(0.01)
         rules, ended = [], threading.Event()
 
@@ -102,7 +103,7 @@ def test_a_run_that_cannot_be_used_changes_nothing(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(folder / "run", folder / "broken")
-    with Served(make, folder, None) as served:
+    with closing(Served(make, folder, None)) as served:
         promote(folder / "broken", force=True)
         (folder / "broken" / "policy" / "best.safetensors").unlink()
         served.check()
@@ -113,6 +114,34 @@ def test_a_run_that_cannot_be_used_changes_nothing(
         promote_back(folder)
         served.check()
     assert "broken is not used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", ["{", '{"files": {}, "current": "../other"}', "folder"])
+def test_a_damaged_pointer_file_is_told_of_once_and_followed_again(
+    folder: Path, capsys: pytest.CaptureFixture[str], damage: str
+) -> None:
+    pointer = folder / POINTER
+    whole = pointer.read_bytes()
+    with closing(Served(make, folder, None)) as served:
+        served.follow(0.01)
+        pointer.unlink()
+        if damage == "folder":
+            pointer.mkdir()
+        else:
+            pointer.write_text(damage)
+        time.sleep(0.3)
+        answers(served)
+        if damage == "folder":
+            pointer.rmdir()
+        pointer.write_bytes(whole)
+        promote(folder / "other", force=True)
+        deadline = time.monotonic() + 60
+        while served.described()["name"] != "other" and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert served.described()["name"] == "other"
+        promote_back(folder)
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "answers from" not in line]
+    assert str(folder) in said
 
 
 def test_a_folder_without_a_promoted_run_is_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import random
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def write_exposures(folder: Path) -> None:
     """Answer for ever, and say how many answers were given."""
     trained, name = TrainedPolicy.load(folder / "run"), str(time.time_ns())
     given = (folder / f"given-{name}").open("w", buffering=1)
-    with ExposureLog(folder / "written", trained, rows=40, seconds=0.05) as log:
+    with closing(ExposureLog(folder / "written", trained, rows=40, seconds=0.05)) as log:
         for number in count():
             log.add("u", Answer([1, 2], [0.0, 0.0], [0.5, 0.5], f"{name}-{number}", "r", "d"))
             given.write(f"{number}\n")

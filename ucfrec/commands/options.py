@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -330,7 +330,7 @@ def exposures_given(
     if options.exposures is None:
         yield None
         return
-    with ExposureLog(options.exposures, trained) as log:
+    with closing(ExposureLog(options.exposures, trained)) as log:
         yield log
 
 

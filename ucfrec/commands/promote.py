@@ -31,10 +31,11 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: the run cannot be promoted, or there is none to return to.
     """
+    from ucfrec.files.checksums import RUN_RECORD
     from ucfrec.runs.promoted import POINTER, promote, promote_back
 
     if options.back:
-        folder = options.run.parent if (options.run / "run.json").is_file() else options.run
+        folder = options.run.parent if (options.run / RUN_RECORD).is_file() else options.run
         found = promote_back(folder)
     else:
         folder, found = options.run.resolve().parent, promote(options.run, options.force)

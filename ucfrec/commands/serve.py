@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -112,7 +113,7 @@ def run(options: argparse.Namespace) -> None:
     if shares is None and (folder / RUN).is_file():
         folder, shares = folder.parent, {folder.name: 1.0}
     with (
-        Served(make, folder, shares) as served,
+        closing(Served(make, folder, shares)) as served,
         exposures_given(options, served.trained) as exposures,
     ):
         if shares is None:

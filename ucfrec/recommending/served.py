@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import xxhash
 
@@ -162,17 +161,6 @@ class Served:
             for arm in self._arms:
                 arm.responder.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
     def _current(self) -> str:
         found = promoted(self._folder)
         if found is None:
@@ -183,11 +171,16 @@ class Served:
         return found.run(self._folder).name
 
     def _run(self, seconds: float) -> None:
+        said = ""
         while not self._closed.wait(seconds):
             try:
                 self.check()
-            except InputError as error:
-                _say(str(error))
+                said = ""
+            except Exception as error:
+                # Whatever is wrong with the pointer file, the run that answers goes on.
+                if str(error) != said:
+                    said = str(error)
+                    _say(said)
 
     def _replace(self, name: str) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""

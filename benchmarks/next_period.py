@@ -4,9 +4,8 @@
     python benchmarks/next_period.py --out runs/next --validation 27 --until 29      # on 28 April
 
 Runs the commands of docs/quickstart.md on the files in $UCFREC_DATA/kuairand: it trains on the days
-before `--validation`, whose rows choose the decision rule, and ranks the days after it. `--refit`
-also ranks a policy that learned from the validation day, too. Appends rows to results.jsonl in
---out, or to --results, and prints the table of `ucfrec rank`.
+before `--validation`, whose rows choose the decision rule, and ranks the days after it. Appends rows
+to results.jsonl in --out, or to --results, and prints the table of `ucfrec rank`.
 """
 
 import argparse
@@ -63,7 +62,7 @@ def main() -> None:
     parser.add_argument("--validation", type=int, default=28, help="day of April (default: 28)")
     parser.add_argument("--until", type=int, help="the first day of April that is left out")
     parser.add_argument("--policy", action="append", help="policies (default: ucf)")
-    parser.add_argument("--refit", action="store_true", help="also learn from the validation day")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the training (default: 0)")
     parser.add_argument("--set", action="append", default=[], help="settings over the command's")
     options = parser.parse_args()
     first, until = options.validation, options.until
@@ -76,11 +75,9 @@ def main() -> None:
     settings = [part for each in (*SETTINGS, *options.set) for part in ("--set", each)]
     runs = []
     for policy in options.policy or ["ucf"]:
-        runs.append(out / "-".join([policy, *options.set]).replace("/", "-"))
-        run("train", store, "--out", runs[-1], "--policy", policy, *settings)
-    if options.refit:
-        runs.append(runs[0].with_name(runs[0].name + "-refit"))
-        run("train", store, "--out", runs[-1], "--refit", runs[0])
+        runs.append(out / "-".join([policy, str(options.seed), *options.set]).replace("/", "-"))
+        about = ("--policy", policy, "--seed", str(options.seed), "--no-refit")
+        run("train", store, "--out", runs[-1], *about, *settings)
     results = options.results or options.out / "results.jsonl"
     for folder in runs:
         run("rank", folder, "--json", folder.with_suffix(".json"))

@@ -4,8 +4,8 @@
     python benchmarks/next_period.py --out runs/next --validation 27 --until 29      # on 28 April
 
 Runs the commands of docs/quickstart.md on the files in $UCFREC_DATA/kuairand: it trains on the days
-before `--validation`, whose rows choose the decision rule, and ranks the days after it. Appends rows
-to results.jsonl in --out, or to --results, and prints the table of `ucfrec rank`.
+before `--validation`, whose rows choose the decision rule, and ranks the days after it. It appends
+rows to results.jsonl in --out, or to --results, and prints the table of `ucfrec rank`.
 """
 
 import argparse

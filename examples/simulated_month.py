@@ -15,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -271,9 +272,9 @@ def _done(folder: Path) -> list[Day]:
 def _day(folder: Path, world: World, day: int) -> Day:
     month, clock, runs = world.month, Clock(), folder / "runs"
     shown, log = folder / f"shown-{day:02d}", folder / f"log-{day:02d}.parquet"
-    with Served(lambda run: responder(run, month, EXPLORE), runs, None) as served:
+    with closing(Served(lambda run: responder(run, month, EXPLORE), runs, None)) as served:
         current = served.described()["name"]
-        with ExposureLog(shown, served.trained, clock=clock) as exposures:
+        with closing(ExposureLog(shown, served.trained, clock=clock)) as exposures:
             steps = world.sessions(day, Serve(served, exposures, clock))
     frozen = world.sessions(day, Serve(responder(runs / "day-00", month, EXPLORE), None, clock))
     clicks = steps[steps.click > 0][["user_id", "item_id", "timestamp", "click"]]

@@ -201,7 +201,8 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store = tiring_store(tmp_path)
     scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
-    config = replace(FEW, tag_windows=(0,), temperatures=(1.0,), reward_weights=(0.0,))
+    one = {"temperatures": (1.0,), "reward_weights": (0.0,)}
+    config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), **one)
     found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     fatigue = found.as_dict()["fatigue"]
     assert (fatigue["length"], fatigue["steps"]) == (3, 4)
@@ -270,7 +271,7 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
 ) -> None:
     store = tiring_store(tmp_path)
     scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
-    config = replace(FEW, tag_windows=(0,), tolerance=0.1)
+    config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), tolerance=0.1)
     found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     rule = found.rule
     assert rule.tag_run > 0

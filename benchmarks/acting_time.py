@@ -115,7 +115,7 @@ def line_ways(trained: TrainedPolicy, engine: str) -> tuple[Way, Way]:
 
     def before() -> str:
         request = json.loads(line)
-        history = responder._reader.read(request["history"])
+        history = responder._reader.read(request["history"], request["user_id"])
         items = trained.items.numbers(history.item_ids)
         store = _next_steps(trained, items, history.rewards, np.array([HISTORY]), np.array([-1]))
         left_out = torch.zeros(1, len(trained.items), dtype=torch.bool)

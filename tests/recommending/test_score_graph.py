@@ -5,6 +5,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from torch import Tensor
 
 from tests.recommending.test_responder import answered
 from tests.support.served import (
@@ -43,10 +44,10 @@ def test_answers_are_those_of_torch(
     asked = [*requests_of(histories()), {"user_id": "new", "request_id": "1"}]
     graph, alone = fast._scorer._engine, []
 
-    def counted(sessions: Sessions) -> Any:
+    def counted(sessions: Sessions, excluded: Tensor) -> Any:
         alone.append(len(sessions.users))
         assert graph is not None
-        return graph(sessions)
+        return graph(sessions, excluded)
 
     monkeypatch.setattr(fast._scorer, "_engine", counted)
     expected = answered(responder(trained, rule=FULL, k=24), asked)

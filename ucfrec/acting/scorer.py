@@ -337,13 +337,11 @@ class Scorer:
         steps = history.windows.timesteps[:, -1]
         some, recent = rewards.gather(1, best), history.shown.latest(model.lags)
         if self._outcomes is not None and end.uses_rewards:
-            low, high = (
-                end.of_items(recent, best, torch.full_like(some, reward), steps)
-                for reward in self._outcomes
-            )
+            rewarded = [torch.full_like(some, reward) for reward in self._outcomes]
+            low, high = end.of_items(recent, best, rewarded, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
-            ends = end.of_items(recent, best, some, steps)
+            (ends,) = end.of_items(recent, best, [some], steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)

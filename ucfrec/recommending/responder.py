@@ -285,8 +285,8 @@ class Responder:
             # Items that may not be recommended come last.
             counts = np.isfinite(values).sum(1).tolist()
             columns = (each.tolist() for each in (self._items.ids[numbers], values, chances))
-            for row, count, *lists in zip(rows, counts, *columns, strict=True):
-                shown = (each[:count] for each in lists)
+            for row, count, items, logs, shares in zip(rows, counts, *columns, strict=True):
+                shown = items[:count], logs[:count], shares[:count]
                 answers[row] = Answer(*shown, asked[row].request_id, *self._source)
         return [answers[row] for row in range(len(asked))]
 

@@ -7,8 +7,9 @@ do; beside it, a store of every request. The rule is the run's, or what `--rewar
 `--tag-window` and the other options of `ucfrec serve` say. With `--items 1000000` also for a
 catalogue of random copies of the run's items. `one user's frame`: `Recommender.recommend`, beside
 reading the frame by SQL. `all users`: `ucfrec recommend` without its start, beside a store of all
-requests. `choose the rule`: decision rules played side by side, and one after the other. `VirtualTaobao`: pages of 4,096
-sessions, beside the authors' environment (--original, their repository) page by page.
+requests. `choose the rule`: decision rules simulated side by side, and one after the other.
+`VirtualTaobao`: pages of 4,096 sessions, beside the authors' environment (--original, their
+repository) page by page.
 
 One thread. Appends the rows to runs/acting_time/results.jsonl, or to --results, and prints a table.
 """

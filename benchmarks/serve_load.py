@@ -111,7 +111,8 @@ async def with_httpx(address: str, body: bytes, clients: int, seconds: float) ->
 
 def cpu_seconds(address: str) -> tuple[float, float]:
     """CPU time of the server, and of what asks it, so far."""
-    of_server = re.search(r"process_cpu_seconds_total (\d\S+)", httpx.get(f"{address}/metrics").text)
+    metrics = httpx.get(f"{address}/metrics").text
+    of_server = re.search(r"process_cpu_seconds_total (\d\S+)", metrics)
     assert of_server is not None
     who = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
     used = [resource.getrusage(each) for each in who]

@@ -176,7 +176,10 @@ def test_the_command_writes_it_whole_or_not_at_all(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["gsasrec", "bpr", "recent-rate"])
+_SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("bpr", "recent-rate")]
+
+
+@pytest.mark.parametrize("name", ["gsasrec", *_SLOW])
 def test_peers_are_exported(tmp_path: Path, name: str) -> None:
     trained = trained_run(tmp_path, name)
     assert export(trained, tmp_path / "out", k=5).difference <= 1e-5

@@ -22,3 +22,8 @@ def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
         if writer is not None:
             writer.close()
     return rows
+
+
+def part_name(part: int) -> str:
+    """Name of a part of a folder of Parquet files, whose names are in the order of the parts."""
+    return f"part-{part:06}.parquet"

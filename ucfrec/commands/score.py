@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.files.frames import write_frames
     from ucfrec.logs.summary import format_report
-    from ucfrec.off_policy.score import logged_sessions, score
+    from ucfrec.off_policy.score import about_scores, logged_sessions, score
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
@@ -60,7 +60,9 @@ def run(options: argparse.Namespace) -> None:
     limit = options.memory_limit
     with logged_sessions(options.run, trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))
-        rows = write_frames(options.out, score(trained, logged, rule_given(options, trained)))
+        rule = rule_given(options, trained)
+        frames = score(trained, logged, rule)
+        rows = write_frames(options.out, frames, about_scores(trained, rule))
     print(f"\n{origin(options.out)}: {rows:,} rows")
 
 

@@ -1,6 +1,6 @@
 """Write pandas data frames to Parquet."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -10,12 +10,24 @@ import pyarrow.parquet as pq
 from ucfrec.files.atomic import atomic_file
 
 
-def write_frames(out: Path, frames: Iterable[pd.DataFrame]) -> int:
-    """Write `frames` one after the other as a single Parquet file, atomically."""
+def write_frames(
+    out: Path, frames: Iterable[pd.DataFrame], about: Mapping[str, str] | None = None
+) -> int:
+    """Write `frames` one after the other as a single Parquet file, atomically.
+
+    Args:
+        about: added to the metadata of the schema.
+
+    Returns:
+        The number of rows.
+    """
     rows, writer = 0, None
     with atomic_file(out) as scratch:
         for frame in frames:
             table = pa.Table.from_pandas(frame, preserve_index=False)
+            table = table.replace_schema_metadata(
+                {**(table.schema.metadata or {}), **(about or {})}
+            )
             writer = writer or pq.ParquetWriter(scratch, table.schema)
             writer.write_table(table)
             rows += len(frame)

@@ -276,6 +276,11 @@ def score(
         yield pd.DataFrame(columns)
 
 
+def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> dict[str, str]:
+    """What files of `score` say of the policy and the rule, in the metadata of their schema."""
+    return {"run": trained.fingerprint, "rule": (rule or trained.rule).hash}
+
+
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     """The test split of the store that policies were trained on, whose rows none of them has seen.
 

@@ -16,6 +16,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog
 from ucfrec.off_policy.score import (
     SESSION,
+    about_scores,
     as_trained,
     prepared_sessions,
     require_items,
@@ -42,7 +43,8 @@ class ScorePart:
         _, options = as_trained(trained, mapping, self.memory_limit)
         options = replace(options, reward=schema.REWARD)
         with prepared_sessions(trained, [rows], mapping, options) as logged:
-            write_frames(self.out / part_name(part), score(trained, logged, self.rule))
+            frames = score(trained, logged, self.rule)
+            write_frames(self.out / part_name(part), frames, about_scores(trained, self.rule))
             return logged.store.n_episodes
 
 

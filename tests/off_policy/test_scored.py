@@ -83,8 +83,8 @@ def test_what_was_not_scored_by_the_run_and_rule_is_refused(
         estimated(tmp_path / "log.parquet")
     with pytest.raises(InputError, match="need the logs"):
         estimated(parts, pages=True)
+    (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
     with pytest.raises(InputError, match="cannot be read"):
-        (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
         estimated(tmp_path / "broken.parquet")
     shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
     with pytest.raises(InputError, match="not numbered in order"):
@@ -98,7 +98,9 @@ def test_the_command_reads_what_score_writes(
     assert main(["score", run, str(folder / "rest.parquet"), "--out", out, *rule]) == 0
     results = str(tmp_path / "ope.json")
     assert main(["ope", run, out, "--scored", *rule, "--json", results]) == 0
-    assert "SNPDIS" in (said := capsys.readouterr().out) and "verdict:" in said
+    said = capsys.readouterr().out
+    assert "SNPDIS" in said
+    assert "verdict:" in said
     assert main(["ope", run, out, "--scored", *rule, "--temperatures", "1,2"]) == 2
     assert main(["ope", run, "--scored"]) == 2
     assert main(["report", run, "--results", results, "--out", str(tmp_path / "r.html")]) == 0

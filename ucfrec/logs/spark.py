@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -266,7 +267,10 @@ def spark_session(master: str) -> Iterator[Any]:
         ) from None
     started.sparkContext.setLogLevel("ERROR")
     try:
-        yield started.newSession()
+        with warnings.catch_warnings():
+            # Its doubts about a version of pandas do not concern Arrow, which is used here.
+            warnings.filterwarnings("ignore", category=FutureWarning, module="pyspark")
+            yield started.newSession()
     finally:
         if running is None:
             started.stop()

@@ -201,7 +201,7 @@ class StepSums:
             left: (N,).
         """
         weights = steps.weights
-        rewarded = np.bincount(steps.step, weights * left)
+        rewarded = np.bincount(steps.step, weights * left).astype(np.float64)
         return cls(len(steps.first), step_totals(steps, weights), rewarded)
 
     def __add__(self, other: "StepSums") -> "StepSums":

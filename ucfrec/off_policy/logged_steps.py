@@ -221,8 +221,8 @@ class LoggedSteps:
 
     def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
         """What there is one of a step, at the given steps; without the sessions."""
-        names = ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
-        names += ("per_decision", "by_step")
+        names = ["reward", "propensity", "target", "cluster_propensity", "cluster_target"]
+        names += ["per_decision", "by_step"]
         parts: dict[str, Any] = {
             name: values[rows] for name in names if (values := getattr(self, name)) is not None
         }

@@ -13,7 +13,6 @@ from ucfrec.commands.cli import main
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 
 RULES = {
-    "best": ["--k", "4"],
     "drawn": ["--k", "6", "--temperature", "1.5", "--seed", "3"],
     "explored": ["--k", "2", "--explore", "0.5", "--explore-top", "5", "--keep-seen"],
 }

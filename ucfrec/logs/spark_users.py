@@ -66,9 +66,11 @@ def by_users(given: GivenLog, folder: Path, master: str, work: Work) -> list[int
     Raises:
         InputError: the log cannot be used, no row is left, or Spark is missing or fails.
     """
-    files = log_files(given.paths)
+    # Workers have a working folder of their own.
+    files = [file.absolute() for file in log_files(given.paths)]
+    known = given.known_items and given.known_items.absolute()
     with (
-        scratch_folder(folder, "users") as scratch,
+        scratch_folder(folder.absolute(), "users") as scratch,
         engine(files, scratch) as connection,
         spark_session(master) as spark,
         spark_failures(),
@@ -76,7 +78,7 @@ def by_users(given: GivenLog, folder: Path, master: str, work: Work) -> list[int
         tables = tuple(open_tables(connection, files, given.mapping.partitions))
         mapping, reward = settled(connection, tables, given.mapping, given.reward)
         typed = connection, tables, mapping, reward, given.session_by
-        log, rows = typed_with_spark(spark, *typed, given.known_items, scratch)
+        log, rows = typed_with_spark(spark, *typed, known, scratch)
         if log.key != schema.ITEM_ID:
             raise InputError(f"{log.name}: its actions are vectors; map item_id instead")
         usable, dropped = _counted(log, rows)

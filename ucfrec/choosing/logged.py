@@ -28,8 +28,8 @@ _Z = 1.96
 class LoggedScores:
     """Scores of all items at M logged steps by rules of one policy.
 
-    Policy and reward model are computed once for all rules of one target, and kept for rules that
-    are asked for later.
+    Policy and reward model are computed once for all rules of one target, and where the policy has
+    factors kept for rules that are asked for later: the outputs of others are as many as items.
     """
 
     def __init__(
@@ -48,15 +48,16 @@ class LoggedScores:
             for first in range(0, len(self._steps), _AT_ONCE):
                 part = slice(first, min(first + _AT_ONCE, len(self._steps)))
                 at = self._episodes[part], self._steps[part]
+                kept = self._kept if self._scorer.has_factors else {}
                 known: History | None = None
                 scores = list[Tensor]()
                 for each in scorers:
                     rule = each.rule
                     key = first, rule.target, rule.minimum_target, widest.reach, weighted
-                    if key not in self._kept:
+                    if key not in kept:
                         known = known or logged_history(widest, self._view, *at)[0]
-                        self._kept[key] = _Asked.of(each, known, weighted)
-                    asked = self._kept[key]
+                        kept[key] = _Asked.of(each, known, weighted)
+                    asked = kept[key]
                     seen = seen_before(self._view, *at) if rule.exclude_seen else None
                     scores.append(each.scores_of(asked.query, asked.history, excluded=seen))
                 yield part, scores

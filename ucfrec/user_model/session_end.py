@@ -152,8 +152,7 @@ class SessionEnd:
         if trees is None:
             uses = bool(self.tensors["weights"][_REWARD] != 0)
         else:
-            inner = trees.left != torch.arange(trees.left.shape[1])
-            uses = bool(((trees.inputs == _REWARD) & inner).any())
+            uses = bool((trees.inputs == _REWARD).any())
         object.__setattr__(self, "uses_rewards", uses)
 
     def probabilities(

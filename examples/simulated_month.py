@@ -48,6 +48,8 @@ FIRST_ITEMS = 100
 """Items of the first day; the others come evenly over the month."""
 EXPLORE, TEMPERATURE = 0.05, 0.5
 """Of the rules that are served, which draw at least at this temperature."""
+_CANDIDATES = ("drawing at temperature 1", "exploring half of the time", "uniform")
+"""Variants of the served rule that are evaluated on a day's exposures."""
 _LEAST_STEPS = 50
 _ESTIMATED = 200
 """Sessions of a day that candidates are evaluated on."""
@@ -95,8 +97,8 @@ class Day:
     """Processor time of the update."""
     validation_loss: float
     covered: tuple[bool | None, ...]
-    """Whether the interval of the estimated reward per step holds the true one, for each
-    candidate: the served run drawing at temperature 1, exploring half of the time, and uniform."""
+    """Whether the interval of the estimated reward per step holds the true one, for each of
+    `_CANDIDATES`; None where the exposures say too little."""
     nothing_seconds: float | None = None
     nothing_loss: float | None = None
 
@@ -127,7 +129,7 @@ class World:
         users = rng.permutation(self.month.users)[: self.month.sessions]
         catalog = self.catalog
         recent = np.full((len(users), catalog.boredom_window - 1), -1)
-        live, rows = np.arange(len(users)), []
+        live, rows = np.arange(len(users)), list[pd.DataFrame]()
         begins = START_MS + day * DAY_MS + rng.integers(DAY_MS // 2, size=len(users))
         for step in range(catalog.max_turn):
             now = begins + step * STEP_MS
@@ -311,6 +313,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
     config = resolve_config(month.policy, None, month.settings, month.seed)
     store = EpisodeStore.open(folder / f"store-{day:02d}")
     nothing = train_run(store, folder / f"nothing-{day:02d}", config)
+    refit_within(store, folder / f"nothing-{day:02d}")
     return replace(
         found,
         nothing_seconds=time.process_time() - began,
@@ -367,15 +370,19 @@ def summary(days: list[Day]) -> str:
     """What the month shows."""
     last = days[-7:]
     reward, frozen = (np.mean([getattr(d, name) for d in last]) for name in ("reward", "frozen"))
-    covered = [found for each in days for found in each.covered if found is not None]
     lines = [
         f"last {len(last)} days: {reward:.3f} clicks per session, never updated {frozen:.3f} "
         f"({reward / frozen - 1:+.1%})",
         f"first day: {days[0].reward:.3f} and {days[0].frozen:.3f}",
-        f"estimates cover the true value: {np.mean(covered):.1%} of {len(covered)}; of "
-        f"{3 * len(days) - len(covered)} more candidates the log says too little",
         f"promoted: {sum(each.promoted for each in days)} of {len(days)} updates",
+        "days on which the estimate of a candidate covers its true value:",
     ]
+    for name, found in zip(
+        _CANDIDATES, zip(*(each.covered for each in days), strict=True), strict=True
+    ):
+        known = [each for each in found if each is not None]
+        too_little = f"; {len(days) - len(known)} days say too little" * (len(known) < len(days))
+        lines.append(f"  {name}: {np.mean(known):.1%} of {len(known)}{too_little}")
     lines += [_against_nothing(each) for each in days if each.nothing_seconds is not None]
     return "\n".join(lines)
 

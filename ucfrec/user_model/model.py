@@ -18,7 +18,11 @@ from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
 from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import fit_item_reward_model
+from ucfrec.user_model.reward_fit import (
+    MAX_ROWS,
+    fit_item_reward_model,
+    refit_item_reward_model,
+)
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
@@ -59,23 +63,31 @@ class UserModel:
         folder: Path,
         seed: int,
         simulated: bool = True,
+        first: Path | None = None,
     ) -> "UserModel":
         """Fit the parts that are not in `folder` yet; read the others.
 
         Args:
             train: training episodes of a store of items.
             validation: held-out episodes of the same store.
+            simulated: whether sessions are simulated.
+            first: folder of the user model of an earlier state of the store, near whose spreads of
+                effects the search begins and ends, on fewer rows; all are fitted to in the end.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
                 damaged.
         """
         require_blas_memory()
-        reward, report = fit_item_reward_model(train, validation, folder, seed)
+        most = MAX_ROWS if first is None else _MOST_STEPS
+        reward, report = fit_item_reward_model(train, validation, folder, seed, most, first=first)
+        path = folder / SESSIONS
+        if most < min(train.n_steps, MAX_ROWS) and not path.exists():
+            reward = refit_item_reward_model(folder, train, folder, seed)
         users = None
         if simulated and train.has_users:
-            users = fit_training_users(train, folder, seed, weighted=report.new_users)
-        tags, path = MainTags.of(validation.item_states), folder / SESSIONS
+            users = fit_training_users(train, folder, seed, report.new_users, first)
+        tags = MainTags.of(validation.item_states)
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
             tired = fit_fatigue(*runs) if reward.binary else None

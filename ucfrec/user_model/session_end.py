@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -66,9 +67,14 @@ class LoggedEnds:
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - known)[episodes]
         ended = steps == store.lengths[episodes] - 1
-        window = store.windows(episodes, steps, lags + 1)
-        rewards = window.rewards[:, -1].double().numpy()
-        return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
+        shown = Shown.before(store, episodes, steps, lags)
+        items, rewards = (
+            store.step_values(name, episodes, steps) for name in (schema.ITEM, schema.REWARD)
+        )
+        return cls(
+            *(shown, torch.from_numpy(items.astype(np.int64))),
+            *(rewards.astype(np.float64), steps, ended),
+        )
 
 
 @dataclass(frozen=True, config=SAVED)

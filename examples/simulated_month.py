@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -194,7 +195,7 @@ class Serve(Show):
         self, answers: Served | Responder, log: ExposureLog | None, clock: "Clock"
     ) -> None:
         self._answers, self._log, self._clock = answers, log, clock
-        self._history: dict[int, list[dict[str, float]]] = {}
+        self._history: dict[int, list[Any]] = {}
 
     def __call__(
         self, users: np.ndarray, now: np.ndarray, rows: list[pd.DataFrame]

@@ -287,9 +287,11 @@ def _day(folder: Path, world: World, day: int) -> Day:
     join_feedback([shown], [folder / f"clicks-{day:02d}.parquet"], log, 5000)
     mapping = world.features(folder, day)
     began, run = time.process_time(), runs / f"day-{day:02d}"
-    record = update_run(
-        runs / current, [log], run, store=folder / f"store-{day:02d}", mapping=mapping
-    )
+    # Days whose run was not promoted are new to the one that was.
+    new = range(int(current.removeprefix("day-")) + 1, day + 1)
+    logs = [folder / f"log-{each:02d}.parquet" for each in new]
+    store = folder / f"store-{day:02d}"
+    record = update_run(runs / current, logs, run, store=store, mapping=mapping)
     seconds = time.process_time() - began
     assert record.update is not None
     assert record.update.verdict is not None
@@ -312,9 +314,8 @@ def _day(folder: Path, world: World, day: int) -> Day:
         return found
     began = time.process_time()
     config = resolve_config(month.policy, None, month.settings, month.seed)
-    store = EpisodeStore.open(folder / f"store-{day:02d}")
-    nothing = train_run(store, folder / f"nothing-{day:02d}", config)
-    refit_within(store, folder / f"nothing-{day:02d}")
+    nothing = train_run(EpisodeStore.open(store), folder / f"nothing-{day:02d}", config)
+    refit_within(EpisodeStore.open(store), folder / f"nothing-{day:02d}")
     return replace(
         found,
         nothing_seconds=time.process_time() - began,

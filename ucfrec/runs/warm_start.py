@@ -84,7 +84,7 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
         config.train,
         steps=few,
         warmup_steps=min(config.train.warmup_steps, few // 10),
-        validate_every=min(config.train.validate_every, max(1, few // 2)),
+        validate_every=min(config.train.validate_every, few),
     )
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

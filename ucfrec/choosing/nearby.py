@@ -38,8 +38,8 @@ def near(
     if rule.looks_ahead:
         grid |= {"lookahead": lookaheads, "policy_weight": config.policy_weights}
         grid["reward_weight"] = config.lookahead_weights
-        without = {"lookahead": 0.0, "policy_weight": 1.0}
-        yield replace(rule, reward_weight=_middle(config.reward_weights), **without)
+        weight = _middle(config.reward_weights)
+        yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
     elif problem.users.session_end_report.kept != "constant":
         for ahead, weight in product(lookaheads, config.lookahead_weights):
             yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)

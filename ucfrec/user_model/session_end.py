@@ -68,13 +68,9 @@ class LoggedEnds:
         steps = numbers - (ends - known)[episodes]
         ended = steps == store.lengths[episodes] - 1
         shown = Shown.before(store, episodes, steps, lags)
-        items, rewards = (
-            store.step_values(name, episodes, steps) for name in (schema.ITEM, schema.REWARD)
-        )
-        return cls(
-            *(shown, torch.from_numpy(items.astype(np.int64))),
-            *(rewards.astype(np.float64), steps, ended),
-        )
+        items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
+        rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+        return cls(shown, items, rewards, steps, ended)
 
 
 @dataclass(frozen=True, config=SAVED)

@@ -54,9 +54,12 @@ class BoostedTrees:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
-        tables = zip(*(_table(trees[0].nodes) for trees in model._predictors), strict=True)
-        columns = (torch.from_numpy(np.stack(each)) for each in tables)
-        return cls(*columns, base=torch.tensor(float(model._baseline_prediction.item())).double())
+        tables = [_table(trees[0].nodes) for trees in model._predictors]
+        splits, thresholds, leaves = (
+            torch.from_numpy(np.stack(each)) for each in zip(*tables, strict=True)
+        )
+        base = torch.tensor(float(model._baseline_prediction.item())).double()
+        return cls(splits, thresholds, leaves, base)
 
     def tensors(self) -> dict[str, Tensor]:
         """The tables by name, to be saved."""

@@ -305,7 +305,12 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     assert {each.tag_window for each in plain} == {0, 3}
     value = {each.rule: each.value for each in found.candidates}
     assert value[found.rule] > value[bad]
-    assert "near the rule of an earlier run" in found.chosen_by
+    assert "near that of an earlier run" in found.chosen_by
+    # From there it moves on as long as a neighbour is better, and then stays.
+    moves = [found.rule]
+    while len({*moves}) == len(moves):
+        moves.append(choose_by_simulation(replace(given, start=moves[-1])).rule)
+    assert moves[-1] == moves[-2]
     ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
     rules = [*near(ahead, given)]
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}

@@ -174,9 +174,11 @@ class RuleSearch:
         return min(self.level(candidates), key=_simplicity)
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
-        """Of those that cannot be told apart from the best, the one with the most support in the
-        log: effective users, or without propensities the likelihood; then the most hits."""
+        """Of those that cannot be told apart from the best, the rule that the choice starts from,
+        or the one with the most support in the log: effective users, or without propensities the
+        likelihood; then the most hits."""
         level = self.level(candidates)
+        level = [each for each in level if each.rule == self.problem.start] or level
         known = [each for each in level if each.evidence is not None]
         lacking = [each for each in level if each.evidence is None]
         known += [replace(one, evidence=each) for one, each in self._with_evidence(lacking)]
@@ -233,7 +235,8 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     highest value are then simulated in more sessions. Of rules that the model cannot distinguish,
     the one with the most support in the log is taken.
 
-    With a rule to start from, the candidates are that rule and its neighbours instead.
+    With a rule to start from, the candidates are that rule and its neighbours instead, and it stays
+    unless one of them is better.
     """
     search = RuleSearch(problem)
     tried = _all(search) if problem.start is None else _near(search, problem.start)
@@ -244,7 +247,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         tried = [*(each for each in tried if each.rule not in again), *finalists]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
-    where = "" if problem.start is None else "; candidates are near the rule of an earlier run"
+    where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
         chosen_by=_chosen_by(search.users) + where,

@@ -18,11 +18,7 @@ from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
 from ucfrec.user_model.main_tags import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import (
-    MAX_ROWS,
-    fit_item_reward_model,
-    refit_item_reward_model,
-)
+from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
 from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
@@ -72,22 +68,18 @@ class UserModel:
             validation: held-out episodes of the same store.
             simulated: whether sessions are simulated.
             first: folder of the user model of an earlier state of the store, near whose spreads of
-                effects the search begins and ends, on fewer rows; all are fitted to in the end.
+                effects the search begins and ends.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
                 damaged.
         """
         require_blas_memory()
-        most = MAX_ROWS if first is None else _MOST_STEPS
-        reward, report = fit_item_reward_model(train, validation, folder, seed, most, first=first)
-        path = folder / SESSIONS
-        if most < min(train.n_steps, MAX_ROWS) and not path.exists():
-            reward = refit_item_reward_model(folder, train, folder, seed)
+        reward, report = fit_item_reward_model(train, validation, folder, seed, first=first)
         users = None
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
-        tags = MainTags.of(validation.item_states)
+        tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
             tired = fit_fatigue(*runs) if reward.binary else None

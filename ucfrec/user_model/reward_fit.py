@@ -44,7 +44,9 @@ _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Standard deviations of tastes that are tried, relative to the noise of single steps."""
 LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
-MAX_ROWS: Final = 500_000
+_MAX_ROWS: Final = 500_000
+WARM_ROWS: Final = 40_000
+"""Most rows of a search that begins near an earlier one."""
 _CONSTANT: Final = 1e-6
 _ROWS: Final = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
@@ -68,7 +70,7 @@ def fit_item_reward_model(
     validation: EpisodeStore,
     folder: Path,
     seed: int,
-    max_rows: int = MAX_ROWS,
+    max_rows: int = _MAX_ROWS,
     effects: Collection[str] = EFFECTS,
     first: Path | None = None,
 ) -> tuple[ItemRewardModel, ItemRewardReport]:
@@ -91,7 +93,7 @@ def fit_item_reward_model(
         seed: of the rows drawn from a store with more than `max_rows`.
         max_rows: most rows of each view that are used.
         first: folder of the model of an earlier state of the store, near whose spreads the search
-            begins and ends.
+            begins and ends; where users are known, on fewer rows.
 
     Returns:
         The model, in evaluation mode, and its quality on the validation rows.
@@ -110,13 +112,19 @@ def fit_item_reward_model(
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
     set_statistics(model, rows, held_out, train.item_states)
     begin = {} if first is None else kept_by(first / FITTED)
-    search = EffectSearch(Design.of(model, rows), Design.of(model, held_out), begin)
+    design = Design.of(model, rows)
+    search = EffectSearch(design, Design.of(model, held_out), begin)
+    if begin and not search.of_new_users:
+        some = np.random.default_rng(seed).permutation(len(rows)) < WARM_ROWS
+        search = EffectSearch(design.select(torch.from_numpy(some)), search.held_out, begin)
     if search.of_new_users:
         rows = RewardRows.of(train, MEMORY, max_rows, seed)
         held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
         search.shown = ShownBefore(model, rows.shown, held_out.shown)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         search.add_all(bar, effects)
+    if len(search.design.items) < len(rows):
+        search.fit_to(design)
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
     folder.mkdir(parents=True, exist_ok=True)
@@ -125,7 +133,7 @@ def fit_item_reward_model(
 
 
 def refit_item_reward_model(
-    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = MAX_ROWS
+    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = _MAX_ROWS
 ) -> ItemRewardModel:
     """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
 
@@ -330,6 +338,13 @@ class EffectSearch:
         """Choose the spreads of the effects found so far again, each given the others."""
         for name in [*self.kept]:
             self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
+
+    def fit_to(self, design: Design) -> None:
+        """Fit the effects that were kept to other rows."""
+        spreads = {name: _SPREADS[number] for name, number in self.kept.items()}
+        self.design = design
+        self.effects = fit_effects(design, self.effects, spreads)
+        self.losses = self._losses(self.effects)
 
     def report(self) -> tuple[EffectTried, ...]:
         """The effects tried, with the final spreads of those that were kept."""

@@ -34,6 +34,7 @@ from ucfrec.progress import progress
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
 from ucfrec.user_model.reward_fit import (
+    WARM_ROWS,
     EffectSearch,
     kept_by,
     reward_model_sizes,
@@ -89,7 +90,7 @@ def fit_training_users(
         seed: of the sessions drawn by `sessions_of`.
         weighted: whether rows are weighted by propensities, if there are any.
         first: folder of the fit to an earlier state of the store, near whose spreads the search
-            begins and ends.
+            begins and ends; of known users, on fewer rows.
 
     Raises:
         InputError: all training rewards are equal, or the file is damaged.
@@ -112,14 +113,18 @@ def fit_training_users(
         weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
     begin = {} if first is None else kept_by(first / _FITTED)
-    search = EffectSearch(design, design, begin).of_training()
+    few = design
+    if begin and not weighted:
+        few = design.select(torch.arange(len(rows)) < WARM_ROWS)
+    search = EffectSearch(few, few, begin).of_training()
     with progress(len(EFFECTS), "training users", "effects") as bar:
         for name in EFFECTS:
             search.add(name)
             bar.update()
     tried, held_back = search.report(), search.held_out
     spreads = {each.effect: each.spread for each in tried if each.kept}
-    model.set_effects(fit_effects(design, design.mean_effect(), spreads), design.of_content)
+    start = search.effects if begin else design.mean_effect()
+    model.set_effects(fit_effects(design, start, spreads), design.of_content)
     scores = held_back.predictor(search.effects)
     line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
     report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)

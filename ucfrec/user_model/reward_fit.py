@@ -45,7 +45,7 @@ _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
-WARM_ROWS: Final = 40_000
+WARM_ROWS: Final = 25_000
 """Most rows of a search that begins near an earlier one."""
 _CONSTANT: Final = 1e-6
 _ROWS: Final = 512

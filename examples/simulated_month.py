@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -48,6 +49,8 @@ FIRST_ITEMS = 100
 """Items of the first day; the others come evenly over the month."""
 EXPLORE, TEMPERATURE = 0.05, 0.5
 """Of the rules that are served, which draw at least at this temperature."""
+_CANDIDATES = ("drawing at temperature 1", "exploring half of the time", "uniform")
+"""Variants of the served rule that are evaluated on a day's exposures."""
 _LEAST_STEPS = 50
 _ESTIMATED = 200
 """Sessions of a day that candidates are evaluated on."""
@@ -95,8 +98,8 @@ class Day:
     """Processor time of the update."""
     validation_loss: float
     covered: tuple[bool | None, ...]
-    """Whether the interval of the estimated reward per step holds the true one, for each
-    candidate: the served run drawing at temperature 1, exploring half of the time, and uniform."""
+    """Whether the interval of the estimated reward per step holds the true one, for each of
+    `_CANDIDATES`; None where the exposures say too little."""
     nothing_seconds: float | None = None
     nothing_loss: float | None = None
 
@@ -127,7 +130,7 @@ class World:
         users = rng.permutation(self.month.users)[: self.month.sessions]
         catalog = self.catalog
         recent = np.full((len(users), catalog.boredom_window - 1), -1)
-        live, rows = np.arange(len(users)), []
+        live, rows = np.arange(len(users)), list[pd.DataFrame]()
         begins = START_MS + day * DAY_MS + rng.integers(DAY_MS // 2, size=len(users))
         for step in range(catalog.max_turn):
             now = begins + step * STEP_MS
@@ -192,7 +195,7 @@ class Serve(Show):
         self, answers: Served | Responder, log: ExposureLog | None, clock: "Clock"
     ) -> None:
         self._answers, self._log, self._clock = answers, log, clock
-        self._history: dict[int, list[dict[str, float]]] = {}
+        self._history: dict[int, list[Any]] = {}
 
     def __call__(
         self, users: np.ndarray, now: np.ndarray, rows: list[pd.DataFrame]
@@ -284,9 +287,11 @@ def _day(folder: Path, world: World, day: int) -> Day:
     join_feedback([shown], [folder / f"clicks-{day:02d}.parquet"], log, 5000)
     mapping = world.features(folder, day)
     began, run = time.process_time(), runs / f"day-{day:02d}"
-    record = update_run(
-        runs / current, [log], run, store=folder / f"store-{day:02d}", mapping=mapping
-    )
+    # Days whose run was not promoted are new to the one that was.
+    new = range(int(current.removeprefix("day-")) + 1, day + 1)
+    logs = [folder / f"log-{each:02d}.parquet" for each in new]
+    store = folder / f"store-{day:02d}"
+    record = update_run(runs / current, logs, run, store=store, mapping=mapping)
     seconds = time.process_time() - began
     assert record.update is not None
     assert record.update.verdict is not None
@@ -309,8 +314,8 @@ def _day(folder: Path, world: World, day: int) -> Day:
         return found
     began = time.process_time()
     config = resolve_config(month.policy, None, month.settings, month.seed)
-    store = EpisodeStore.open(folder / f"store-{day:02d}")
-    nothing = train_run(store, folder / f"nothing-{day:02d}", config)
+    nothing = train_run(EpisodeStore.open(store), folder / f"nothing-{day:02d}", config)
+    refit_within(EpisodeStore.open(store), folder / f"nothing-{day:02d}")
     return replace(
         found,
         nothing_seconds=time.process_time() - began,
@@ -367,15 +372,19 @@ def summary(days: list[Day]) -> str:
     """What the month shows."""
     last = days[-7:]
     reward, frozen = (np.mean([getattr(d, name) for d in last]) for name in ("reward", "frozen"))
-    covered = [found for each in days for found in each.covered if found is not None]
     lines = [
         f"last {len(last)} days: {reward:.3f} clicks per session, never updated {frozen:.3f} "
         f"({reward / frozen - 1:+.1%})",
         f"first day: {days[0].reward:.3f} and {days[0].frozen:.3f}",
-        f"estimates cover the true value: {np.mean(covered):.1%} of {len(covered)}; of "
-        f"{3 * len(days) - len(covered)} more candidates the log says too little",
         f"promoted: {sum(each.promoted for each in days)} of {len(days)} updates",
+        "days on which the estimate of a candidate covers its true value:",
     ]
+    for name, found in zip(
+        _CANDIDATES, zip(*(each.covered for each in days), strict=True), strict=True
+    ):
+        known = [each for each in found if each is not None]
+        too_little = f"; {len(days) - len(known)} days say too little" * (len(known) < len(days))
+        lines.append(f"  {name}: {np.mean(known):.1%} of {len(known)}{too_little}")
     lines += [_against_nothing(each) for each in days if each.nothing_seconds is not None]
     return "\n".join(lines)
 

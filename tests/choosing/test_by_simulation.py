@@ -16,6 +16,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import RuleChoice
 from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.nearby import near
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
@@ -281,6 +282,44 @@ def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     level = [each for each in same_run if each.value >= 0.9 * top and each.items >= 2]
     assert len({each.rule.temperature for each in level}) > 1
     assert rule.temperature == max(each.rule.temperature for each in level)
+
+
+def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    store = EpisodeStore.open(folder / "store")
+    users, views = users_of(folder / "run", store), training_views(store)
+    scorer = Scorer(trained.policy, trained.rule, store.item_states, trained.returns, users.reward)
+    config = replace(FEW, reward_weights=(0.0, 1.0, 4.0, 8.0), tag_windows=(3, 5))
+    given = Problem(scorer, users, {0.9: 2.0, 1.0: 3.0}, *views, config, 0)
+    bad = DecisionRule(2.0, reward_weight=1.0, temperature=1.0)
+    found = choose_by_simulation(replace(given, start=bad))
+    rules = [each.rule for each in found.candidates]
+    assert rules[0] == bad
+    assert len({*rules}) == len(rules)
+    plain = [each for each in rules if not each.lookahead]
+    assert {each.temperature for each in plain} == {0.5, 1.0}
+    assert {each.reward_weight for each in plain} == {0.0, 1.0, 4.0}
+    assert {each.target for each in plain} == {2.0, 3.0}
+    assert {each.tag_window for each in plain} == {0, 3}
+    value = {each.rule: each.value for each in found.candidates}
+    assert value[found.rule] > value[bad]
+    assert "near that of an earlier run" in found.chosen_by
+    # From there it moves on as long as a neighbour is better, and then stays.
+    moves = [found.rule]
+    while len({*moves}) == len(moves):
+        moves.append(choose_by_simulation(replace(given, start=moves[-1])).rule)
+    assert moves[-1] == moves[-2]
+    ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
+    rules = [*near(ahead, given)]
+    assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}
+    assert {each.policy_weight for each in rules if each.lookahead} == {0.0, 0.5, 1.0}
+    assert sum(not each.lookahead for each in rules) == 1
+
+
+def mean_reward(store: EpisodeStore) -> float:
+    train = training_views(store)[0]
+    return float(train.returns.sum(dtype=np.float64)) / train.n_steps
 
 
 def tiring_store(folder: Path) -> EpisodeStore:

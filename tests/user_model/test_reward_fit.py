@@ -1,10 +1,10 @@
 """Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from ucfrec.errors import InputError
 from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.posterior import MEMORY
 from ucfrec.user_model.reward import LAGS
+from ucfrec.user_model.reward_effects import Effects, fit_effects
 from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
     refit_item_reward_model,
@@ -173,6 +174,31 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)
     for name, value in model.state_dict().items():
         assert torch.allclose(value, again.state_dict()[name], atol=0.05), name
+
+
+def test_a_search_begins_and_ends_near_an_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planted, counted = log(0, users=200), list[Mapping[str, float]]()
+
+    def counting(*arguments: Any) -> Effects:
+        counted.append(arguments[2])
+        return fit_effects(*arguments)
+
+    monkeypatch.setattr("ucfrec.user_model.reward_fit.fit_effects", counting)
+    store = store_of(planted, clicks(planted, 1))
+    half = views(store_of(log(0, users=100), clicks(log(0, users=100))))
+    old = fit_item_reward_model(*half, tmp_path / "old", seed=0)[1]
+    counted.clear()
+    cold = fit_item_reward_model(*views(store), tmp_path / "cold", seed=0)[1]
+    fits = len(counted)
+    counted.clear()
+    warm = fit_item_reward_model(*views(store), tmp_path / "warm", 0, first=tmp_path / "old")[1]
+    assert len(counted) < 0.8 * fits
+    assert warm.loss < 1.01 * cold.loss
+    assert {"item", "user"} <= old.kept.keys() & warm.kept.keys()
+    none = fit_item_reward_model(*views(store), tmp_path / "none", 0, first=tmp_path / "nowhere")[1]
+    assert replace(none, seconds=0) == replace(cold, seconds=0)
 
 
 def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> None:

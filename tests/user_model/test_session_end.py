@@ -65,8 +65,8 @@ def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
     inputs = logged.shown, items, logged.rewards, logged.steps
     again = SessionEnd.of(likeness, {**end.tensors})
     np.testing.assert_array_equal(again.probabilities(*inputs), end.probabilities(*inputs))
-    with pytest.raises(ValueError, match="beyond the trees"):
-        SessionEnd.of(likeness, {**end.tensors, "left": end.tensors["left"] + 99})
+    with pytest.raises(ValueError, match="beyond any input"):
+        SessionEnd.of(likeness, {**end.tensors, "inputs": end.tensors["inputs"] + 2**15})
 
 
 def test_all_items_at_once_end_sessions_as_each_alone() -> None:

@@ -20,6 +20,7 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.choice import RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import roll_out
+from ucfrec.choosing.nearby import near
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.calibration import half_of
@@ -79,7 +80,7 @@ class RuleSearch:
             return []
         n = times * self._config.sessions
         found = self._rolled(rules, self.users, self._store, n, self.problem.seed)
-        if self.least_users:
+        if 0 < self.least_users < self._many.users:
             found = [replace(one, evidence=each) for one, each in self._with_evidence(found)]
         return found
 
@@ -173,9 +174,11 @@ class RuleSearch:
         return min(self.level(candidates), key=_simplicity)
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
-        """Of those that cannot be told apart from the best, the one with the most support in the
-        log: effective users, or without propensities the likelihood; then the most hits."""
+        """Of those that cannot be told apart from the best, the rule that the choice starts from,
+        or the one with the most support in the log: effective users, or without propensities the
+        likelihood; then the most hits."""
         level = self.level(candidates)
+        level = [each for each in level if each.rule == self.problem.start] or level
         known = [each for each in level if each.evidence is not None]
         lacking = [each for each in level if each.evidence is None]
         known += [replace(one, evidence=each) for one, each in self._with_evidence(lacking)]
@@ -231,8 +234,44 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     Where the log has propensities, rules that stay near it follow. For new users, the rules of the
     highest value are then simulated in more sessions. Of rules that the model cannot distinguish,
     the one with the most support in the log is taken.
+
+    With a rule to start from, the candidates are that rule and its neighbours instead, and it stays
+    unless one of them is better.
     """
     search = RuleSearch(problem)
+    tried = _all(search) if problem.start is None else _near(search, problem.start)
+    finalists = tried
+    if search.users.reward_report.new_users:
+        finalists = search.finalists(tried, search.best(tried))
+        again = {each.rule for each in finalists}
+        tried = [*(each for each in tried if each.rule not in again), *finalists]
+    best = search.most_evident(finalists)
+    agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
+    where = "" if problem.start is None else "; only rules near that of an earlier run"
+    return RuleChoice(
+        rule=best.rule,
+        chosen_by=_chosen_by(search.users) + where,
+        candidates=[best if each.rule == best.rule else each for each in tried],
+        warning=_warning(search, best),
+        estimate=estimate,
+        details={
+            **search.users.report(),
+            "least_items": search.least_items,
+            "least_users": search.least_users,
+            "halves_agree": list(agree),
+        },
+    )
+
+
+def _near(search: RuleSearch, start: DecisionRule) -> list[SimulatedRule]:
+    """The rule `start` and its neighbours."""
+    more = _NEAR_THE_LOG if search.least_users else ()
+    return search.simulate([*dict.fromkeys(near(start, search.problem, more))])
+
+
+def _all(search: RuleSearch) -> list[SimulatedRule]:
+    """All candidates of the configuration that the best of the earlier ones leads to."""
+    problem = search.problem
     tried = search.simulate([*_unweighted(problem)])
     first = search.best(tried).rule
     tried += search.simulate([*_variants(first, reward_weight=problem.config.reward_weights)])
@@ -244,28 +283,9 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         tried += _with_tag_run(search, second)
     if search.least_users:
         done = {each.rule for each in tried}
-        near = (replace(first, **parts) for grid in _NEAR_THE_LOG for parts in _grid(**grid))
-        tried += search.simulate([rule for rule in near if rule not in done])
-    finalists = tried
-    if search.users.reward_report.new_users:
-        finalists = search.finalists(tried, search.best(tried))
-        again = {each.rule for each in finalists}
-        tried = [*(each for each in tried if each.rule not in again), *finalists]
-    best = search.most_evident(finalists)
-    agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
-    return RuleChoice(
-        rule=best.rule,
-        chosen_by=_chosen_by(search.users),
-        candidates=[best if each.rule == best.rule else each for each in tried],
-        warning=_warning(search, best),
-        estimate=estimate,
-        details={
-            **search.users.report(),
-            "least_items": search.least_items,
-            "least_users": search.least_users,
-            "halves_agree": list(agree),
-        },
-    )
+        others = (replace(first, **parts) for grid in _NEAR_THE_LOG for parts in _grid(**grid))
+        tried += search.simulate([rule for rule in others if rule not in done])
+    return tried
 
 
 def _warning(search: RuleSearch, best: SimulatedRule) -> str:

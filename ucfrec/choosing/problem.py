@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.episodes.store import EpisodeStore
@@ -27,3 +28,5 @@ class Problem:
     """Candidates and conditions."""
     seed: int
     """Of everything random."""
+    start: DecisionRule | None = None
+    """A rule near which to look for a better one; None to try all candidates."""

@@ -53,12 +53,12 @@ class TrainingCounts:
         liked_of: Callable[[EpisodeStore, IntArray, IntArray], BoolArray] = liked_steps,
     ) -> "TrainingCounts":
         """Count the items in `train`, a view of a store of items; `liked_of` as `liked_steps`."""
-        liked = np.zeros(len(train.item_states.embeddings), dtype=np.int64)
+        shown, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
         for steps in train.step_batches():
-            items = train.step_values(schema.ITEM, *steps)[liked_of(train, *steps)]
-            liked += np.bincount(items, minlength=len(liked))
-        shown = torch.from_numpy(train.item_counts())
-        return cls(shown, torch.from_numpy(liked), train.n_episodes)
+            items = train.step_values(schema.ITEM, *steps)
+            shown += np.bincount(items, minlength=len(shown))
+            liked += np.bincount(items[liked_of(train, *steps)], minlength=len(liked))
+        return cls(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""

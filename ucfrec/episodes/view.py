@@ -255,7 +255,12 @@ class EpisodeView:
     def step_batches(self) -> Iterator[tuple[IntArray, IntArray]]:
         """`all_steps` in batches, for views whose steps are too many to list."""
         for begin in range(0, self.n_steps, _BATCH_STEPS):
-            yield self.locate(np.arange(begin, min(begin + _BATCH_STEPS, self.n_steps)))
+            end = min(begin + _BATCH_STEPS, self.n_steps)
+            first, last = np.searchsorted(self._ends, (begin, end - 1), side="right")
+            counts = np.diff(self._ends[first : last + 1].clip(max=end), prepend=begin)
+            episodes = np.repeat(np.arange(first, last + 1), counts)
+            starts = self._ends[episodes] - self.lengths[episodes]
+            yield episodes, np.arange(begin, end) - starts
 
     def column(self, name: str) -> Array:
         """The values of a step column at `all_steps`, (n_steps,) or (n_steps, size).

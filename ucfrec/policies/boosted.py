@@ -101,9 +101,10 @@ class BoostedPolicy(SequencePolicy):
                 steps = np.sort(drawn)
             trees = BoostedTrees.fit(*self._rows(train, steps), seed)
             self.base.copy_(trees.base)
-            for tree in range(len(trees.values)):
-                inputs, thresholds, self.leaves[tree] = _table(trees, tree)
-                self.split_inputs[:, tree], self.split_thresholds[:, tree] = inputs, thresholds
+            count = len(trees.leaves)
+            self.leaves[:count] = trees.leaves
+            self.split_inputs[:, :count] = trees.inputs.T
+            self.split_thresholds[:, :count] = trees.thresholds.T
 
         return solve
 
@@ -210,27 +211,3 @@ class BoostedPolicy(SequencePolicy):
 
 def _rounded(values: Tensor) -> Tensor:
     return torch.round(values, decimals=_DECIMALS)
-
-
-def _table(trees: BoostedTrees, tree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Inputs and thresholds of a tree's splits, (S,) each, and its value for each of their 2^S
-    outcomes, numbered with bit s set where split s sends a row to the left."""
-    left, right = trees.left[tree].tolist(), trees.right[tree].tolist()
-    # Node 0 is the root; others are reached from it.
-    waiting, splits = [0], list[int]()
-    while waiting:
-        node = waiting.pop()
-        if left[node] != node:
-            splits.append(node)
-            waiting += [left[node], right[node]]
-    number = {node: place for place, node in enumerate(splits)}
-    outcomes = torch.zeros(2**_SPLITS)
-    for outcome in range(2**_SPLITS):
-        node = 0
-        while node in number:
-            node = left[node] if outcome >> number[node] & 1 else right[node]
-        outcomes[outcome] = trees.values[tree, node]
-    inputs, thresholds = torch.zeros(_SPLITS, dtype=torch.int64), torch.zeros(_SPLITS)
-    inputs[: len(splits)] = trees.inputs[tree, splits]
-    thresholds[: len(splits)] = trees.thresholds[tree, splits]
-    return inputs, thresholds, outcomes

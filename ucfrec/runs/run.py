@@ -35,7 +35,7 @@ from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
-from ucfrec.runs.warm_start import start_warm
+from ucfrec.runs.warm_start import rule_to_start_from, start_warm
 from ucfrec.user_model.model import UserModel
 
 _OVERLAY = "overlay.safetensors"
@@ -96,7 +96,8 @@ def train_run(
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
         callbacks: what is told of the training of the policy.
-        initial: a run on an older state of the store, whose weights the training begins with.
+        initial: a run on an older state of the store, whose weights the training begins with, near
+            whose rule a better one is looked for, and whose user model says which effects to fit.
 
     Raises:
         InputError: `out` is a run on another store or with another configuration, the store has
@@ -120,18 +121,18 @@ def train_run(
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.with_entries(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
-            record = record.with_entries(**_selected(run))
+            record = record.with_entries(**_selected(run, initial))
         _write_samples(run)
         seconds = record.wall_time_s + time.perf_counter() - begun
         return record.with_entries(wall_time_s=seconds).sealed(out)
 
 
-def _selected(run: _Inputs) -> dict[str, Any]:
+def _selected(run: _Inputs, initial: Path | None) -> dict[str, Any]:
     """Entries of the record: the user model and the decision rule that is best in it."""
     with phase("Fitting the user model", 3, PHASES):
-        user_model = _fit_user_model(run)
+        user_model = _fit_user_model(run, initial)
     with phase("Selecting the decision rule", 4, PHASES):
-        rule = _choose_rule(run, user_model)
+        rule = _choose_rule(run, user_model, initial)
     return {"reward_model": user_model.reward_report, "rule": rule}
 
 
@@ -222,18 +223,19 @@ def _train_policy(
     return fit_policy(run.policy, train, validation, run.out, run.config, start, callbacks)
 
 
-def _fit_user_model(run: _Inputs) -> UserModel:
+def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
     views = of_people(run.logged), of_people(run.held_out)
     inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated = run.record.return_to_go.per_session
     given = *views, run.out / REWARD_MODEL, run.config.seed
-    fit = partial(UserModel.fit, *given, simulated)
+    first = None if initial is None else initial / REWARD_MODEL
+    fit = partial(UserModel.fit, *given, simulated, first)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
 
-def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
+def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
     """Choose the decision rule: by simulation in the user model, or by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
     parts = trained.item_states, trained.returns, users.reward, users.session_end
@@ -241,7 +243,9 @@ def _choose_rule(run: _Inputs, users: UserModel) -> RuleRecord:
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     views = of_people(run.logged), of_people(run.held_out)
-    choice = choose_rule(Problem(scorer, users, targets, *views, config, run.config.seed))
+    start = None if initial is None else rule_to_start_from(initial, trained)
+    given = targets, *views, config, run.config.seed, start
+    choice = choose_rule(Problem(scorer, users, *given))
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 

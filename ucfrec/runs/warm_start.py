@@ -7,13 +7,15 @@ from typing import Final
 
 import torch
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM
 from ucfrec.counterfactual.reward_model_fit import INITIAL
 from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_trained
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import REFIT, read_record, refit_of_run
+from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 SHARE: Final = 1 / 8
 """Steps of a warm training, as a share of those of one from nothing."""
@@ -52,6 +54,25 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
             shutil.copyfile(best, scratch)
 
 
+def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
+    """The rule of a run, in the units of another: targets are the same quantile of the training
+    returns, and the lookahead the same number of mean rewards."""
+    old = TrainedPolicy.load(initial, split=True)
+    rule, quantiles = old.rule, new.record.config.rule.quantiles
+    if rule.target is not None:
+        target = rule.target
+        nearest = min(quantiles, key=lambda each: abs(old.target_return(each) - target))
+        moved = new.target_return(nearest)
+        least = None if rule.minimum_target is None else moved
+        rule = replace(rule, target=moved, minimum_target=least)
+    of_new, of_old = (_mean_reward(each.record) for each in (new, old))
+    return replace(rule, lookahead=rule.lookahead * of_new / of_old if of_old > 0 else 0.0)
+
+
+def _mean_reward(record: RunRecord) -> float:
+    return record.mean_return * record.train_episodes / record.train_steps
+
+
 def warm_settings(config: Config, share: float = SHARE) -> Config:
     """The settings of a warm training.
 
@@ -63,7 +84,7 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
         config.train,
         steps=few,
         warmup_steps=min(config.train.warmup_steps, few // 10),
-        validate_every=min(config.train.validate_every, max(1, few // 2)),
+        validate_every=min(config.train.validate_every, few),
     )
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

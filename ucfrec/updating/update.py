@@ -54,10 +54,10 @@ def update_run(
     """Make a run that has learned from new logs, too; an interrupted update goes on.
 
     The settings are those of the run. Its policy and augmentation models start from its weights,
-    with fewer steps; the user model is fitted and the decision rule chosen anew. The validation
-    split is the second newest part of the new rows, the test split, on which the runs are compared,
-    the newest. Once they are compared, the new run goes on learning from these rows, too. Neither
-    the run nor its store is changed.
+    with fewer steps; effects of the user model and the decision rule are looked for near those of
+    the run. The validation split is the second newest part of the new rows, the test split, on
+    which the runs are compared, the newest. Once they are compared, the new run goes on learning
+    from these rows, too. Neither the run nor its store is changed.
 
     Args:
         run: a finished run on a store of logs of items, which must be there.

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from ucfrec import schema
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -51,9 +53,9 @@ class LoggedRuns:
         ends = np.cumsum(store.lengths)
         view = store.select(np.arange(int(np.searchsorted(ends, most)) + 1)[: len(ends)])
         episodes, steps = view.all_steps()
-        windows = view.windows(episodes, steps, lags + 1)
-        runs = tags.runs(Shown.before_last(windows))
-        return cls(runs, tags.liked(windows.rewards[:, -1]).numpy(), np.asarray(episodes))
+        runs = tags.runs(Shown.before(view, episodes, steps, lags))
+        rewards = torch.from_numpy(view.step_values(schema.REWARD, episodes, steps))
+        return cls(runs, tags.liked(rewards).numpy(), np.asarray(episodes))
 
 
 def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:

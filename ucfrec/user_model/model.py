@@ -59,22 +59,26 @@ class UserModel:
         folder: Path,
         seed: int,
         simulated: bool = True,
+        first: Path | None = None,
     ) -> "UserModel":
         """Fit the parts that are not in `folder` yet; read the others.
 
         Args:
             train: training episodes of a store of items.
             validation: held-out episodes of the same store.
+            simulated: whether sessions are simulated.
+            first: folder of the user model of an earlier state of the store, near whose spreads of
+                effects the search begins and ends.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
                 damaged.
         """
         require_blas_memory()
-        reward, report = fit_item_reward_model(train, validation, folder, seed)
+        reward, report = fit_item_reward_model(train, validation, folder, seed, first=first)
         users = None
         if simulated and train.has_users:
-            users = fit_training_users(train, folder, seed, weighted=report.new_users)
+            users = fit_training_users(train, folder, seed, report.new_users, first)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
             runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))

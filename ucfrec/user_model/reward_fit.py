@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -45,6 +45,8 @@ _SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 LASTING: Final = ("item", "user", "content", "affinity")
 """Effects that are distinguished by users who were shown several items."""
 _MAX_ROWS: Final = 500_000
+WARM_ROWS: Final = 25_000
+"""Most rows of a search that begins near an earlier one."""
 _CONSTANT: Final = 1e-6
 _ROWS: Final = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
@@ -70,6 +72,7 @@ def fit_item_reward_model(
     seed: int,
     max_rows: int = _MAX_ROWS,
     effects: Collection[str] = EFFECTS,
+    first: Path | None = None,
 ) -> tuple[ItemRewardModel, ItemRewardReport]:
     """Fit the model to training rows, or read it from `folder` if it was fitted before.
 
@@ -89,6 +92,8 @@ def fit_item_reward_model(
         validation: held-out view of the same store.
         seed: of the rows drawn from a store with more than `max_rows`.
         max_rows: most rows of each view that are used.
+        first: folder of the model of an earlier state of the store, near whose spreads the search
+            begins and ends; where users are known, on fewer rows.
 
     Returns:
         The model, in evaluation mode, and its quality on the validation rows.
@@ -106,13 +111,20 @@ def fit_item_reward_model(
     rows = RewardRows.of(train, model.lags, max_rows, seed)
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
     set_statistics(model, rows, held_out, train.item_states)
-    search = EffectSearch(Design.of(model, rows), Design.of(model, held_out))
+    begin = {} if first is None else kept_by(first / FITTED)
+    design = Design.of(model, rows)
+    search = EffectSearch(design, Design.of(model, held_out), begin)
+    if begin and not search.of_new_users:
+        some = np.random.default_rng(seed).permutation(len(rows)) < WARM_ROWS
+        search = EffectSearch(design.select(torch.from_numpy(some)), search.held_out, begin)
     if search.of_new_users:
         rows = RewardRows.of(train, MEMORY, max_rows, seed)
         held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
         search.shown = ShownBefore(model, rows.shown, held_out.shown)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         search.add_all(bar, effects)
+    if len(search.design.items) < len(rows):
+        search.fit_to(design)
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
     folder.mkdir(parents=True, exist_ok=True)
@@ -180,6 +192,19 @@ def added_by_tastes(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tens
     return torch.cat(added)
 
 
+def kept_by(file: Path) -> dict[str, int]:
+    """Numbers of the spreads of the effects that a fit kept; none if it is not there."""
+    if not file.exists():
+        return {}
+    with damage_explained(file, REMEDY):
+        effects = [EffectTried(**each) for each in load_tensors(file)[1]["effects"]]
+    return {
+        each.effect: int(np.abs(np.array(_SPREADS) - each.spread).argmin())
+        for each in effects
+        if each.kept
+    }
+
+
 class ShownBefore(NamedTuple):
     """What the sessions of rows showed before them, where users are new."""
 
@@ -195,8 +220,15 @@ class EffectSearch:
     shown: ShownBefore | None = None
     """Where users are new; needed to learn tastes within the session."""
 
-    def __init__(self, design: Design, held_out: Design) -> None:
-        self.design, self.held_out = design, held_out
+    def __init__(
+        self, design: Design, held_out: Design, begin: Mapping[str, int] | None = None
+    ) -> None:
+        """Args:
+        design: training rows.
+        held_out: rows that choose.
+        begin: of `kept_by`, of a search on older rows.
+        """
+        self.design, self.held_out, self._begin = design, held_out, begin or {}
         self.effects = design.mean_effect()
         self.kept: dict[str, int] = {}
         self.new_users = False
@@ -213,7 +245,10 @@ class EffectSearch:
         no_one = bool((self.design.users == self.design.n_users).all())
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
-        at, (effects, losses) = self._best(name, _FIRST, _STRIDES.get(name, (2,)))
+        near, strides = _FIRST, _STRIDES.get(name, (2,))
+        if self._begin:
+            near, strides = self._begin.get(name, _FIRST), (1,) if name in self._begin else ()
+        at, (effects, losses) = self._best(name, near, strides)
         decrease = self.losses - losses
         gain = float(decrease.mean())
         error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
@@ -233,7 +268,7 @@ class EffectSearch:
                 search = self
             if name in effects:
                 search.add(name)
-            if name == _CHEAP[-1]:
+            if name == _CHEAP[-1] and not search._begin:
                 search.adjust()
             bar.update()
 
@@ -253,7 +288,8 @@ class EffectSearch:
         """A search that is evaluated on a fifth of the training rows."""
         rows = len(self.design.items)
         held_back = torch.arange(rows) % 5 == min(4, rows - 1)
-        return EffectSearch(self.design.select(~held_back), self.design.select(held_back))
+        parts = self.design.select(~held_back), self.design.select(held_back)
+        return EffectSearch(*parts, self._begin)
 
     def _take(self, search: "EffectSearch") -> None:
         """Fit the effects that `search` keeps, with its spreads, to all training rows."""
@@ -303,6 +339,13 @@ class EffectSearch:
         for name in [*self.kept]:
             self.kept[name], (self.effects, self.losses) = self._best(name, self.kept[name], (1,))
 
+    def fit_to(self, design: Design) -> None:
+        """Fit the effects that were kept to other rows."""
+        spreads = {name: _SPREADS[number] for name, number in self.kept.items()}
+        self.design = design
+        self.effects = fit_effects(design, self.effects, spreads)
+        self.losses = self._losses(self.effects)
+
     def report(self) -> tuple[EffectTried, ...]:
         """The effects tried, with the final spreads of those that were kept."""
         return tuple(
@@ -326,7 +369,10 @@ class EffectSearch:
                 if self.new_users:
                     spreads = {each: spreads[each] for each in spreads if each not in LASTING}
                 spreads[name] = _SPREADS[index]
-                effects = fit_effects(self.design, self.effects, spreads, self._fixed)
+                start = self.effects
+                if self._begin and found:
+                    start = found[min(found, key=lambda other: abs(other - index))][0]
+                effects = fit_effects(self.design, start, spreads, self._fixed)
                 found[index] = effects, self._losses(effects)
             return float(found[index][1].mean())
 

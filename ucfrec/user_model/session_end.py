@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torch.nn import functional as F
 
+from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -66,9 +67,10 @@ class LoggedEnds:
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - known)[episodes]
         ended = steps == store.lengths[episodes] - 1
-        window = store.windows(episodes, steps, lags + 1)
-        rewards = window.rewards[:, -1].double().numpy()
-        return cls(Shown.before_last(window), window.actions[:, -1], rewards, steps, ended)
+        shown = Shown.before(store, episodes, steps, lags)
+        items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
+        rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+        return cls(shown, items, rewards, steps, ended)
 
 
 @dataclass(frozen=True, config=SAVED)
@@ -152,8 +154,7 @@ class SessionEnd:
         if trees is None:
             uses = bool(self.tensors["weights"][_REWARD] != 0)
         else:
-            inner = trees.left != torch.arange(trees.left.shape[1])
-            uses = bool(((trees.inputs == _REWARD) & inner).any())
+            uses = bool((trees.inputs == _REWARD).any())
         object.__setattr__(self, "uses_rewards", uses)
 
     def probabilities(

@@ -33,7 +33,13 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_t
 from ucfrec.progress import progress
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
-from ucfrec.user_model.reward_fit import EffectSearch, reward_model_sizes, set_statistics
+from ucfrec.user_model.reward_fit import (
+    WARM_ROWS,
+    EffectSearch,
+    kept_by,
+    reward_model_sizes,
+    set_statistics,
+)
 from ucfrec.user_model.reward_report import SAVED, EffectTried, fit_line
 from ucfrec.user_model.reward_rows import RewardRows
 
@@ -69,7 +75,11 @@ class TrainingUsers:
 
 
 def fit_training_users(
-    train: EpisodeStore, folder: Path, seed: int, weighted: bool = True
+    train: EpisodeStore,
+    folder: Path,
+    seed: int,
+    weighted: bool = True,
+    first: Path | None = None,
 ) -> TrainingUsers:
     """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
@@ -79,6 +89,8 @@ def fit_training_users(
         train: view of a store of items whose episodes name their users.
         seed: of the sessions drawn by `sessions_of`.
         weighted: whether rows are weighted by propensities, if there are any.
+        first: folder of the fit to an earlier state of the store, near whose spreads the search
+            begins and ends; of known users, on fewer rows.
 
     Raises:
         InputError: all training rewards are equal, or the file is damaged.
@@ -100,14 +112,19 @@ def fit_training_users(
     if weighted:
         weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
-    search = EffectSearch(design, design).of_training()
+    begin = {} if first is None else kept_by(first / _FITTED)
+    few = design
+    if begin and not weighted:
+        few = design.select(torch.arange(len(rows)) < WARM_ROWS)
+    search = EffectSearch(few, few, begin).of_training()
     with progress(len(EFFECTS), "training users", "effects") as bar:
         for name in EFFECTS:
             search.add(name)
             bar.update()
     tried, held_back = search.report(), search.held_out
     spreads = {each.effect: each.spread for each in tried if each.kept}
-    model.set_effects(fit_effects(design, design.mean_effect(), spreads), design.of_content)
+    start = search.effects if begin else design.mean_effect()
+    model.set_effects(fit_effects(design, start, spreads), design.of_content)
     scores = held_back.predictor(search.effects)
     line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
     report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)

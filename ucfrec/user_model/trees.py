@@ -20,31 +20,30 @@ _SETTINGS: Final = {
     "early_stopping": True,
 }
 
-_NODES: Final = ("inputs", "thresholds", "left", "right", "values")
+_SPLITS: Final = LEAVES - 1
+_TENSORS: Final = ("inputs", "thresholds", "leaves", "base")
 
 
 @dataclass(frozen=True)
 class BoostedTrees:
-    """The sum of T regression trees of at most N nodes; node 0 is a tree's root.
+    """The sum of T regression trees of at most S splits.
 
-    A node sends a row to `left` if its input is at most the threshold; leaves send rows to
-    themselves.
+    A tree is a table: which of its splits' inputs are at most their threshold selects the leaf.
     """
 
     inputs: Tensor
-    """(T, N) int64 number of the input that a node looks at."""
+    """(T, S) int64 number of the input that a split looks at."""
     thresholds: Tensor
-    """(T, N) float64."""
-    left: Tensor
-    """(T, N) int64."""
-    right: Tensor
-    """(T, N) int64."""
-    values: Tensor
-    """(T, N) float64."""
+    """(T, S) float64."""
+    leaves: Tensor
+    """(T, 2^S) float64 values; bit s of a column's number is set where split s finds an input that
+    is at most its threshold."""
     base: Tensor
     """() float64, what the trees' sum starts from."""
-    depth: int = field(init=False)
-    """Largest number of steps from a root to a leaf."""
+    _splits: tuple[Tensor, Tensor] = field(init=False)
+    """Input and threshold (U,) of the different splits."""
+    _bits: Tensor = field(init=False)
+    """(T, U) float32 bits of the columns' numbers that a split stands for."""
 
     @classmethod
     def fit(cls, inputs: Array, target: Array, seed: int) -> Self:
@@ -55,27 +54,16 @@ class BoostedTrees:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
-        trees = [trees[0].nodes for trees in model._predictors]
-        size = max(len(nodes) for nodes in trees)
-        columns = {name: np.zeros((len(trees), size)) for name in _NODES}
-        for tree, nodes in enumerate(trees):
-            own, leaf = np.arange(len(nodes)), nodes["is_leaf"] == 1
-            for name, values in (
-                ("inputs", np.where(leaf, 0, nodes["feature_idx"])),
-                ("thresholds", np.where(leaf, 0.0, nodes["num_threshold"])),
-                ("left", np.where(leaf, own, nodes["left"])),
-                ("right", np.where(leaf, own, nodes["right"])),
-                ("values", nodes["value"]),
-            ):
-                columns[name][tree, : len(nodes)] = values
-        whole = ("inputs", "left", "right")
-        tensors = {name: torch.from_numpy(each) for name, each in columns.items()}
-        tensors |= {name: tensors[name].long() for name in whole}
-        return cls(**tensors, base=torch.tensor(float(model._baseline_prediction.item())).double())
+        tables = [_table(trees[0].nodes) for trees in model._predictors]
+        splits, thresholds, leaves = (
+            torch.from_numpy(np.stack(each)) for each in zip(*tables, strict=True)
+        )
+        base = torch.tensor(float(model._baseline_prediction.item())).double()
+        return cls(splits, thresholds, leaves, base)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The fields by name, to be saved."""
-        return {name: getattr(self, name) for name in (*_NODES, "base")}
+        """The tables by name, to be saved."""
+        return {name: getattr(self, name) for name in _TENSORS}
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor]) -> Self:
@@ -84,29 +72,48 @@ class BoostedTrees:
         Raises:
             ValueError: they are no trees.
         """
-        given = {name: tensors[name] for name in (*_NODES, "base")}
-        shape = given["values"].shape
-        for name, most in (("inputs", 2**15), ("left", shape[1]), ("right", shape[1])):
-            numbers = given[name]
-            if numbers.shape != shape or numbers.dtype != torch.int64:
-                raise ValueError(f"{name} are no numbers of nodes")
-            if bool(((numbers < 0) | (numbers >= most)).any()):
-                raise ValueError(f"{name} are beyond the trees")
-        return cls(**given)
+        inputs, thresholds, leaves, base = (tensors[name] for name in _TENSORS)
+        if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
+            raise ValueError("inputs are no numbers of inputs")
+        if bool(((inputs < 0) | (inputs >= 2**15)).any()):
+            raise ValueError("inputs are beyond any input")
+        shapes = thresholds.shape, leaves.shape, base.shape
+        if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
+            raise ValueError("thresholds, leaves and base do not fit the inputs")
+        return cls(inputs, thresholds, leaves, base)
 
     def __post_init__(self) -> None:
-        nodes, reached, depth = self.values.shape[1], torch.zeros_like(self.left[:, :1]), 0
-        while depth < nodes and not torch.equal(self.left.gather(1, reached), reached):
-            children = [side.gather(1, reached) for side in (self.left, self.right)]
-            reached, depth = torch.unique(torch.cat(children, 1), dim=1), depth + 1
-        object.__setattr__(self, "depth", depth)
+        pairs = torch.stack([self.inputs.double(), self.thresholds], 2).flatten(0, 1)
+        splits, which = torch.unique(pairs, dim=0, return_inverse=True)
+        bits = torch.zeros(len(self.inputs), len(splits))
+        numbers = (2.0 ** torch.arange(self.inputs.shape[1])).expand(self.inputs.shape)
+        bits.scatter_add_(1, which.view(self.inputs.shape), numbers)
+        object.__setattr__(self, "_splits", (splits[:, 0].long(), splits[:, 1:]))
+        object.__setattr__(self, "_bits", bits)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) float64 from inputs (M, F)."""
-        columns = inputs.double().T
-        node = torch.zeros(self.values.shape[0], columns.shape[1], dtype=torch.int64)
-        for _ in range(self.depth):
-            values = columns.gather(0, self.inputs.gather(1, node))
-            goes_left = values <= self.thresholds.gather(1, node)
-            node = torch.where(goes_left, self.left.gather(1, node), self.right.gather(1, node))
-        return self.base + self.values.gather(1, node).sum(0)
+        numbers, thresholds = self._splits
+        at_most = inputs.double().T[numbers] <= thresholds
+        # Sums of a few powers of two are exact in float32.
+        return self.base + self.leaves.gather(1, (self._bits @ at_most.float()).long()).sum(0)
+
+
+def _table(nodes: Array) -> tuple[Array, Array, Array]:
+    """Inputs (S,), thresholds (S,) and leaves (2^S,) of the nodes of one of scikit-learn's trees.
+
+    Splits that the tree lacks look at input 0, and select nothing.
+    """
+    inner = np.flatnonzero(nodes["is_leaf"] == 0)
+    inputs, thresholds = np.zeros(_SPLITS, dtype=np.int64), np.zeros(_SPLITS)
+    inputs[: len(inner)] = nodes["feature_idx"][inner]
+    thresholds[: len(inner)] = nodes["num_threshold"][inner]
+    split = np.zeros(len(nodes), dtype=np.int64)
+    split[inner] = np.arange(len(inner))
+    outcomes = np.arange(2**_SPLITS)
+    node = np.zeros(2**_SPLITS, dtype=np.int64)
+    for _ in inner:
+        left = (outcomes >> split[node]) & 1 == 1
+        below = np.where(left, nodes["left"][node], nodes["right"][node])
+        node = np.where(nodes["is_leaf"][node] == 1, node, below).astype(np.int64)
+    return inputs, thresholds, nodes["value"][node]

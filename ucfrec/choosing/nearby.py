@@ -1,0 +1,62 @@
+"""Rules near another one, for a choice that begins where an earlier one ended."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.choosing.problem import Problem
+
+
+def near(
+    rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
+) -> Iterator[DecisionRule]:
+    """The rule, rules with another target, and those with another of its numbers one candidate up
+    or down.
+
+    A rule without lookahead also gets one, with the middle weight of the policy, and loses it with
+    the middle reward weight.
+
+    Args:
+        more: further candidates of `temperature` and `reward_weight`.
+    """
+    config, learned = problem.config, problem.scorer.policy.values is not None
+    yield rule
+    for target in dict.fromkeys(problem.targets.values()):
+        yield replace(rule, target=target, minimum_target=None)
+        yield replace(rule, target=target, minimum_target=target)
+    if learned and problem.scorer.policy.config.max_return:
+        yield replace(rule, target=None, minimum_target=None)
+    grid: dict[str, Sequence[float]] = {
+        name: [*getattr(config, f"{name}s"), *(each for part in more for each in part[name])]
+        for name in ("temperature", "reward_weight")
+    }
+    mean = float(problem.train.returns.sum(dtype="float64")) / problem.train.n_steps
+    lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
+    middle = _middle(config.policy_weights)
+    if rule.looks_ahead:
+        grid |= {"lookahead": lookaheads, "policy_weight": config.policy_weights}
+        grid["reward_weight"] = config.lookahead_weights
+        weight = _middle(config.reward_weights)
+        yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
+    elif problem.users.session_end_report.kept != "constant":
+        for ahead, weight in product(lookaheads, config.lookahead_weights):
+            yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
+    if problem.validation.item_states.tags.shape[1]:
+        known = problem.scorer.known
+        grid["tag_window"] = [0, *(each for each in config.tag_windows if each <= known)]
+        grid["tag_run"] = [0, *config.tag_runs] if problem.users.fatigue else [0]
+    for name, values in grid.items():
+        yield from (replace(rule, **{name: each}) for each in _beside(getattr(rule, name), values))
+
+
+def _beside(value: float, values: Sequence[float]) -> list[Any]:
+    """The next smaller and the next larger of the values."""
+    smaller = [each for each in values if each < value]
+    larger = [each for each in values if each > value]
+    return [*([max(smaller)] if smaller else []), *([min(larger)] if larger else [])]
+
+
+def _middle(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]

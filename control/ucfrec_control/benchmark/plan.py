@@ -11,10 +11,19 @@ from ucfrec.benchmark.plan import Plan, Presets
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec_control.benchmark.budgets import TRIED_RATES
-from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
-from ucfrec_control.benchmark.methods import RATES, ROBUST, ROBUSTNESS, SCORES, TABLES
+from ucfrec_control.benchmark.measure import BACK, DISTRACTOR, RATE
+from ucfrec_control.benchmark.methods import (
+    MAIN,
+    RATES,
+    ROBUST,
+    ROBUSTNESS,
+    SCORES,
+    SPREAD,
+    TABLES,
+)
 from ucfrec_control.benchmark.rates import SEARCHED, settings_of
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
+from ucfrec_control.training.kept import KEPT
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
 
@@ -38,12 +47,29 @@ def score_cells(
     Raises:
         InputError: a file is missing, or a method is not in the table.
     """
-    selected = _selected(TABLES[table], methods)
+    selected = _selected(TABLES[table], methods or budget.methods)
     plan = _plan(SCORES, folder, budget)
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
             store = zoo_store(data, stores_of(folder), file)
             yield from plan.trained(table, Task(file, store), selected)
+
+
+def spread_cells(
+    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = (), checkpoints: int = KEPT
+) -> Iterator[Cell]:
+    """A cell for each of the last checkpoints of the trainings of the main table.
+
+    Args:
+        data, folder, budget, methods: as of `score_cells`, whose runs they share.
+        checkpoints: number of last checkpoints, at most `KEPT`.
+
+    Raises:
+        InputError: as `score_cells`.
+    """
+    for cell in score_cells(data, folder, budget, MAIN, methods):
+        for back in range(checkpoints):
+            yield replace(cell, suite=SPREAD, table=SPREAD, conditions={BACK: back})
 
 
 def robustness_cells(

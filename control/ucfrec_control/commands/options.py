@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from ucfrec.benchmark.cells import Budget
 from ucfrec.commands.grid_options import budget_options, grid_options
@@ -14,6 +15,12 @@ from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
 
+BUDGETS: Final = {
+    "small": "a quick look: policies have not learned all they can",
+    "medium": "averaged weights, 16 times the windows; about 20 core hours for the main table",
+    "full": "the steps, seeds and episodes of the papers",
+}
+"""What the budgets are, by name."""
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""
 
@@ -62,7 +69,7 @@ def data_given(options: argparse.Namespace) -> Path:
 def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -> None:
     """Add the options for what a benchmark measures, and where it keeps its runs and rows."""
     if budget:
-        budget_options(parser, "--file", "--seeds")
+        budget_options(parser, "--file", "--seeds", BUDGETS)
     grid_options(parser, "runs/control", 1)
 
 

@@ -17,6 +17,7 @@ from ucfrec_control.benchmark.reproduce import (
 )
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import (
+    BUDGETS,
     control_grid_options,
     data_given,
     data_option,
@@ -30,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `reproduce`."""
     parser.add_argument("part", choices=list(PARTS), help="table or figure of the paper")
     data_option(parser)
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument("--budget", default="small", choices=list(BUDGETS))
     parser.add_argument(
         "--seeds",
         dest="training_seeds",

@@ -23,7 +23,7 @@ from ucfrec_control.benchmark.methods import (
 )
 from ucfrec_control.benchmark.rates import SEARCHED, settings_of
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
-from ucfrec_control.training.kept import KEPT
+from ucfrec_control.training.kept import KEPT, kept_steps
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
 
@@ -65,10 +65,15 @@ def spread_cells(
         checkpoints: number of last checkpoints, at most `KEPT`.
 
     Raises:
-        InputError: as `score_cells`.
+        InputError: as `score_cells`, or a method is trained without averaging.
     """
     for cell in score_cells(data, folder, budget, MAIN, methods):
-        for back in range(checkpoints):
+        if cell.policy in ALGORITHMS or not cell.config.train.average:
+            raise InputError(
+                f"{cell.method} of budget {budget.name} is trained without train.average, so it "
+                "has no averaged weights; name another --method, or --budget medium"
+            )
+        for back in range(min(checkpoints, len(kept_steps(cell.config.train)))):
             yield replace(cell, suite=SPREAD, table=SPREAD, conditions={BACK: back})
 
 

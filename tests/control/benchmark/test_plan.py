@@ -52,7 +52,7 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     }
 
 
-@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("size", BUDGETS)
 @pytest.mark.parametrize("table", TABLES)
 def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
     budget = budget_of(table, size)
@@ -90,7 +90,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
     assert main["ucf-wo-arch"].policy_name == "dt"
     assert main["ucf-wo-arch"].augment.copies > 0
-    for size in ("small", "full"):
+    for size in BUDGETS:
         timed = resolved(EQUAL_TIME, BUDGETS[size], file)
         steps = {name: config.train.steps for name, config in timed.items()}
         assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
@@ -108,7 +108,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
-@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("size", BUDGETS)
 def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
     """They share their runs."""
     for file in budget_of("gate", size).tasks:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from ucfrec.benchmark.cells import Method
 
 SCORES, ROBUSTNESS, RATES, SPREAD = "control", "robustness", "rates", "spread"
+CONTEXTS = "contexts"
 """Suites of the rows."""
 Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"
@@ -43,6 +44,8 @@ WITHOUT_TIME = (
     *("bc", "bc-10", "bc-25"),
 )
 """Methods of a training long enough to be trusted: one of each architecture, and cloning."""
+WITH_HISTORY = ("ucf-wo-count", "dc-wo-time", "dt-wo-time", "lsdt-wo-time")
+"""One of those of each policy that takes a history."""
 WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
 """Methods with embeddings of time steps of which there is one without."""
 

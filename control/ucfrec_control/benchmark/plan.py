@@ -10,9 +10,10 @@ from ucfrec.benchmark.grid import chosen
 from ucfrec.benchmark.plan import Plan, Presets
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec_control.benchmark.budgets import TRIED_RATES
-from ucfrec_control.benchmark.measure import BACK, DISTRACTOR, RATE
+from ucfrec_control.benchmark.budgets import TRIED_CONTEXTS, TRIED_RATES
+from ucfrec_control.benchmark.measure import BACK, CONTEXT, DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import (
+    CONTEXTS,
     MAIN,
     RATES,
     ROBUST,
@@ -53,6 +54,26 @@ def score_cells(
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
             store = zoo_store(data, stores_of(folder), file)
             yield from plan.trained(table, Task(file, store), selected)
+
+
+def context_cells(
+    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = ()
+) -> Iterator[Cell]:
+    """The cells of methods of the main table with each of `TRIED_CONTEXTS`; arguments and errors as
+    of `score_cells`, which shares the runs of the context that it is given."""
+    names = methods or budget.methods
+    for context in TRIED_CONTEXTS:
+        given = with_contexts(budget, dict.fromkeys(names, context))
+        for cell in score_cells(data, folder, given, MAIN, names):
+            yield replace(cell, suite=CONTEXTS, table=CONTEXTS, conditions={CONTEXT: context})
+
+
+def with_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
+    """`budget` with contexts of single methods."""
+    settings = dict(budget.of_methods)
+    for name, context in contexts.items():
+        settings[name] = (*settings.get(name, ()), f"policy.context={context}")
+    return replace(budget, of_methods=settings)
 
 
 def spread_cells(

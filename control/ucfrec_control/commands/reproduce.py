@@ -18,11 +18,11 @@ from ucfrec_control.benchmark.reproduce import (
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import (
     BUDGETS,
+    choices_options,
     control_grid_options,
     data_given,
     data_option,
     narrowed,
-    rates_option,
 )
 from ucfrec_control.commands.robustness import print_robustness
 
@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="number of training seeds (default: set by --budget)",
     )
-    rates_option(parser)
+    choices_options(parser)
     control_grid_options(parser, budget=False)
     parser.set_defaults(tasks=[], evaluation_seed=None)
 

@@ -13,11 +13,11 @@ from ucfrec_control.benchmark.methods import SPREAD
 from ucfrec_control.benchmark.plan import spread_cells
 from ucfrec_control.benchmark.spread import SHOWN, spreads
 from ucfrec_control.commands.options import (
+    choices_options,
     control_grid_options,
     data_given,
     data_option,
     narrowed,
-    rates_option,
 )
 from ucfrec_control.training.kept import KEPT
 
@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         choices=range(1, KEPT + 1),
         help=f"number of last checkpoints of each training (default: {KEPT})",
     )
-    rates_option(parser)
+    choices_options(parser)
     control_grid_options(parser)
     parser.set_defaults(budget="medium")
 

@@ -13,6 +13,7 @@ from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.robustness import verdicts
+from ucfrec_control.benchmark.spread import AVERAGING, BACK
 from ucfrec_control.data.distractor import CLEAN
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.training.evaluate import evaluate_run, held_out_losses
@@ -34,10 +35,6 @@ DISTRACTOR: Final = "distractor"
 """Condition of rows of the robustness table: a key of `DISTRACTORS`."""
 CONTEXT: Final = "context"
 """Condition of rows of the search for contexts."""
-BACK: Final = "checkpoints_before_last"
-"""Condition of rows of single checkpoints."""
-AVERAGING: Final = "weights"
-"""Condition of rows of single checkpoints: one of `WEIGHTS`."""
 RATE: Final = "learning_rate"
 """Condition of rows of the search for rates."""
 

@@ -11,7 +11,7 @@ from ucfrec.benchmark.plan import Plan, Presets
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec_control.benchmark.budgets import TRIED_CONTEXTS, TRIED_RATES
-from ucfrec_control.benchmark.measure import BACK, CONTEXT, DISTRACTOR, RATE
+from ucfrec_control.benchmark.measure import CONTEXT, DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import (
     CONTEXTS,
     MAIN,
@@ -23,6 +23,7 @@ from ucfrec_control.benchmark.methods import (
     TABLES,
 )
 from ucfrec_control.benchmark.rates import SEARCHED, settings_of
+from ucfrec_control.benchmark.spread import BACK
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
 from ucfrec_control.training.kept import KEPT, kept_steps
 from ucfrec_control.training.rl_baselines import ALGORITHMS

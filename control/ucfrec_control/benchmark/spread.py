@@ -5,8 +5,11 @@ from typing import Any, Final
 
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.measure import AVERAGING, BACK
 
+BACK: Final = "checkpoints_before_last"
+"""Condition of rows of single checkpoints."""
+AVERAGING: Final = "weights"
+"""Condition of rows of single checkpoints: one of `WEIGHTS`."""
 SHOWN: Final = ("task", "method", "weights", "seeds", "score", "sd_seeds", "checkpoints", "sd_last")
 """Columns of `spreads`."""
 

@@ -13,8 +13,7 @@ from ucfrec.fitting.loop import LoopConfig
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS
-from ucfrec_control.benchmark.measure import AVERAGING, BACK
-from ucfrec_control.benchmark.spread import spreads
+from ucfrec_control.benchmark.spread import AVERAGING, BACK, spreads
 from ucfrec_control.cli import main
 from ucfrec_control.training.kept import WEIGHTS, checkpoint_name, keeping, kept_steps
 

@@ -66,7 +66,14 @@ BASELINES = (
 SEQUENCE = ("sasrec", "gsasrec", "bpr", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
 UCF = (
     *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure"),
-    *("ucf-wo-reward-weight", "ucf-wo-rule", "ucf-weights", "ucf-max-return"),
+    *(
+        "ucf-wo-reward-weight",
+        "ucf-wo-lookahead",
+        "ucf-wo-policy",
+        "ucf-wo-rule",
+        "ucf-weights",
+        "ucf-max-return",
+    ),
     *("ucf-actions", "ucf-both", "ucf-wo-count", "ucf-wo-arch", "ucf"),
 )
 METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQUENCE), *UCF)

@@ -255,8 +255,8 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     trained = TrainedPolicy.load(Path(run))
     actor = trained.actor(512, replace(trained.rule, temperature=1.5, reward_weight=0.0))
     env = Environment("synthetic-catalog", None).simulator().make(512, None)
-    returns = rollout(env, actor, 2000, seed=0).returns
-    truth, error = returns.mean(), returns.std() / 2000**0.5
+    returns = rollout(env, actor, 4000, seed=0).returns
+    truth, error = returns.mean(), returns.std() / 4000**0.5
     assert abs(truth - rows["logged"]["R_cum"]) > 3 * error
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]

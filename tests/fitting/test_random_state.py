@@ -135,7 +135,9 @@ def test_collecting_and_evaluating(environment: str, tmp_path: Path) -> None:
 def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(
     store: EpisodeStore, tmp_path: Path
 ) -> None:
-    config = resolve_config("ucf", None, [*killed_run.SETTINGS, "train.steps=10", "crm.epochs=1"])
+    config = resolve_config(
+        "ucf", None, [*killed_run.SETTINGS, "augment.copies=1", "train.steps=10", "crm.epochs=1"]
+    )
     weights = []
     for seed in (1, 2):
         torch.manual_seed(seed)

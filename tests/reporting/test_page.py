@@ -32,7 +32,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         split = np.repeat([0, 1], [n * 3 // 4, n - n * 3 // 4]).astype(np.uint8)
         EpisodeStore.write(folder / name, columns, lengths, {"split": split})
     small = [*killed_run.SETTINGS, "train.steps=30"]
-    supervised = {"ucf": ["policy.lambda_mask=0.1"]}
+    supervised = {"ucf": ["policy.lambda_mask=0.1", "augment.copies=1"]}
     for run, store, policy_name in (("ucf", "store", "ucf"), ("dt", "store", "dt"),
                                 ("other", "other-store", "dt")):  # fmt: skip
         config = resolve_config(policy_name, None, [*small, *supervised.get(run, [])], seed=3)

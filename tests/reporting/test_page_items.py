@@ -58,9 +58,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ids = pa.table({"item_id": [f"item {n}" for n in range(N_ITEMS)], "train_count": [7] * N_ITEMS})
     pq.write_table(ids, folder / "store" / "items.parquet")
     for run, policy_name in (("ucf", "ucf"), ("greedy", "crm-greedy")):
-        config = resolve_config(
-            policy_name, None, SETTINGS if run == "ucf" else SETTINGS[:-1], seed=3
-        )
+        own = (*SETTINGS, "augment.copies=1") if run == "ucf" else SETTINGS[:-1]
+        config = resolve_config(policy_name, None, own, seed=3)
         train_run(EpisodeStore.open(folder / "store"), folder / run, config)
     return folder
 

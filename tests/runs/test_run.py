@@ -102,18 +102,18 @@ def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> No
 
 
 def test_without_copies_no_reward_model_is_trained(store: Path, tmp_path: Path) -> None:
-    settings = [*killed_run.SETTINGS, "augment.copies=0", "train.steps=10"]
+    settings = [*killed_run.SETTINGS, "train.steps=10"]
     store_ = EpisodeStore.open(store)
     record = train_run(store_, tmp_path / "run", resolve_config("ucf", None, settings))
     assert record.augmentation is None
     assert not (tmp_path / "run" / "crm").exists()
-    assert TrainedPolicy.load(tmp_path / "run").name == "ucf-no-augmentation"
+    assert TrainedPolicy.load(tmp_path / "run").name == "ucf"
 
 
 def test_other_actions_alone_on_the_command_line(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = (*killed_run.SETTINGS, "train.steps=4", "augment.copies=0", "augment.actions=2")
+    settings = (*killed_run.SETTINGS, "train.steps=4", "augment.actions=2")
     command = ["train", str(store), "--out", str(tmp_path / "run")]
     main([*command, *(text for setting in settings for text in ("--set", setting))])
     printed = capsys.readouterr().out
@@ -122,7 +122,7 @@ def test_other_actions_alone_on_the_command_line(
     assert "acceptance" not in printed
     assert (report["copies"], report["proposals"]) == (0, 0)
     assert not (tmp_path / "run" / "csg").exists()
-    assert TrainedPolicy.load(tmp_path / "run").name == "ucf"
+    assert TrainedPolicy.load(tmp_path / "run").name == "ucf-augmented"
 
 
 @pytest.mark.parametrize("policy_name", ["ucf", "dt4rec", "cdt4rec"])
@@ -152,7 +152,7 @@ def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: P
         "reward": rng.random(200),
     }
     whole = EpisodeStore.write(tmp_path / "store", columns, np.full(40, 5))
-    settings = [*killed_run.SETTINGS, "train.steps=10"]
+    settings = [*killed_run.SETTINGS, "augment.copies=1", "train.steps=10"]
     train_run(whole, tmp_path / "run", resolve_config("ucf", None, settings))
     overlay = Overlay.load(tmp_path / "run" / "overlay.safetensors")
     assert not set(overlay.copy_source) & {1, 11, 21, 31}
@@ -210,9 +210,9 @@ def test_a_start_that_fails_leaves_nothing_and_the_corrected_command_works_there
 def test_rewards_that_never_vary_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     flat = two_columns(tmp_path / "store", reward=0.5)
     with pytest.raises(InputError, match=r"all 270 training rewards of .* equal 0\.5"):
-        train_run(flat, tmp_path / "run", resolve_config("ucf", None, SHORT))
+        train_run(flat, tmp_path / "run", resolve_config("ucf-paper", None, SHORT))
     assert not (tmp_path / "run").exists()
-    train_run(flat, tmp_path / "run", resolve_config("ucf", None, [*SHORT, "augment.copies=0"]))
+    train_run(flat, tmp_path / "run", resolve_config("ucf", None, SHORT))
 
 
 def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(

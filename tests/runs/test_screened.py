@@ -23,7 +23,7 @@ from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=4", "train.validate_every=2", "policy.dim=8", "policy.context=3"]
-SETTINGS += ["rule.choose=false", "crm.epochs=1", "csg.epochs=1"]
+SETTINGS += ["rule.choose=false", "augment.copies=1", "crm.epochs=1", "csg.epochs=1"]
 FLAGGED = (0, 4)
 
 

@@ -18,6 +18,7 @@ SETTINGS = (
     "train.validate_every=4",
     "policy.dim=8",
     "policy.context=3",
+    "augment.copies=1",
     "crm.epochs=2",
     "rule.sessions=8",
 )

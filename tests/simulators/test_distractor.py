@@ -187,7 +187,9 @@ def test_screening_finds_the_distractor_among_items_and_drops_it_to_the_last_bit
     store = EpisodeStore.open(kuairand_folder / "log" / "store")
     monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK_SCREENING)
     planted = plant_distractor(store, tmp_path / "planted")
-    config = resolve_config("ucf", overrides=[*TINY, "crm.epochs=1", "rule.choose=false"])
+    config = resolve_config(
+        "ucf", overrides=[*TINY, "augment.copies=1", "crm.epochs=1", "rule.choose=false"]
+    )
     record = train_screened(planted, tmp_path / "dropped", config, "drop")
     assert record.dropped_observations == (0,)
     train_run(store, tmp_path / "plain", config)

@@ -28,7 +28,7 @@ SETTINGS = (
 
 def train(store: Path, run: Path) -> None:
     # A reward model that is fitted too little does not know the rewards of other actions.
-    copies = ("augment.actions=1", "crm.epochs=10")
+    copies = ("augment.copies=1", "augment.actions=1", "crm.epochs=10")
     config = resolve_config("ucf", None, [*SETTINGS, *copies], seed=3)
     with short_validation():
         train_run(EpisodeStore.open(store), run, config)

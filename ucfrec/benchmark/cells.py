@@ -39,6 +39,11 @@ class Method:
         return not self.tags or bool(store.item_states.tags.shape[1])
 
 
+def augmented_ucf(*settings: str, vectors: bool = True) -> Method:
+    """UCF with augmented states, as in the paper's tables, and more settings."""
+    return Method("ucf", ("augment.copies=1", *settings), vectors=vectors)
+
+
 @dataclass(frozen=True)
 class Task:
     """A log to train on, and the environments to evaluate in."""

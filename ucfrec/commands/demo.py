@@ -21,8 +21,8 @@ METHODS: dict[str, tuple[str, ...]] = {
     "bc": ("bc",),
     "dt": ("dt",),
     SHARED: ("dt", "policy.exposure=true", "rule.choose=true"),
-    "ucf-no-augmentation": ("ucf", "augment.copies=0"),
-    "ucf": ("ucf",),
+    "ucf-no-augmentation": ("ucf",),
+    "ucf": ("ucf", "augment.copies=1"),
 }
 """Name in the results to the policy and the settings that it has besides `DemoConfig.settings`."""
 BEHAVIORS = {"logging": "mixture", "random": "random", "optimal": "optimal"}

@@ -78,7 +78,6 @@ class UCFPolicy(SequencePolicy):
     """
 
     Config = UCFConfig
-    augmented = True
     config: UCFConfig
 
     def __init__(self, config: UCFConfig, sizes: Mapping[str, int]) -> None:
@@ -171,11 +170,13 @@ class UCFPolicy(SequencePolicy):
 class UCFPaperPolicy(UCFPolicy):
     """UCF as read in the paper, without what later measurements added.
 
-    λ 0.1, a plain CVAE as reward model at Table 4's rate and passes, the paper's generator, the
-    return of the whole rest, and the most probable action at the largest training return.
+    Augmented states, λ 0.1, a plain CVAE as reward model at Table 4's rate and passes, the paper's
+    generator, the return of the whole rest, and the most probable action at the largest training
+    return.
     """
 
     Config = UCFPaperConfig
+    augmented = True
     presets: ClassVar[Mapping[str, Any]] = {
         "crm.mean_first": False,
         "crm.learning_rate": 3e-4,

@@ -66,10 +66,16 @@ NETWORK: Final[Space] = {
     "train.learning_rate": Dimension(low=1e-4, high=3e-3, log=True),
     "train.steps": Dimension(low=500, high=10_000, log=True),
     "policy.dim": Dimension((32, 64, 128, 256)),
-    "policy.context": Dimension((5, 10, 20, 50)),
     "policy.dropout": Dimension(low=0.0, high=0.3),
+    "augment.copies": Dimension((0, 1)),
+    "augment.actions": Dimension((0, 2)),
 }
 """Of policies that are trained step by step."""
+HISTORY: Final[Space] = {
+    "policy.context": Dimension((5, 10, 20, 50)),
+    "policy.exposure": Dimension((True, False)),
+}
+"""Of those that read what was shown before, too."""
 NEIGHBORS: Final[Space] = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
 REWARD_WEIGHTS: Final[Space] = {
     "rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0)),
@@ -86,9 +92,8 @@ def default_space(policy: str, by_value: bool) -> Space:
     policy_type = policy_class(policy)
     space: Space = {} if by_value else REWARD_WEIGHTS
     if policy_type.closed_form is SequencePolicy.closed_form:
-        space = {**NETWORK, **space}
-        if policy_type.Config().context == 1:  # it reads no history
-            space = {name: each for name, each in space.items() if name != "policy.context"}
+        reads = policy_type.Config().context > 1
+        space = {**NETWORK, **(HISTORY if reads else {}), **space}
     if hasattr(policy_type.Config(), "neighbors"):
         space = {**NEIGHBORS, **space}
     return space

@@ -168,7 +168,7 @@ def _at_rate(
         return (*own, *([] if steps is None else [f"steps={steps}"]), f"{RATE}={rate:g}")
     shorter = [] if steps is None else [f"train.steps={steps}", f"train.validate_every={steps}"]
     searched = ("augment.copies=0", *shorter, f"train.{RATE}={rate:g}")
-    return (*budget.settings, *own, *searched, *method.settings)
+    return (*budget.settings, *own, *method.settings, *searched)
 
 
 def _selected(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from ucfrec.benchmark.cells import Method
+from ucfrec.benchmark.cells import Method, augmented_ucf
 
 PLAIN: Final = ("policy.exposure=false", "rule.choose=false")
 """Settings of a policy without the shared components: the best item at the largest training
@@ -62,30 +62,32 @@ METHODS: Final[Mapping[str, Method]] = {
     **{name: _with(method, PLAIN, False) for name, method in PEERS.items()},
     **{f"{name}+shared": _with(method, SHARED, False) for name, method in PEERS.items()},
     **PAPER,
-    "ucf-plain": Method("ucf", PLAIN, vectors=False),
-    "ucf-wo-count": Method("ucf", ("augment.copies=0",)),
+    "ucf-plain": augmented_ucf(*PLAIN, vectors=False),
+    "ucf-wo-count": Method("ucf"),
     "ucf-wo-arch": Method("dt", ("augment.copies=1", *SHARED)),
-    "ucf": Method("ucf"),
+    "ucf": augmented_ucf(),
 }
 """Methods by their name in the tables. A policy's name stands for it as its authors have it,
 `+shared` for it with `SHARED`. UCF has these components by default, `ucf-plain` lacks them.
 `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations of `ucf`."""
 COMPONENTS: Final[Mapping[str, Method]] = {
-    "ucf-wo-exposure": Method("ucf", ("policy.exposure=false",), vectors=False),
-    "ucf-wo-reward-weight": Method(
-        "ucf", ("rule.reward_weights=[0]", "rule.lookaheads=[0]"), vectors=False
+    "ucf-wo-exposure": augmented_ucf("policy.exposure=false", vectors=False),
+    "ucf-wo-reward-weight": augmented_ucf(
+        "rule.reward_weights=[0]", "rule.lookaheads=[0]", vectors=False
     ),
-    "ucf-wo-rule": Method("ucf", ("rule.choose=false",), vectors=False),
-    "ucf-weights": Method("ucf", ("policy.advantage_weights=true",)),
-    "ucf-max-return": Method("ucf", ("policy.max_return=true",)),
-    "ucf-actions": Method("ucf", ("augment.copies=0", "augment.actions=2"), vectors=False),
-    "ucf-both": Method("ucf", ("augment.actions=2",), vectors=False),
+    "ucf-wo-lookahead": augmented_ucf("rule.lookaheads=[0]", vectors=False),
+    "ucf-wo-policy": augmented_ucf("rule.policy_weights=[0]", vectors=False),
+    "ucf-wo-rule": augmented_ucf("rule.choose=false", vectors=False),
+    "ucf-weights": augmented_ucf("policy.advantage_weights=true"),
+    "ucf-max-return": augmented_ucf("policy.max_return=true"),
+    "ucf-actions": Method("ucf", ("augment.actions=2",), vectors=False),
+    "ucf-both": augmented_ucf("augment.actions=2", vectors=False),
 }
 """UCF without one of the shared components, or with another one, by their name in the table
-`shared`."""
+`shared`. `ucf-wo-policy` has policy weight 0 wherever it looks ahead."""
 SCREENED: Final[Mapping[str, Method]] = {
-    "ucf-screened": Method("ucf", screening="copies"),
-    "ucf-dropped": Method("ucf", screening="drop"),
+    "ucf-screened": replace(METHODS["ucf"], screening="copies"),
+    "ucf-dropped": replace(METHODS["ucf"], screening="drop"),
 }
 """UCF with augmentation that intervenes on the observation columns that screening flags, and UCF
 without these columns, by their name in the distractor table."""

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Cell, Method, Task
+from ucfrec.benchmark.cells import Budget, Cell, Method, Task, augmented_ucf
 from ucfrec.benchmark.plan import Plan, folder_name
 from ucfrec.benchmark.suite import BenchmarkRequest
 from ucfrec.episodes.store import EpisodeStore
@@ -96,7 +96,7 @@ class RecommendationCells:
             **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
             **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
         }
-        methods = {f"ucf, {name}": Method("ucf", (s,)) for name, s in sweeps.items()}
+        methods = {f"ucf, {name}": augmented_ucf(s) for name, s in sweeps.items()}
         yield from self._trained("sweeps", {**methods, **PAPER}, task, log)
 
     def _distractor(self, task: Task, log: int) -> Iterator[Cell]:

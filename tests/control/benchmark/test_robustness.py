@@ -232,7 +232,9 @@ def test_what_is_dropped_might_never_have_been_logged(
     store = planted_vectors(tmp_path / "store")
     logged = store.step_values(schema.OBSERVATION, *store.all_steps())[:, :3]
     never = with_observations(store, tmp_path / "never", logged, {})
-    config = resolve_config("ucf", None, ["train.steps=4", "policy.dim=8", "crm.epochs=1"])
+    config = resolve_config(
+        "ucf", None, ["train.steps=4", "policy.dim=8", "augment.copies=1", "crm.epochs=1"]
+    )
     record = train_control(store, tmp_path / "dropped", config, screening="drop")
     assert record.dropped_observations == (3, 4)
     assert record.sizes["state"] == 3

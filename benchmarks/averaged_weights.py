@@ -119,16 +119,17 @@ def measure(task: Task, policy: str, seed: int, options: argparse.Namespace) -> 
 
 
 def table(rows: list[ResultRow]) -> str:
-    """One line per task, policy and decay: losses less those of the raw weights, in percent."""
+    """One line per task, policy and decay but 0: losses less those of raw weights, in percent."""
     raw = {_training(row): row.metrics for row in rows if row.conditions[DECAY] == 0}
     lines = []
     for key, own in grouped(rows, lambda row: (*_training(row)[:3], row.conditions[DECAY])).items():
-        less = [
-            signed_difference(
-                summary(100 * (row.metrics[n] / raw[_training(row)][n] - 1) for row in own)
-            )
-            for n in ("lowest", "last")
+        if key[-1] == 0:
+            continue
+        relative = [
+            summary(100 * (row.metrics[name] / raw[_training(row)][name] - 1) for row in own)
+            for name in ("lowest", "last")
         ]
+        less = [signed_difference(s) if s.count > 1 else f"{s.mean:+.3g}" for s in relative]
         loss = f"{summary(row.value for row in own).mean:.4f}"
         lines.append((*map(str, key), loss, *less))
     head = ("task", "policy", "steps", "decay", "lowest loss", "lowest less raw, %")

@@ -1,6 +1,10 @@
 """Settings of every test: one thread, short validations, and the same examples every time."""
 
+import os
+import shutil
+import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -31,3 +35,16 @@ def few_windows() -> Iterator[None]:
     """A training of a few steps would spend most of its time validating."""
     with short_validation():
         yield
+
+
+@pytest.fixture(scope="module")
+def spark() -> Iterator[Any]:
+    """A small local session, which commands use in place of one of their own."""
+    sql = pytest.importorskip("pyspark.sql")
+    if shutil.which("java") is None and "JAVA_HOME" not in os.environ:
+        pytest.skip("Java is missing")
+    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
+    builder = sql.SparkSession.builder.master("local[2]").config("spark.ui.enabled", "false")
+    session = builder.config("spark.sql.shuffle.partitions", "3").getOrCreate()
+    yield session
+    session.stop()

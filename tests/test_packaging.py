@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.test_layering import imports
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = {
     "ucfrec": ROOT / "ucfrec",
@@ -27,6 +29,41 @@ ENTRY_POINTS = [
     }.items()
     for name, value in named.items()
 ]
+
+
+DISTRIBUTIONS = {
+    "annotated_types": "pydantic",
+    "faiss": "faiss-cpu",
+    "py4j": "pyspark",
+    "sklearn": "scikit-learn",
+    "starlette": "fastapi",
+    "structlog": "d3rlpy",
+    "threadpoolctl": "scikit-learn",
+    "typing_extensions": "pydantic",
+}
+"""Imported name to the requirement that brings it, where the two differ."""
+
+
+def required(requirements: list[str]) -> set[str]:
+    """Names of the distributions, extras that name the project itself resolved."""
+    names = {re.split(r"[\[<>=; ]", each)[0].lower() for each in requirements}
+    for extra in re.findall(r"ucfrec\[(\w+)\]", " ".join(requirements)):
+        names |= required(PROJECT["optional-dependencies"][extra])
+    return names - {"ucfrec"}
+
+
+def test_what_is_imported_is_required_or_of_an_extra_that_a_message_names() -> None:
+    sources = {file: file.read_text() for each in PACKAGES.values() for file in each.rglob("*.py")}
+    named = set(re.findall(r"ucfrec\[(\w+)\]", "".join(sources.values())))
+    extras = {name: required(of) for name, of in PROJECT["optional-dependencies"].items()}
+    assert named <= extras.keys() - {"dev", "docs"}
+    offered = set().union(*(extras[name] for name in named))
+    known = {*sys.stdlib_module_names, *PACKAGES}
+    for file in sources:
+        for name in {name.split(".")[0] for name in imports(file)} - known:
+            distribution = DISTRIBUTIONS.get(name, name.replace("_", "-")).lower()
+            here = file.relative_to(ROOT)
+            assert distribution in required(PROJECT["dependencies"]) | offered, f"{here}: {name}"
 
 
 @pytest.mark.parametrize("folder", ["datasets", "simulators", "control"])

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from ucfrec.acting.rollout import rollout
-from ucfrec.commands.cli import UCFREC, build_parser, main
+from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.evaluation.environment import Environment
 from ucfrec.plugins import load_plugin
 from ucfrec.results.row import ResultRow
@@ -447,3 +447,17 @@ def test_a_policy_is_not_played_in_a_environment_it_does_not_fit(
 ) -> None:
     arguments = ["evaluate", str(folder / "synthetic-catalog-run"), "--env", "synthetic-taobao"]
     assert "which the policy was not trained on" in refused(arguments, capsys)
+
+
+def test_a_package_that_is_missing_is_named_with_its_extra() -> None:
+    for module, extra in {
+        "h5py": "control",
+        "stable_baselines3": "collect",
+        "optuna": "tune",
+    }.items():
+        said = explanation(ModuleNotFoundError(name=f"{module}.part"))
+        assert said is not None
+        assert f"install ucfrec[{extra}]" in said
+    # A defect of ucfrec, such as a package that no extra has, is shown with its traceback.
+    assert explanation(ModuleNotFoundError(name="hypothesis")) is None
+    assert explanation(ModuleNotFoundError(name="ucfrec.nowhere")) is None

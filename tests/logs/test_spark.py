@@ -1,10 +1,8 @@
 """Spark sorts a log as DuckDB does: the stores are the same to the last bit."""
 
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +15,6 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
 START = 1_700_000_000_000
-
-
-@pytest.fixture(scope="module")
-def spark() -> Iterator[Any]:
-    """A small local session, which `prepare` uses in place of one of its own."""
-    sql = pytest.importorskip("pyspark.sql")
-    if shutil.which("java") is None and "JAVA_HOME" not in os.environ:
-        pytest.skip("Java is missing")
-    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
-    builder = sql.SparkSession.builder.master("local[2]").config("spark.ui.enabled", "false")
-    session = builder.config("spark.sql.shuffle.partitions", "3").getOrCreate()
-    yield session
-    session.stop()
 
 
 def make_log(rows: int, text: bool, seed: int) -> pd.DataFrame:

@@ -6,12 +6,13 @@ command loads what only another one needs.
 
 import argparse
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
+from importlib import import_module, metadata
 from typing import Any, Final, Protocol, cast
 
 from ucfrec import __version__
@@ -114,6 +115,8 @@ def explanation(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, OSError):
         return explain_os_error(error)
+    if isinstance(error, ModuleNotFoundError) and (extras := _extras_with(error.name or "")):
+        return f"{error.name} is not installed; install {' or '.join(extras)}"
     text = str(error)
     if isinstance(error, MemoryError) or any(phrase in text for phrase in _NO_MEMORY):
         reason = f" ({text:.120})" if text else ""
@@ -124,6 +127,14 @@ def explanation(error: BaseException) -> str | None:
     if any(phrase in text for phrase in _NO_SPACE):
         return f"no space is left on a disk ({text:.120}); free space and run again"
     return None
+
+
+def _extras_with(module: str) -> list[str]:
+    """The extras of ucfrec that bring a module which has the name of its distribution."""
+    name = re.escape(module.partition(".")[0].replace("_", "-"))
+    offered = re.compile(rf"{name}\b[^-].*; extra == .(?!dev|docs)(\w+).", re.IGNORECASE)
+    found = (offered.match(each) for each in metadata.requires("ucfrec") or ())
+    return [f"ucfrec[{match[1]}]" for match in found if match]
 
 
 _NO_MEMORY: Final = (

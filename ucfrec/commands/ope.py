@@ -40,6 +40,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="T,…",
         help="compare drawing items at these temperatures; 0 takes the best: 0,0.5,1",
     )
+    parser.add_argument(
+        "--scored",
+        action="store_true",
+        help="LOGS are what `ucfrec score` wrote for RUN with the same decision rule, of any size: "
+        "a row a session is in memory, and there are no models of the reward",
+    )
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
     parser.epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
@@ -129,6 +135,8 @@ def run(options: argparse.Namespace) -> None:
     options.logs = [path for path in options.logs if Path(path) not in runs]
     if not runs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
+    if options.scored and not options.logs:
+        raise InputError("--scored needs what ucfrec score wrote; name it after the run")
     candidates = [
         _Candidate(run, rule) for run in runs for rule in _rules(options, _loaded(options, run))
     ]
@@ -184,20 +192,18 @@ class _Candidate:
 def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
+    from ucfrec.off_policy.scored import evaluate_scored
     from ucfrec.reporting.cards import card_of_estimates
     from ucfrec.reporting.tables import format_rows
 
     run = candidate.run
     trained = _loaded(options, run)
-    with _logged(options, trained) as logged:
-        found = evaluate_off_policy(
-            run,
-            trained,
-            logged,
-            rule=candidate.rule,
-            seed=options.seed,
-            options=estimates_asked(options),
-        )
+    asked = {"rule": candidate.rule, "seed": options.seed, "options": estimates_asked(options)}
+    if options.scored:
+        found = evaluate_scored(trained, options.logs, **asked)
+    else:
+        with _logged(options, trained) as logged:
+            found = evaluate_off_policy(run, trained, logged, **asked)
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
     print(f"\n{format_rows(lines, shown)}")
@@ -214,7 +220,8 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
         ]
         print(f"\n{format_rows(lines, per_step)}\n{found.per_step}\n")
     print("R_cum: return per session, with a 95% interval where an estimator has one")
-    print(f"models: {found.models}")
+    if found.models is not None:
+        print(f"models: {found.models}")
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
@@ -272,15 +273,43 @@ def limit_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def engine_option(parser: argparse.ArgumentParser) -> None:
-    """Add what computes the network of a request that comes alone."""
+def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = "") -> None:
+    """Add what computes the network of a request that comes alone.
+
+    Args:
+        more: further choices.
+        more_help: what they are, for the help.
+    """
     parser.add_argument(
         "--engine",
-        choices=("torch", "onnxruntime"),
+        choices=("torch", "onnxruntime", *more),
         default="torch",
         help="what computes the network of a request that comes alone; onnxruntime is faster, but "
-        "needs ucfrec[export] and some 10 seconds at the start (default: torch)",
+        f"needs ucfrec[export] and some 10 seconds at the start{more_help} (default: torch)",
     )
+
+
+def spark_option(parser: argparse.ArgumentParser) -> None:
+    """Add where Spark is, for an engine of that name."""
+    parser.add_argument(
+        "--spark-master",
+        metavar="MASTER",
+        help="with --engine spark: its master, e.g. spark://HOST:7077; inputs and output must lie "
+        "where every worker sees them (default: local[*], this machine)",
+    )
+
+
+def spark_given(options: argparse.Namespace) -> str | None:
+    """Spark's master, if it is the engine; otherwise None.
+
+    Raises:
+        InputError: there is a master, but another engine.
+    """
+    if options.engine == "spark":
+        return options.spark_master or "local[*]"
+    if options.spark_master:
+        raise InputError("--spark-master is for --engine spark; add it, or omit both")
+    return None
 
 
 def limits_given(options: argparse.Namespace) -> "Limits":

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import log_options, logs_given
+from ucfrec.commands.options import log_options, logs_given, spark_given, spark_option
 from ucfrec.errors import InputError
 from ucfrec.files.remote import Output, origin, uri_or_path
 
@@ -74,12 +74,7 @@ def _engine_options(parser: argparse.ArgumentParser) -> None:
         help="what reads and sorts the rows: DuckDB on this machine, or Spark, for logs that "
         "outgrow it; the store is the same (default: duckdb)",
     )
-    parser.add_argument(
-        "--spark-master",
-        metavar="MASTER",
-        help="with --engine spark: its master, e.g. spark://HOST:7077; logs and STORE must lie "
-        "where every worker sees them (default: local[*], this machine)",
-    )
+    spark_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -92,8 +87,6 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
     from ucfrec.logs.summary import format_report
 
-    if options.spark_master and options.engine != "spark":
-        raise InputError("--spark-master is for --engine spark; add it, or omit both")
     files, mapping = logs_given(options)
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
@@ -104,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
         "max_session": options.max_session,
         "memory_limit": options.memory_limit,
         "engine": options.engine,
-        "spark_master": options.spark_master,
+        "spark_master": spark_given(options),
         "split": options.split and parse_split(options.split),
     }
     prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})

@@ -48,7 +48,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--json", type=Path, metavar="FILE", help="also write the rows, with intervals, as JSON"
     )
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
-    parser.epilog = "Without LOGS, the policies rank the test split of the store of the first run."
+    parser.epilog = (
+        "Without LOGS, the policies rank the test split of the store of the first run. Matrix "
+        "factorisation, a baseline, needs ucfrec[rank]."
+    )
 
 
 def run(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from ucfrec.commands.options import (
     responder_given,
     rule_given,
     rule_options,
+    spark_given,
+    spark_option,
 )
 from ucfrec.errors import InputError
 from ucfrec.files.remote import Output, origin, uri_or_path
@@ -25,6 +28,7 @@ from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
     from ucfrec.recommending.histories import Histories
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +47,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "without a temperature; says the recall (default: exactly)",
     )
     out = parser.add_argument(
-        "--out", type=uri_or_path(Output, Path), required=True, help="Parquet file to write"
+        "--out",
+        type=uri_or_path(Output, Path),
+        required=True,
+        help="Parquet file (with --engine spark: folder) to write",
     )
     parser.add_argument(
         "--stream",
@@ -52,7 +59,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
         "answers to stdout (docs/serving.md)",
     )
-    engine_option(parser)
+    engine_option(
+        parser,
+        "spark",
+        more_help="; spark: with LOGS, Spark's workers each recommend to some of the users and "
+        "write the parts of a folder --out",
+    )
+    spark_option(parser)
     limit_options(parser)
 
 
@@ -84,13 +97,16 @@ def run(options: argparse.Namespace) -> None:
     if options.stream:
         _answer_stream(options)
         return
-    from ucfrec.commands.frames import write_frames
+    from ucfrec.files.frames import write_frames
     from ucfrec.recommending.exposures import exposures_written
     from ucfrec.recommending.histories import histories_of_files
     from ucfrec.recommending.recommend import recommend
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
+    if (master := spark_given(options)) is not None:
+        _recommend_with_spark(options, trained, master)
+        return
     files, mapping = logs_given(options, trained)
     rule, index = rule_given(options, trained), None
     if options.approximate:
@@ -121,12 +137,47 @@ def run(options: argparse.Namespace) -> None:
         )
 
 
+def _recommend_with_spark(
+    options: argparse.Namespace, trained: "TrainedPolicy", master: str
+) -> None:
+    from ucfrec.files.atomic import atomic_folder
+    from ucfrec.logs.spark_users import by_users
+    from ucfrec.recommending.recommend import require_whole
+    from ucfrec.recommending.spark import RecommendPart, log_of_histories
+    from ucfrec.runs.on_workers import RunOnWorkers
+
+    if options.approximate:
+        raise InputError("--engine spark finds items exactly; leave --approximate out")
+    rule = rule_given(options, trained)
+    trained.item_scorer(rule)
+    require_whole(options.k)
+    given = log_of_histories(trained, *logs_given(options, trained))
+    with ExitStack() as stack:
+        folders = [options.out] + ([] if options.exposures is None else [options.exposures])
+        out, *exposures = [stack.enter_context(atomic_folder(each)).absolute() for each in folders]
+        part = RecommendPart(
+            RunOnWorkers.of(trained, options.checkpoint),
+            out,
+            exposures[0] if exposures else None,
+            options.memory_limit,
+            rule,
+            options.k,
+            filter_seen=not options.keep_seen,
+            skip_unknown=options.skip_unknown,
+            seed=options.seed,
+        )
+        rows = sum(by_users(given, out.parent, master, part))
+    print(f"{origin(options.out)}: {rows:,} rows")
+
+
 def _answer_stream(options: argparse.Namespace) -> None:
     from ucfrec.recommending.stream import answer_stream
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     if options.logs or options.out:
         raise InputError("--stream reads stdin and writes stdout; leave LOGS and --out out")
+    if options.engine == "spark" or options.spark_master:
+        raise InputError("--stream answers in this process; leave --engine spark out")
     if options.approximate:
         raise InputError("--stream finds items exactly; leave --approximate out")
     trained = TrainedPolicy.load(options.run, options.checkpoint)

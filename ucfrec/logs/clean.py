@@ -93,15 +93,19 @@ def note_dropped(
     )
 
 
+class NoRowsError(InputError):
+    """No row of a log can be used."""
+
+
 def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
     """Check that a row is left.
 
     Raises:
-        InputError: none is.
+        NoRowsError: none is.
     """
     if kept == 0:
         reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
         hint = f"; {CLOCK_HINT}" if dropped["clock_out_of_range"] else ""
-        raise InputError(
+        raise NoRowsError(
             f"{log.name}: no row is left ({reasons}{hint}); correct the mapping or the log"
         )

@@ -27,7 +27,7 @@ from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
 """Id column to the table of its ids and their codes, numbers in the order of the ids."""
 _SESSION_CODES: Final = "session_codes"
-_UNPLACED: Final = 128
+UNPLACED: Final = 128
 """Added to the fault of rows without a user or a time, which have no place in the order."""
 
 
@@ -143,10 +143,10 @@ def _check_batch(
     rows: SortedRows, batch: dict[str, Array], duplicates: str, hashes: Hashes, rewards: _Rewards
 ) -> None:
     rows.read += len(batch["fault"])
-    placed = np.asarray(batch["fault"] < _UNPLACED)
+    placed = np.asarray(batch["fault"] < UNPLACED)
     rows.placed.append(_where(placed, {n: batch[n] for n in ("user", "timestamp", "row")}))
     reasons = list(REASONS)
-    counts = np.bincount(batch["fault"] % _UNPLACED, minlength=len(reasons) + 1)
+    counts = np.bincount(batch["fault"] % UNPLACED, minlength=len(reasons) + 1)
     for reason, n in zip(reasons, counts[1:], strict=True):
         rows.dropped[reason] += int(n)
     usable = np.asarray(batch.pop("fault") == 0)
@@ -205,7 +205,7 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
         f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
     )
     unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
-    fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {_UNPLACED} ELSE 0 END"
+    fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {UNPLACED} ELSE 0 END"
     values = f"* EXCLUDE ({WANTED})" if log.has_condition else "*"
     query = f"SELECT {values}, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
     if log.key == schema.ITEM_ID:

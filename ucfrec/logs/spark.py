@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -85,6 +86,40 @@ def sorted_with_spark(
         InputError: a file, column or type makes the log unusable, an observation is missing or not
             finite, or Spark is missing or fails.
     """
+    with spark_session(master) as spark, spark_failures():
+        given = connection, tables, mapping, reward, session_by
+        log, rows = typed_with_spark(spark, *given, known_items, scratch)
+        rows.createOrReplaceTempView(_TYPED)
+        for name, table in code_tables(log):
+            codes = _written(spark, spark.sql(coded_ids(name, _TYPED)), scratch / table)
+            codes.createOrReplaceTempView(table)
+        _written(spark, spark.sql(in_order(log, _TYPED)), scratch / ROWS)
+    shutil.rmtree(scratch / _TYPED)
+    for _, table in code_tables(log):
+        _load(connection, scratch / table, table)
+    return log, _batches(scratch / ROWS, log.batch_rows)
+
+
+def typed_with_spark(
+    spark: Any,
+    connection: duckdb.DuckDBPyConnection,
+    tables: tuple[Table, ...],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+    known_items: Path | None,
+    scratch: Path,
+) -> tuple[TypedLog, Any]:
+    """Read every row of a log; the arguments are those of `sorted_with_spark`.
+
+    Returns:
+        The log, and a Spark frame of its rows as of `ucfrec.logs.sorted_rows.with_faults`, read
+        from files in the scratch folder.
+
+    Raises:
+        InputError: a file, column or type makes the log unusable, or an observation is missing or
+            not finite.
+    """
     typed = typed_columns(connection, tables, mapping, reward, session_by)
     with explained(connection, tables, scratch):
         every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
@@ -94,22 +129,11 @@ def sorted_with_spark(
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
-    with _session(master) as spark, _failures():
-        found = _surveyed(spark, files, vectors(typed.names))
-        sizes = vector_sizes(found.vectors)
-        log = typed.log(connection, sizes, mapping)
-        require_observations(tables, found.bad, sum(found.rows))
-        tasks = _row_tasks(log, files, found.rows, known_items)
-        rows = _run(spark, tasks, _schema(log))
-        _written(spark, rows, scratch / _TYPED).createOrReplaceTempView(_TYPED)
-        for name, table in code_tables(log):
-            codes = _written(spark, spark.sql(coded_ids(name, _TYPED)), scratch / table)
-            codes.createOrReplaceTempView(table)
-        _written(spark, spark.sql(in_order(log, _TYPED)), scratch / ROWS)
-    shutil.rmtree(scratch / _TYPED)
-    for _, table in code_tables(log):
-        _load(connection, scratch / table, table)
-    return log, _batches(scratch / ROWS, log.batch_rows)
+    found = _surveyed(spark, files, vectors(typed.names))
+    log = typed.log(connection, vector_sizes(found.vectors), mapping)
+    require_observations(tables, found.bad, sum(found.rows))
+    tasks = _row_tasks(log, files, found.rows, known_items)
+    return log, _written(spark, _run(spark, tasks, _schema(log)), scratch / _TYPED)
 
 
 @dataclass
@@ -216,7 +240,7 @@ def _load(connection: duckdb.DuckDBPyConnection, folder: Path, table: str) -> No
 
 
 @contextmanager
-def _session(master: str) -> Iterator[Any]:
+def spark_session(master: str) -> Iterator[Any]:
     """A session of Spark of its own; its cluster connection is kept if the program had one before.
 
     Raises:
@@ -230,9 +254,9 @@ def _session(master: str) -> Iterator[Any]:
     if master.startswith("local"):
         os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     running = SparkSession.getActiveSession()
-    builder = SparkSession.builder.appName("ucfrec prepare")
+    builder = SparkSession.builder.appName("ucfrec")
     try:
-        # The bar of `prepare` shows how far it is.
+        # The commands' own bars show how far they are.
         started = running or (
             builder.master(master).config("spark.ui.showConsoleProgress", "false").getOrCreate()
         )
@@ -243,14 +267,17 @@ def _session(master: str) -> Iterator[Any]:
         ) from None
     started.sparkContext.setLogLevel("ERROR")
     try:
-        yield started.newSession()
+        with warnings.catch_warnings():
+            # Its doubts about a version of pandas do not concern Arrow, which is used here.
+            warnings.filterwarnings("ignore", category=FutureWarning, module="pyspark")
+            yield started.newSession()
     finally:
         if running is None:
             started.stop()
 
 
 @contextmanager
-def _failures() -> Iterator[None]:
+def spark_failures() -> Iterator[None]:
     """Turn errors of Spark that occur in the block into `InputError`.
 
     Raises:

@@ -26,7 +26,7 @@ step, as if it went on without reward (Thomas & Brunskill 2016).
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -120,18 +120,24 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     weights, last = steps.weights, steps.session_weights
     if not last.any():
         return {}
-    ones = np.ones(len(last))
+    ones, per_decision, by_step = np.ones(len(last)), steps.per_decision, steps.by_step
+    if per_decision is None:
+        per_decision = steps.per_session(steps.discounts * weights * steps.reward)
+    if by_step is None:
+        by_step = normalised_by_step(steps, steps.reward, None, StepSums.of(steps, steps.reward))
     found = {
         "IPS": Terms(last * steps.returns, ones, last),
         "SNIPS": Terms(last * steps.returns, last, last),
-        "PDIS": Terms(steps.per_session(steps.discounts * weights * steps.reward), ones, last),
-        "SNPDIS": Terms(_normalised_by_step(steps, steps.reward, None), ones, last),
+        "PDIS": Terms(per_decision, ones, last),
+        "SNPDIS": Terms(by_step, ones, last),
     }
     if steps.model is not None:
         left = steps.reward - steps.model.q
         corrected = weights * left + steps.before(weights) * steps.model.v
         found["DR"] = Terms(steps.per_session(steps.discounts * corrected), ones, last)
-        found["SNDR"] = Terms(_normalised_by_step(steps, left, steps.model.v), ones, last)
+        found["SNDR"] = Terms(
+            normalised_by_step(steps, left, steps.model.v, StepSums.of(steps, left)), ones, last
+        )
     if steps.pages:
         for name, (above, kept) in independent_terms(steps).items():
             found[name] = Terms(above, ones, kept)
@@ -177,8 +183,42 @@ def step_totals(steps: LoggedSteps, weights: Float64Array) -> Float64Array:
     return np.asarray(alive + np.cumsum(ended)[:-1])
 
 
-def _normalised_by_step(
-    steps: LoggedSteps, left: Float64Array, v: Float64Array | None
+@dataclass(frozen=True)
+class StepSums:
+    """Sums over sessions by step, T of the longest."""
+
+    sessions: int
+    totals: Float64Array
+    """(T,) as of `step_totals`."""
+    rewarded: Float64Array
+    """(T,) Σ_i w_it left_it, with the reward or what a model leaves of it."""
+
+    @classmethod
+    def of(cls, steps: LoggedSteps, left: Float64Array) -> "StepSums":
+        """The sums of some sessions.
+
+        Args:
+            left: (N,).
+        """
+        weights = steps.weights
+        rewarded = np.bincount(steps.step, weights * left).astype(np.float64)
+        return cls(len(steps.first), step_totals(steps, weights), rewarded)
+
+    def __add__(self, other: "StepSums") -> "StepSums":
+        longest = max(len(self.totals), len(other.totals))
+
+        def sums(name: str, mode: Any) -> Float64Array:
+            # Sessions that have ended keep the weight of their last step, and have no reward.
+            both = (getattr(one, name) for one in (self, other))
+            padded = (np.pad(values, (0, longest - len(values)), mode) for values in both)
+            return np.asarray(sum(padded), dtype=np.float64)
+
+        totals, rewarded = sums("totals", "edge"), sums("rewarded", "constant")
+        return StepSums(self.sessions + other.sessions, totals, rewarded)
+
+
+def normalised_by_step(
+    steps: LoggedSteps, left: Float64Array, v: Float64Array | None, sums: StepSums
 ) -> Float64Array:
     """(S,) estimate plus influence of each session; their mean is the estimate.
 
@@ -189,11 +229,11 @@ def _normalised_by_step(
     Args:
         left: (N,) reward, or what the model leaves of it.
         v: (N,) modelled values, or None.
+        sums: of all sessions; where there are more than those of `steps`, without modelled values.
     """
-    weights, step, sessions = steps.weights, steps.step, len(steps.first)
-    totals = step_totals(steps, weights)
+    weights, step, sessions, totals = steps.weights, steps.step, sums.sessions, sums.totals
     by_step = steps.discount ** np.arange(len(totals))
-    rewarded = by_step * np.bincount(step, weights * left) / totals
+    rewarded = by_step * sums.rewarded / totals
     mine = steps.discounts * weights * left / totals[step]
     # What W_t in the denominators takes off, for each unit of weight at step t.
     slopes = rewarded / totals

@@ -87,8 +87,8 @@ class OffPolicyReport(ResultTable):
     warnings: list[str]
     """The verdict's reasons, cautions, and remarks on the logs."""
     verdict: Verdict
-    models: ModelReport
-    """How good the models of DM, FQE and DR are."""
+    models: ModelReport | None
+    """How good the models of DM, FQE and DR are; None from scored rows."""
     returns: Float64Array
     """(S,) of the logged sessions, or pages, with all their propensities; empty if none has."""
     user: IntArray | None
@@ -164,32 +164,35 @@ def evaluate_off_policy(
         **diagnosis_columns(diagnosis),
         **evaluated.models.columns(),
     }
-    read = logged.store.record.fingerprint, _conditions(run, steps, options)
+    read = (
+        logged.store.record.fingerprint,
+        conditions(run, len(steps.first), len(steps.reward), options),
+    )
     subject = Subject(trained, rule, seed, *read, about)
     return OffPolicyReport(
         subject.rows(found),
         warnings,
         verdict,
         evaluated.models,
-        *_of_sessions(steps, diagnosis, verdict),
+        *of_sessions(steps, diagnosis, verdict),
         value,
         [] if value is None else subject.rows(value.estimates, per_step=True),
     )
 
 
-def _conditions(run: Path, steps: LoggedSteps, options: EstimateOptions) -> dict[str, Scalar]:
+def conditions(run: Path, sessions: int, steps: int, options: EstimateOptions) -> dict[str, Scalar]:
     """How the logs were read, and their size."""
     return {
         "run": without_folders(str(run)),
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
-        "sessions": len(steps.first),
-        "steps": len(steps.reward),
+        "sessions": sessions,
+        "steps": steps,
     }
 
 
-def _of_sessions(
+def of_sessions(
     steps: LoggedSteps, diagnosis: Diagnosis, verdict: Verdict
 ) -> tuple[Float64Array, IntArray | None, Float64Array | None]:
     """`returns`, `user` and `terms` of the report."""

@@ -73,6 +73,10 @@ class LoggedSteps:
     densities: bool = False
     """Whether `propensity` and `target` are probability densities of vector actions, which may
     exceed 1."""
+    per_decision: Float64Array | None = None
+    """(N,) terms of PDIS, where steps are sums of whole sessions (`ucfrec.off_policy.scored`)."""
+    by_step: Float64Array | None = None
+    """(N,) those of SNPDIS."""
     pages: bool = False
     """Whether a session is one page and its steps the page's positions, chosen at once; see
     `ucfrec.off_policy.pages`."""
@@ -217,7 +221,8 @@ class LoggedSteps:
 
     def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
         """What there is one of a step, at the given steps; without the sessions."""
-        names = ("reward", "propensity", "target", "cluster_propensity", "cluster_target")
+        names = ["reward", "propensity", "target", "cluster_propensity", "cluster_target"]
+        names += ["per_decision", "by_step"]
         parts: dict[str, Any] = {
             name: values[rows] for name in names if (values := getattr(self, name)) is not None
         }

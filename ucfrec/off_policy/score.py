@@ -113,20 +113,45 @@ def logged_sessions(
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
             is known, or their observations are not those of the training logs.
     """
-    if trained.item_states is None:
-        raise _vectors(run)
-    record = trained.record
-    mapping = mapping.over(LogMapping.of_source(record.data, str(run / RUN)))
+    require_items(trained)
+    mapping, options = as_trained(trained, mapping, memory_limit)
+    with prepared_sessions(trained, files, mapping, options, keep_unknown) as logged:
+        yield logged
+
+
+def as_trained(
+    trained: TrainedPolicy, mapping: LogMapping, memory_limit: str = "2GB"
+) -> tuple[LogMapping, PrepareOptions]:
+    """How logs are read in the same way as the training logs of a policy.
+
+    Args:
+        mapping: which columns of the logs mean what; what it leaves open is as in the training
+            logs.
+    """
+    record, source = trained.record, str(trained.folder / RUN)
+    mapping = mapping.over(LogMapping.of_source(record.data, source))
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
-    gap_ms = record.session_gap_ms
-    reward = Expression(record.reward, str(run / RUN))
+    reward = Expression(record.reward, source)
     options = PrepareOptions(reward, record.session_by, memory_limit=memory_limit)
-    if gap_ms is not None:
-        options = replace(options, gap_minutes=gap_ms / 60_000)
+    if record.session_gap_ms is not None:
+        options = replace(options, gap_minutes=record.session_gap_ms / 60_000)
+    return mapping, options
+
+
+@contextmanager
+def prepared_sessions(
+    trained: TrainedPolicy,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    options: PrepareOptions,
+    keep_unknown: bool = False,
+) -> Iterator[LoggedSessions]:
+    """`logged_sessions` of logs whose columns and options are given in full."""
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
         folder = scratch / "store"
-        report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
+        like = trained.folder
+        report = prepare(files, mapping, folder, options, like=like, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
         unknown = _unknown_items(store)
         if unknown == store.n_steps:
@@ -251,6 +276,11 @@ def score(
         yield pd.DataFrame(columns)
 
 
+def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> dict[str, str]:
+    """What files of `score` say of the policy and the rule, in the metadata of their schema."""
+    return {"run": trained.fingerprint, "rule": (rule or trained.rule).hash}
+
+
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     """The test split of the store that policies were trained on, whose rows none of them has seen.
 
@@ -262,8 +292,7 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
             a refit, trained on all rows.
     """
     for policy in trained:
-        if policy.item_states is None:
-            raise _vectors(policy.folder)
+        require_items(policy)
         if policy.record.refit_of is not None:
             raise InputError(
                 f"{policy.folder} is a refit, trained on the test split too; name later logs"
@@ -284,8 +313,14 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     return _with_history(first, logged, store.select(before))
 
 
-def _vectors(run: Path) -> InputError:
-    return InputError(
-        f"{run}: the actions of this policy are vectors; it chooses one for certain, so a logged "
-        "action has no probability. Evaluate it with ucfrec evaluate"
-    )
+def require_items(trained: TrainedPolicy) -> None:
+    """Check that a policy chooses items.
+
+    Raises:
+        InputError: its actions are vectors.
+    """
+    if trained.item_states is None:
+        raise InputError(
+            f"{trained.folder}: the actions of this policy are vectors; it chooses one for "
+            "certain, so a logged action has no probability. Evaluate it with ucfrec evaluate"
+        )

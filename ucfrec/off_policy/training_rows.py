@@ -40,16 +40,21 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
         if record.refit_of is None:
             held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
         return float((~held_out)[logged.all_steps()[0]].mean())
+    return share_of_rows_seen(trained, np.concatenate(list(_keys(logged))))
+
+
+def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
+    """`share_seen` of rows by their `row_keys`."""
     try:
-        store = store_of(trained.folder, record)
+        store = store_of(trained.folder, trained.record)
     except InputError:
         return None
     if store is None:
         return None
-    keys, rows = np.unique(np.concatenate(list(_keys(logged))), return_counts=True)
+    keys, rows = np.unique(keys, return_counts=True)
     seen = np.zeros(len(keys), dtype=bool)
     # The training data may be far larger than the logs.
-    for name in schema.SPLITS if record.refit_of is not None else ("train", "validation"):
+    for name in schema.SPLITS if trained.record.refit_of is not None else ("train", "validation"):
         for learnt in _keys(store.split(name)):
             places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
             seen[places[keys[places] == learnt]] = True
@@ -72,11 +77,16 @@ def _keys(store: EpisodeStore) -> Iterator[KeyArray]:
         return
     users: Array = store.episode_values(schema.USER)
     for episodes, steps in store.step_batches():
-        keys = np.zeros(len(steps), dtype=np.uint64)
-        for values in (
+        yield row_keys(
             users[episodes],
             store.step_values(schema.ITEM, episodes, steps),
             store.step_values(schema.TIMESTAMP, episodes, steps),
-        ):
-            keys = mixed(keys ^ values.astype(np.int64).view(np.uint64))
-        yield keys
+        )
+
+
+def row_keys(users: Array, items: Array, times: Array) -> KeyArray:
+    """(N,) hash of each row's numbers of user and item, and its time (ms)."""
+    keys = np.zeros(len(users), dtype=np.uint64)
+    for values in (users, items, times):
+        keys = mixed(keys ^ values.astype(np.int64).view(np.uint64))
+    return keys

@@ -181,11 +181,11 @@ def histories_of_files(
     """
     batches = read_histories(
         files,
-        _columns_used(trained, mapping),
-        _reward(trained),
+        columns_used(trained, mapping),
+        reward_of(trained),
         LONGEST_HISTORY,
         memory_limit,
-        session_by=_session_by(trained),
+        session_by=session_by(trained),
         duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
@@ -206,7 +206,7 @@ def histories_of_frame(
     Raises:
         InputError: a column is missing, or has values that cannot be used.
     """
-    by_id = _session_by(trained) == schema.SESSION_ID
+    by_id = session_by(trained) == schema.SESSION_ID
     plain_names = mapping == LogMapping() and not _concerned(trained, frame)
     if not trained.record.observation_size and plain_names:
         plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
@@ -215,10 +215,10 @@ def histories_of_frame(
     has_rewards = schema.REWARD in getattr(frame, "columns", ())
     batches = frame_histories(
         frame,
-        _columns_used(trained, mapping),
-        schema.REWARD if has_rewards else _reward(trained),
+        columns_used(trained, mapping),
+        schema.REWARD if has_rewards else reward_of(trained),
         LONGEST_HISTORY,
-        session_by=_session_by(trained),
+        session_by=session_by(trained),
         duplicates=trained.record.data.duplicates,
     )
     return map(Histories.from_batch, batches)
@@ -287,11 +287,12 @@ def _concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
     return source.earliest is not None or bool(words & names)
 
 
-def _reward(trained: TrainedPolicy) -> Expression:
+def reward_of(trained: TrainedPolicy) -> Expression:
+    """The run's reward, an SQL expression over the columns of its logs."""
     return Expression(trained.record.reward, str(trained.folder / RUN))
 
 
-def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
     """The mapping with what the run remembers of its training log."""
     mapping = mapping.over(_remembered(trained))
     if trained.record.observation_size:
@@ -299,7 +300,8 @@ def _columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
-def _session_by(trained: TrainedPolicy) -> str:
+def session_by(trained: TrainedPolicy) -> str:
+    """How `read_histories` splits the sessions of the run's logs."""
     by_id = trained.record.session_by == schema.SESSION_ID
     return schema.SESSION_ID if by_id else "user"
 

@@ -73,7 +73,7 @@ def recommend(
             their batch is read.
     """
     scorer = trained.item_scorer(rule)
-    _require_whole(k)
+    require_whole(k)
     known_ids = trained.items
     excluded = None if candidates is None else _all_but(known_ids, candidates)
 
@@ -96,7 +96,12 @@ def _numbered(
         yield replace(batch, item_ids=known, seen_ids=seen)
 
 
-def _require_whole(k: int) -> None:
+def require_whole(k: int) -> None:
+    """Check the number of items of a user.
+
+    Raises:
+        InputError: it is no whole number, or below 1.
+    """
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")
 

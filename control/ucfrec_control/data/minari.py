@@ -181,7 +181,7 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
             if find_spec("huggingface_hub") is None:
                 raise InputError(
                     f"{source} is not in {_root()}, and Minari's downloads need huggingface_hub, "
-                    "which is not installed; install ucfrec[control,minari]"
+                    "which is not installed; install ucfrec[minari]"
                 )
             minari.download_dataset(source)
         if not folder.is_dir():

@@ -55,8 +55,7 @@ def antmaze_settings(env_id: str) -> Mapping[str, Any]:
             import gymnasium_robotics
     except ImportError:
         raise InputError(
-            f"{env_id} needs gymnasium-robotics, which is not installed; install "
-            "ucfrec[control,antmaze]"
+            f"{env_id} needs gymnasium-robotics, which is not installed; install ucfrec[antmaze]"
         ) from None
     gymnasium.register_envs(gymnasium_robotics)
     return {} if is_rebuilt(env_id) else {"continuing_task": False, "reward_type": "sparse"}

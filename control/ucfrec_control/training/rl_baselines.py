@@ -439,7 +439,7 @@ def _d3rlpy() -> Any:
         import structlog
     except ImportError:
         raise InputError(
-            "IQL and CQL need d3rlpy, which is not installed; install ucfrec[control,rl]"
+            "IQL and CQL need d3rlpy, which is not installed; install ucfrec[rl]"
         ) from None
     # It logs every training to stdout, and warns that networks exist already, which is intended
     # after a checkpoint.

@@ -131,7 +131,7 @@ def _video(out: Path) -> Iterator[Take]:
         import imageio_ffmpeg
     except ImportError:
         raise InputError(
-            f"{out} needs imageio-ffmpeg, which is not installed; install ucfrec[control,video], "
+            f"{out} needs imageio-ffmpeg, which is not installed; install ucfrec[video], "
             "or name a folder for frames"
         ) from None
     with atomic_file(out) as scratch, ExitStack() as stack:

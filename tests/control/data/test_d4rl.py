@@ -252,7 +252,7 @@ def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:
     with pytest.raises(InputError, match="fetch it with --download"):
         read_minari("mujoco/hopper/medium-v0")
     if find_spec("huggingface_hub") is None:
-        with pytest.raises(InputError, match=r"install ucfrec\[control,minari\]"):
+        with pytest.raises(InputError, match=r"install ucfrec\[minari\]"):
             read_minari("mujoco/hopper/medium-v0", download=True)
     with pytest.raises(InputError, match="no Minari identifier"):
         write_minari(trajectories, "no identifier")

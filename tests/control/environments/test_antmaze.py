@@ -258,7 +258,7 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
     assert main(["evaluate", str(run)]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert f"{REBUILT} needs gymnasium-robotics" in line
-    assert "install ucfrec[control,antmaze]" in line
+    assert "install ucfrec[antmaze]" in line
     with pytest.raises(InputError, match="needs gymnasium-robotics"):
         make_env("AntMaze_UMaze-v4", 1)
 

@@ -86,7 +86,7 @@ def test_a_video_has_the_frames_at_the_speed_of_the_environment(
     [
         (1, "a.gif", "neither an .mp4 file"),
         (2, "frames", "--video records one run; 2 were given"),
-        (1, "without-ffmpeg.mp4", "install ucfrec[control,video], or name a folder"),
+        (1, "without-ffmpeg.mp4", "install ucfrec[video], or name a folder"),
         (1, "without-opengl", "cannot be rendered"),
     ],
 )

@@ -1,0 +1,106 @@
+"""Estimates from scored rows are those from the logs that were scored."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.logs import LogMapping
+from ucfrec.off_policy import scored
+from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
+from ucfrec.off_policy.score import about_scores, logged_sessions, score
+from ucfrec.off_policy.scored import evaluate_scored
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+RULE = DecisionRule(7.5, temperature=1.0)
+WEIGHED = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "clipped IPS")
+
+
+def scored_parts(folder: Path, trained: TrainedPolicy, out: Path, lacking: int) -> Path:
+    """The logs of `folder`, some without propensity, scored into three files of any sessions."""
+    log = pd.read_parquet(folder / "rest.parquet")
+    log["propensity"] = np.random.default_rng(0).uniform(0.02, 0.06, len(log))
+    log.loc[log.index[:lacking], "propensity"] = np.nan
+    log.to_parquet(out / "log.parquet")
+    with logged_sessions(folder / "run", trained, [out / "log.parquet"], LogMapping()) as logged:
+        frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
+    (out / "scored").mkdir()
+    for part, (begin, end) in enumerate(((0, 70), (70, 71), (71, len(frame)))):
+        table = scored.pa.Table.from_pandas(frame[begin:end], preserve_index=False)
+        table = table.replace_schema_metadata(about_scores(trained, RULE))
+        pq.write_table(table, out / "scored" / f"part-{part}.parquet")
+    return out / "scored"
+
+
+@pytest.mark.parametrize(("lacking", "discount", "rows"), [(0, 1.0, 7), (25, 0.8, 64)])
+def test_estimates_are_those_from_the_logs(
+    folder: Path,
+    trained: TrainedPolicy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    lacking: int,
+    discount: float,
+    rows: int,
+) -> None:
+    parts = scored_parts(folder, trained, tmp_path, lacking)
+    monkeypatch.setattr(scored, "_BATCH_ROWS", rows)
+    options = EstimateOptions(discount=discount)
+    found = evaluate_scored(trained, [parts], rule=RULE, seed=3, options=options)
+    given = folder / "run", trained
+    with logged_sessions(*given, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+        expected = evaluate_off_policy(*given, logged, rule=RULE, seed=3, options=options)
+    ours, theirs = ({row.method: row for row in each.rows} for each in (found, expected))
+    assert {*WEIGHED} <= {*ours}
+    assert found.verdict.estimator == "SNPDIS"
+    for name in WEIGHED:
+        assert ours[name].value == pytest.approx(theirs[name].value, rel=1e-5)
+        assert ours[name].conditions == theirs[name].conditions
+        if theirs[name].interval is not None:
+            assert ours[name].interval == pytest.approx(theirs[name].interval, rel=1e-4, abs=1e-6)
+        for column in ("effective_users", "mean_weight", "users", "seen_in_training"):
+            mine, full = (each[name].as_line()[column] for each in (ours, theirs))
+            assert mine == pytest.approx(full, rel=1e-5)
+
+
+def test_what_was_not_scored_by_the_run_and_rule_is_refused(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    parts = scored_parts(folder, trained, tmp_path, 0)
+
+    def estimated(path: Path, rule: DecisionRule = RULE, **options: bool) -> None:
+        chosen = EstimateOptions(**options)
+        evaluate_scored(trained, [path], rule=rule, seed=0, options=chosen)
+
+    with pytest.raises(InputError, match=r"part-0\.parquet was scored with rule '.*', not '"):
+        estimated(parts, DecisionRule(7.5))
+    with pytest.raises(InputError, match="has no column session, probability"):
+        estimated(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="need the logs"):
+        estimated(parts, pages=True)
+    (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
+    with pytest.raises(InputError, match="cannot be read"):
+        estimated(tmp_path / "broken.parquet")
+    shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
+    with pytest.raises(InputError, match="not numbered in order"):
+        estimated(parts)
+
+
+def test_the_command_reads_what_score_writes(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out, rule = str(folder / "run"), str(tmp_path / "scored.parquet"), ["--temperature", "1"]
+    assert main(["score", run, str(folder / "rest.parquet"), "--out", out, *rule]) == 0
+    results = str(tmp_path / "ope.json")
+    assert main(["ope", run, out, "--scored", *rule, "--json", results]) == 0
+    said = capsys.readouterr().out
+    assert "SNPDIS" in said
+    assert "verdict:" in said
+    assert main(["ope", run, out, "--scored", *rule, "--temperatures", "1,2"]) == 2
+    assert main(["ope", run, "--scored"]) == 2
+    assert main(["report", run, "--results", results, "--out", str(tmp_path / "r.html")]) == 0

@@ -89,6 +89,12 @@ def test_checkpoints_are_measured_once_and_share_the_run_of_the_main_table(
     (last,) = (r.value for r in more if r.checkpoint == "last")
     assert last == next(r.value for r in first if r.checkpoint == "averaged-6")
     the_files_are_those_of_the_training(run)
+    searched = ["contexts", "--data", str(tmp_path), *arguments, "--method", "ucf-wo-count"]
+    assert main(searched) == 0
+    assert "highest mean score: --context ucf-wo-count=" in capsys.readouterr().out
+    tried = [r for r in read_rows(out / "results.jsonl") if r.suite == "contexts"]
+    assert {r.conditions["context"] for r in tried} == {8, 20}
+    assert {r.evaluation_seed for r in tried}.isdisjoint({1000})
 
 
 def the_files_are_those_of_the_training(run: Path) -> None:

@@ -3,12 +3,13 @@
     python benchmarks/acting_time.py RUN STORE
 
 `one user`: a line of JSON to the line that answers it, as `ucfrec recommend --stream` and `serve`
-do; beside it, a store of every request. With `--items 1000000` also for a catalogue of random
-copies of the run's items. `one user's frame`: `Recommender.recommend`, beside reading the frame by
-SQL. `all users`: `ucfrec recommend` without its start, beside a store of all requests.
-`choose the rule`:
-decision rules played side by side, and one after the other. `VirtualTaobao`: pages of 4,096
-sessions, beside the authors' environment (--original, their repository) page by page.
+do; beside it, a store of every request. The rule is the run's, or what `--reward-weight`,
+`--tag-window` and the other options of `ucfrec serve` say. With `--items 1000000` also for a
+catalogue of random copies of the run's items. `one user's frame`: `Recommender.recommend`, beside
+reading the frame by SQL. `all users`: `ucfrec recommend` without its start, beside a store of all
+requests. `choose the rule`: decision rules simulated side by side, and one after the other.
+`VirtualTaobao`: pages of 4,096 sessions, beside the authors' environment (--original, their
+repository) page by page.
 
 One thread. Appends the rows to runs/acting_time/results.jsonl, or to --results, and prints a table.
 """
@@ -35,6 +36,7 @@ from ucfrec.acting.scorer import logged_history
 from ucfrec.choosing.by_simulation import RuleSearch
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.problem import Problem
+from ucfrec.commands.options import rule_given, rule_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.policies.registry import policy_class
@@ -115,7 +117,7 @@ def line_ways(trained: TrainedPolicy, engine: str) -> tuple[Way, Way]:
 
     def before() -> str:
         request = json.loads(line)
-        history = responder._reader.read(request["history"])
+        history = responder._reader.read(request["history"], request["user_id"])
         items = trained.items.numbers(history.item_ids)
         store = _next_steps(trained, items, history.rewards, np.array([HISTORY]), np.array([-1]))
         left_out = torch.zeros(1, len(trained.items), dtype=torch.bool)
@@ -262,6 +264,7 @@ def seconds(case: Case) -> tuple[np.ndarray, np.ndarray]:
 def cases(options: argparse.Namespace, folder: Path) -> Iterator[tuple[Case, int]]:
     """The cases, and the number of items of each."""
     trained, store = TrainedPolicy.load(options.run), EpisodeStore.open(options.store)
+    trained = replace(trained, rule=rule_given(options, trained))
     items, rounds, wanted = len(trained.items), options.rounds, options.only or TASKS
     if "one user" in wanted:
         yield Case("one user", line_ways(trained, options.engine), options.users), items
@@ -295,6 +298,7 @@ def main() -> None:
     parser.add_argument("--original", type=Path, help="folder of the authors' VirtualTaobao")
     parser.add_argument("--only", nargs="+", choices=TASKS, help="what to measure (everything)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file of result rows")
+    rule_options(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     lines = []

@@ -2,15 +2,17 @@
 
     python benchmarks/serve_load.py RUN --results benchmarks/results/serve_load.jsonl
 
-Starts the server on a free port of the loopback interface and asks it with wrk where that is
-installed, otherwise with httpx: one client first, then many. Appends a row for each number
-of clients and prints a table. Client and server share the cores.
+Starts the server on a free port of the loopback interface, with further options such as
+`--reward-weight 2`, and asks it with wrk where that is installed, otherwise with httpx: one client
+first, then many. Appends a row for each number of clients and prints a table. Client and server
+share the cores; the CPU time of either, unlike the rate, hardly depends on what else these do.
 """
 
 import argparse
 import asyncio
 import json
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -107,6 +109,29 @@ async def with_httpx(address: str, body: bytes, clients: int, seconds: float) ->
     return {"rate": len(taken) / seconds, "p50_ms": p50, "p90_ms": p90, "p99_ms": p99}
 
 
+def cpu_seconds(address: str) -> tuple[float, float]:
+    """CPU time of the server, and of what asks it, so far."""
+    metrics = httpx.get(f"{address}/metrics").text
+    of_server = re.search(r"process_cpu_seconds_total (\d\S+)", metrics)
+    assert of_server is not None
+    who = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    used = [resource.getrusage(each) for each in who]
+    return float(of_server[1]), sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def measured(address: str, body: bytes, clients: int, seconds: float) -> dict[str, float]:
+    """Rate, latencies, and CPU milliseconds of a request on either side."""
+    before = cpu_seconds(address)
+    if shutil.which("wrk"):
+        found = with_wrk(address, body, clients, seconds)
+    else:
+        found = asyncio.run(with_httpx(address, body, clients, seconds))
+    after, count = cpu_seconds(address), found["rate"] * seconds
+    for name, then, now in zip(("server", "client"), before, after, strict=True):
+        found[f"{name}_cpu_ms"] = 1e3 * (now - then) / count
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
@@ -117,20 +142,17 @@ def main() -> None:
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
     )
-    options = parser.parse_args()
+    options, rule = parser.parse_known_args()
     trained = TrainedPolicy.load(options.run)
     body, tool = request(trained, options.history), "wrk" if shutil.which("wrk") else "httpx"
     assert trained.item_ids is not None
-    lines = []
-    with served(options.run, "--threads", str(options.threads)) as address:
-        for clients in (1, *options.clients):
+    lines = list[tuple[object, ...]]()
+    with served(options.run, "--threads", str(options.threads), *rule) as address:
+        measured(address, body, 1, options.seconds)  # warms the server up
+        for clients in options.clients:
             began = time.perf_counter()
-            given = (address, body, clients, options.seconds)
-            found = with_wrk(*given) if tool == "wrk" else asyncio.run(with_httpx(*given))
-            if not lines:
-                lines.append(())
-                continue  # the first round warms the server up
-            lines.append((clients, *(f"{value:,.1f}" for value in found.values())))
+            found = measured(address, body, clients, options.seconds)
+            lines.append((clients, *(f"{value:,.4g}" for value in found.values())))
             row = ResultRow(
                 suite="serve-load",
                 table="serve-load",
@@ -142,6 +164,7 @@ def main() -> None:
                     "history": options.history,
                     "threads": options.threads,
                     "seconds": options.seconds,
+                    "options": " ".join(rule),
                 },
                 data_fingerprint=trained.record.fingerprint,
                 metric="rate",
@@ -151,7 +174,7 @@ def main() -> None:
             )
             append_rows(options.results, [row])
     heads = ("clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
-    print(markdown_table(heads, lines[1:]))
+    print(markdown_table((*heads, "CPU of the server, ms", "of the client, ms"), lines))
 
 
 if __name__ == "__main__":

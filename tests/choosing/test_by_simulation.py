@@ -239,9 +239,8 @@ def test_rules_of_the_highest_value_are_simulated_in_more_sessions(
 
 def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
     one = ("temperatures=[1.0]", "reward_weights=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
-    rule = [
-        f"rule.{each}" for each in (*one, "sessions=40", "least_items=2", "least_impressions=1")
-    ]
+    one = (*one, "quantiles=[1.0]", "lookaheads=[0.0]", "sessions=15")
+    rule = [f"rule.{each}" for each in (*one, "least_items=2", "least_impressions=1")]
     config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
     store = tiring_store(tmp_path)
     record = train_run(store, tmp_path / "run", config)
@@ -260,7 +259,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert not model.affinity.any()
     assert not model.user.any()
     # The chosen rule was simulated again in four times the sessions.
-    more = search_of(tmp_path, trained, replace(config.rule, sessions=160))
+    more = search_of(tmp_path, trained, replace(config.rule, sessions=60))
     (simulated,) = more.simulate([trained.rule])
     own = next(each for each in record.rule.candidates if each.rule == trained.rule)
     assert (own.value, own.error) == (simulated.value, simulated.error)

@@ -33,7 +33,7 @@ def test_the_rows_before_a_step_are_those_of_the_user(
     seed: int, gap: int | None, share: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    n = 80
+    n = 40
     log = pd.DataFrame({"user": rng.integers(5, size=n), "item": rng.integers(12, size=n)})
     log["reward"] = rng.integers(2, size=n).astype(float)
     log["timestamp"] = np.cumsum(rng.integers(1, 8, size=n))

@@ -158,15 +158,6 @@ def test_the_graph_recommends_what_the_policy_does(
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
 
 
-def test_a_graph_of_a_reward_weight_takes_any_number_of_sessions(
-    trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    model = trained.reward_model
-    assert model is not None
-    assert not model.tastes.known
-    assert export(trained, tmp_path / "out", rule=RULES["weighted"], k=5).difference <= 1e-5
-
-
 def test_the_command_writes_it_whole_or_not_at_all(
     trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,7 +167,10 @@ def test_the_command_writes_it_whole_or_not_at_all(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["gsasrec", "bpr", "recent-rate"])
+_SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("bpr", "recent-rate")]
+
+
+@pytest.mark.parametrize("name", ["gsasrec", *_SLOW])
 def test_peers_are_exported(tmp_path: Path, name: str) -> None:
     trained = trained_run(tmp_path, name)
     assert export(trained, tmp_path / "out", k=5).difference <= 1e-5

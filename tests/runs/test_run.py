@@ -49,6 +49,7 @@ def left_alone(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
     store: Path, left_alone: Path, tmp_path: Path
 ) -> None:

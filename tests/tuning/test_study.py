@@ -83,6 +83,7 @@ def test_a_search_goes_on_and_the_same_search_gives_the_same_trials(
         tune(plan(store, tmp_path / "a", metric="value"), 6)
 
 
+@pytest.mark.slow
 def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
     study = tune(plan(store, tmp_path / "tuned"), 4, workers=2)
     assert len(finished(study)) == 4

@@ -137,6 +137,7 @@ def test_a_seed_and_a_share_of_the_steps_may_be_given(folder: Path, tmp_path: Pa
     assert np.isfinite(record.finished.best_validation)
 
 
+@pytest.mark.slow
 def test_an_update_killed_at_any_moment_ends_as_if_left_alone(folder: Path) -> None:
     assert kills("update", folder) >= 3
     alone, killed = (RunRecord.read(folder / name) for name in ("run2", "killed"))

@@ -75,7 +75,7 @@ def test_all_items_at_once_end_sessions_as_each_alone() -> None:
     steps, rewards = torch.from_numpy(logged.steps), torch.from_numpy(logged.rewards)
     every = torch.arange(ITEMS).expand(400, -1)
     rewards = rewards.unsqueeze(1).expand(-1, ITEMS)
-    together = end.of_items(logged.shown, every, rewards, steps)
+    (together,) = end.of_items(logged.shown, every, [rewards], steps)
     for item in range(ITEMS):
         alone = end.probabilities(
             *(logged.shown, torch.full((400,), item), logged.rewards, logged.steps)

@@ -237,8 +237,7 @@ class ItemProduct:
         """What each tag filter of the rule excludes, (B, n_items) bool, or (B, C) of items."""
         if rule.tag_window:
             recent = shown.items[:, : rule.tag_window]
-            once = torch.ones_like(recent, dtype=torch.float32)
-            yield self._tags.shared(recent, once, items) > 0
+            yield self._tags.any_shared(recent, items)
         if rule.tag_run:
             tired = self._main_tags.tired(shown, rule.tag_run).unsqueeze(1)
             main = self._main_tags.tags
@@ -281,6 +280,16 @@ class _Tags:
         Returns:
             (B, n_items), or (B, C).
         """
+        sums = self._sums(shown, weights, items)
+        return sums if items is not None else sums.index_select(1, self._which)
+
+    def any_shared(self, shown: Tensor, items: Tensor | None = None) -> Tensor:
+        """Whether items share a tag with any that was shown; arguments as of `shared`."""
+        some = self._sums(shown, torch.ones_like(shown, dtype=torch.float32), items) > 0
+        return some if items is not None else some.index_select(1, self._which)
+
+    def _sums(self, shown: Tensor, weights: Tensor, items: Tensor | None) -> Tensor:
+        """`shared` of items (B, C), or for all items (B, M), of the M different sets of tags."""
         weights = weights.masked_fill(shown < 0, 0.0)
         places = self._places[shown.clamp(min=0)]  # (B, N, T)
         spread = weights.unsqueeze(-1).expand(places.shape).flatten(1)
@@ -291,7 +300,7 @@ class _Tags:
             tags = self._places[items]  # (B, C, T)
             return profile.gather(1, tags.flatten(1)).view(tags.shape).sum(2)
         columns = [profile.index_select(1, column) for column in self._distinct.unbind(1)]
-        return torch.stack(columns).sum(0).index_select(1, self._which)
+        return torch.stack(columns).sum(0)
 
 
 def _equal(one: Likeness, other: Likeness) -> bool:

@@ -30,6 +30,11 @@ _LOOKED_AT: Final = 64
 """Items of a decision that a lookahead asks about."""
 
 
+Engine = Callable[[Sessions, Tensor], Tensor]
+"""Gives the scores (1, n_items) of a single session, with what may not be shown, bool of that
+size."""
+
+
 class Query(NamedTuple):
     """What B sessions ask of all items; the rule's weights do not matter yet."""
 
@@ -90,7 +95,7 @@ class Scorer:
         if session_end is not None and reward_model is not None and bool(reward_model.binary):
             self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
         self._items = ItemProduct(policy, reward_model, states)
-        self._engine: Callable[[Sessions], Factors] | None = None
+        self._engine: Engine | None = None
         self._require_parts()
 
     def under(self, rule: DecisionRule) -> "Scorer":
@@ -104,8 +109,8 @@ class Scorer:
         other._require_parts()
         return other
 
-    def answering_one_with(self, engine: Callable[[Sessions], Factors]) -> "Scorer":
-        """The same, but the factors of a single session are computed by `engine`."""
+    def answering_one_with(self, engine: Engine) -> "Scorer":
+        """The same, but the scores of a single session are computed by `engine`."""
         other = copy.copy(self)
         other._engine = engine
         return other
@@ -245,8 +250,12 @@ class Scorer:
             else torch.no_grad()
         ):
             if self._engine is not None and isinstance(given, Sessions) and len(given.users) == 1:
-                scores = self._products(self._engine(given))
-                return self._left(scores, given.shown, left_out, excluded, empty)
+                without = torch.zeros(1, self._items.count, dtype=torch.bool)
+                if left_out is not None:
+                    without[left_out] = True
+                if excluded is not None:
+                    without |= excluded
+                return _require_scores(self._engine(given, without), empty)
             if isinstance(given, Sessions):
                 assert self.states is not None
                 given = given.history(self.states, self.policy.config.context)
@@ -328,13 +337,11 @@ class Scorer:
         steps = history.windows.timesteps[:, -1]
         some, recent = rewards.gather(1, best), history.shown.latest(model.lags)
         if self._outcomes is not None and end.uses_rewards:
-            low, high = (
-                end.of_items(recent, best, torch.full_like(some, reward), steps)
-                for reward in self._outcomes
-            )
+            rewarded = [torch.full_like(some, reward) for reward in self._outcomes]
+            low, high = end.of_items(recent, best, rewarded, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
-            ends = end.of_items(recent, best, some, steps)
+            (ends,) = end.of_items(recent, best, [some], steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)
@@ -353,7 +360,7 @@ class Scorer:
     ) -> Tensor:
         """The scores with −∞ for what is excluded; the given ones are overwritten."""
         if not torch.compiler.is_exporting():
-            _require_numbers(scores)
+            _require_scores(scores, empty=True)
         if left_out is not None:
             scores[left_out] = -torch.inf
         if excluded is not None:
@@ -361,15 +368,10 @@ class Scorer:
         for without in self._items.without_tags(self.rule, shown):
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
-            scores = torch.where(left.amax(1, keepdim=True) > -torch.inf, left, scores)
-        if not empty:
-            none = torch.isneginf(scores.amax(1))
-            if none.any():
-                raise InputError(
-                    f"in {int(none.sum())} of {len(none)} decisions every item is excluded; allow "
-                    "more candidates, or keep seen items"
-                )
-        return scores
+            some = left.amax(1, keepdim=True) > -torch.inf
+            every = not torch.compiler.is_exporting() and bool(some.all())
+            scores = left if every else torch.where(some, left, scores)
+        return scores if empty else _require_scores(scores, empty)
 
 
 def logged_history(
@@ -402,16 +404,24 @@ def logged_scores(
     return scorer.scores(history, left_out, seen, empty=left_out is not None)
 
 
-def _require_numbers(scores: Tensor) -> None:
-    """Check scores (B, n_items).
+def _require_scores(scores: Tensor, empty: bool) -> Tensor:
+    """Check scores (B, n_items), which are returned.
 
     Raises:
-        InputError: those of some row are NaN, or infinitely high.
+        InputError: those of some row are NaN, or infinitely high, or unless `empty` no item is
+            left in it.
     """
-    undefined = ~(scores.amax(1) < torch.inf)
+    highest = scores.amax(1)
+    undefined = ~(highest < torch.inf)
     if undefined.any():
         raise InputError(
             f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
             "weights of the policy or the reward model are NaN or infinite; train again, with "
             "a lower train.learning_rate if the training diverged"
         )
+    if not empty and bool((none := torch.isneginf(highest)).any()):
+        raise InputError(
+            f"in {int(none.sum())} of {len(none)} decisions every item is excluded; allow "
+            "more candidates, or keep seen items"
+        )
+    return scores

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import RankedRule, RuleChoice
-from ucfrec.choosing.logged import SHOWN, scores_at
+from ucfrec.choosing.logged import SHOWN, LoggedScores
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
@@ -41,9 +41,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     """
     scorer, tried = problem.scorer, list[_Tried]()
     rows = _Rows.of(problem.train, problem.validation, problem.seed)
+    scores = LoggedScores(scorer, rows.store, rows.episodes, rows.steps)
 
     def rank(weights: Sequence[float]) -> _Tried:
-        for weight, top in zip(weights, _tops(scorer, weights, rows), strict=True):
+        for weight, top in zip(weights, _tops(scorer, weights, scores), strict=True):
             tried.append(_Tried.of(replace(scorer.rule, reward_weight=weight), top, rows))
         return _best(tried)
 
@@ -174,11 +175,11 @@ class _Rows:
         )
 
 
-def _tops(scorer: Scorer, reward_weights: Sequence[float], rows: _Rows) -> list[IntArray]:
+def _tops(scorer: Scorer, reward_weights: Sequence[float], scores: LoggedScores) -> list[IntArray]:
     """The items (M, `SHOWN`) that are shown with each reward weight."""
     rules = [replace(scorer.rule, reward_weight=each) for each in reward_weights]
-    batches = scores_at(scorer, rules, rows.store, rows.episodes, rows.steps)
     tops = [
-        [each.topk(min(SHOWN, each.shape[1])).indices for each in scores] for _, scores in batches
+        [best_items(each, min(SHOWN, each.shape[1])) for each in batch]
+        for _, batch in scores.of(rules)
     ]
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]

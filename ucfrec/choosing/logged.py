@@ -1,19 +1,22 @@
 """What several decision rules of one policy would have done at logged steps."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import Scorer, logged_history
+from ucfrec.acting.decision import DecisionRule, best_items
+from ucfrec.acting.scorer import Query, Scorer, logged_history
+from ucfrec.acting.sessions import History, seen_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.item_counts import liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.weights import effective_number
+from ucfrec.episodes.windows import Windows
 from ucfrec.progress import progress
 
 SHOWN = 10
@@ -22,36 +25,58 @@ _AT_ONCE = 256
 _Z = 1.96
 
 
-@torch.no_grad()
-def scores_at(
-    scorer: Scorer,
-    rules: Sequence[DecisionRule],
-    view: EpisodeStore,
-    episodes: IntArray,
-    steps: IntArray,
-) -> Iterator[tuple[slice, list[Tensor]]]:
-    """Scores (B, n_items) by each rule of batches of logged steps (M,), and which steps they are.
+class LoggedScores:
+    """Scores of all items at M logged steps by rules of one policy.
 
-    Policy and reward model are computed once for all rules of one target.
+    Policy and reward model are computed once for all rules of one target, and kept for rules that
+    are asked for later.
     """
-    scorers = [scorer.under(rule) for rule in rules]
-    widest = max(scorers, key=lambda each: each.reach)
-    weighted = any(rule.reward_weight for rule in rules)
-    with progress(len(steps), "logged steps under each rule", "rows") as bar:
-        for first in range(0, len(steps), _AT_ONCE):
-            part = slice(first, min(first + _AT_ONCE, len(steps)))
-            known, seen = logged_history(widest, view, episodes[part], steps[part])
-            queries, scores = {}, list[Tensor]()
-            for each in scorers:
-                target = each.rule.target, each.rule.minimum_target
-                if target not in queries:
-                    aimed = each.with_target(known)
-                    queries[target] = aimed, each.query(aimed, rewards=weighted)
-                aimed, query = queries[target]
-                excluded = seen if each.rule.exclude_seen else None
-                scores.append(each.scores_of(query, aimed, excluded=excluded))
-            yield part, scores
-            bar.update(part.stop - part.start)
+
+    def __init__(
+        self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
+    ) -> None:
+        self._scorer, self._view, self._episodes, self._steps = scorer, view, episodes, steps
+        self._kept: dict[tuple[object, ...], _Asked] = {}
+
+    @torch.no_grad()
+    def of(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
+        """Scores (B, n_items) by each rule of batches of the steps, and which steps they are."""
+        scorers = [self._scorer.under(rule) for rule in rules]
+        widest = max(scorers, key=lambda each: each.reach)
+        weighted = any(rule.reward_weight for rule in rules)
+        with progress(len(self._steps), "logged steps under each rule", "rows") as bar:
+            for first in range(0, len(self._steps), _AT_ONCE):
+                part = slice(first, min(first + _AT_ONCE, len(self._steps)))
+                at = self._episodes[part], self._steps[part]
+                known: History | None = None
+                scores = list[Tensor]()
+                for each in scorers:
+                    rule = each.rule
+                    key = first, rule.target, rule.minimum_target, widest.reach, weighted
+                    if key not in self._kept:
+                        known = known or logged_history(widest, self._view, *at)[0]
+                        self._kept[key] = _Asked.of(each, known, weighted)
+                    asked = self._kept[key]
+                    seen = seen_before(self._view, *at) if rule.exclude_seen else None
+                    scores.append(each.scores_of(asked.query, asked.history, excluded=seen))
+                yield part, scores
+                bar.update(part.stop - part.start)
+
+
+class _Asked(NamedTuple):
+    """What a batch of logged steps asks under one target, and what rules need besides."""
+
+    query: Query
+    history: History
+    """With windows of the step itself."""
+
+    @classmethod
+    def of(cls, scorer: Scorer, known: History, weighted: bool) -> "_Asked":
+        aimed = scorer.with_target(known)
+        last = aimed.windows.last(1)
+        # A view would keep the whole windows.
+        copied = Windows(*(getattr(last, each.name).clone() for each in fields(last)))
+        return cls(scorer.query(aimed, rewards=weighted), replace(aimed, windows=copied))
 
 
 @dataclass(frozen=True)
@@ -94,7 +119,7 @@ class LoggedEvidence:
         """
         order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
         last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
-        self._scorer, self._view = scorer, view.select(np.sort(order[: last + 1]))
+        self._view = view.select(np.sort(order[: last + 1]))
         self._episodes, self._steps = self._view.all_steps()
         at = self._episodes, self._steps
         self._items = torch.from_numpy(self._view.step_values(schema.ITEM, *at).astype(np.int64))
@@ -107,6 +132,7 @@ class LoggedEvidence:
         if view.has_users:
             owners = self._view.episode_values(schema.USER)
         self._users = np.unique(owners, return_inverse=True)[1]
+        self._scores = LoggedScores(scorer, self._view, *at)
 
     @property
     def has_propensities(self) -> bool:
@@ -122,13 +148,12 @@ class LoggedEvidence:
         """The evidence of each rule."""
         shape = len(rules), len(self._steps)
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
-        at = self._view, self._episodes, self._steps
-        for part, scores in scores_at(self._scorer, rules, *at):
+        for part, scores in self._scores.of(rules):
             items = self._items[part].unsqueeze(1)
             for n, (rule, each) in enumerate(zip(rules, scores, strict=True)):
                 chances = rule.log_probabilities(each)
                 logs[n, part] = chances.gather(1, items)[:, 0].double().numpy()
-                top = each.topk(min(SHOWN, each.shape[1])).indices
+                top = best_items(each, min(SHOWN, each.shape[1]))
                 hits[n, part] = (top == items).any(1).numpy()
         return [self._evidence(one, hit) for one, hit in zip(logs, hits, strict=True)]
 

@@ -28,6 +28,9 @@ _USERS_AT_ONCE = 128
 _SCORES = 2**24
 """Most scores of a forward pass of several users, users × items: 64 MiB."""
 
+_NEGLIGIBLE: Final = 80.0
+"""Nats below the best score from which on an item counts nothing, in float32."""
+
 
 def recommend(
     trained: TrainedPolicy,
@@ -195,13 +198,15 @@ def best_of(
         k: number of items, at most n_items.
         drawn: (B, n_items + 1) of `uniforms`; needed if the rule draws.
     """
-    total = scores.logsumexp(-1, keepdim=True)
-    none = torch.isneginf(total[:, 0])
+    # Exponentials that underflow take long, and what is lower adds nothing to a sum of 1 or more.
+    lowest = scores.amax(-1, keepdim=True) - _NEGLIGIBLE
+    total = scores.clamp(min=lowest).logsumexp(-1, keepdim=True)
+    none = torch.isneginf(total)
     if none.any():
-        scores[none] = 0.0
+        scores[none[:, 0]] = 0.0
     items, propensities = rule.ranked(scores, k, drawn)
     values = scores.gather(1, items) - total
-    return items, values.masked_fill(none.unsqueeze(1), -torch.inf), propensities
+    return items, values.masked_fill(none, -torch.inf), propensities
 
 
 def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:

@@ -100,7 +100,7 @@ class Responder:
             skip_unknown: ignore rows of items that are not in the training data.
             seed: of the draws of a rule with a temperature, or that explores; they also depend on
                 user and request_id.
-            engine: what computes the network of a request that comes alone, one of `ENGINES`.
+            engine: what computes the scores of a request that comes alone, one of `ENGINES`.
 
         Raises:
             InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
@@ -112,9 +112,9 @@ class Responder:
         if engine not in ENGINES:
             raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
         if engine == ONNXRUNTIME:
-            from ucfrec.recommending.query_graph import QueryGraph
+            from ucfrec.recommending.score_graph import ScoreGraph
 
-            graph = QueryGraph(self._scorer, trained.name)
+            graph = ScoreGraph(self._scorer, trained.name)
             self._scorer = self._scorer.answering_one_with(graph)
         self.trained, self.limits = trained, limits
         self._k, self._filter_seen, self._skip_unknown, self._seed = (
@@ -280,16 +280,14 @@ class Responder:
             whole = len(rows) == len(asked)
             of_rows = scores if whole else scores[rows]
             draws = drawn if drawn is None or whole else drawn[rows]
-            found = (each.numpy() for each in best_of(self.rule, of_rows, k, draws))
-            for row, numbers, values, chances in zip(rows, *found, strict=True):
-                kept = np.isfinite(values)
-                answers[row] = Answer(
-                    self._items.ids[numbers[kept]].tolist(),
-                    values[kept].tolist(),
-                    chances[kept].tolist(),
-                    asked[row].request_id,
-                    *self._source,
-                )
+            found = best_of(self.rule, of_rows, k, draws)
+            numbers, values, chances = (each.numpy() for each in found)
+            # Items that may not be recommended come last.
+            counts = np.isfinite(values).sum(1).tolist()
+            columns = (each.tolist() for each in (self._items.ids[numbers], values, chances))
+            for row, count, items, logs, shares in zip(rows, counts, *columns, strict=True):
+                shown = items[:count], logs[:count], shares[:count]
+                answers[row] = Answer(*shown, asked[row].request_id, *self._source)
         return [answers[row] for row in range(len(asked))]
 
 

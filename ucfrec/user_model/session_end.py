@@ -1,7 +1,7 @@
 """When users leave: the probability that a session ends with a step, fitted to logged steps."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -164,21 +164,25 @@ class SessionEnd:
         inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing))
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
-    def of_items(self, shown: Shown, items: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
-        """Probabilities (B, C) that sessions end if they show items.
+    def of_items(
+        self, shown: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
+    ) -> list[Tensor]:
+        """Probabilities (B, C) that sessions end if they show items, for each of some rewards.
 
         Args:
             items: (B, C) int64.
-            rewards: (B, C) that the items would be given.
+            rewards: R of (B, C) that the items would be given.
             steps: (B,) number of the step.
         """
-        alike = [
-            self.likeness.to_candidates(_profile(self.likeness, shown, lag), items)
-            for lag in range(_LAGS)
-        ]
+        batch, count = items.shape
+        lately = F.pad(shown.items[:, :_LAGS], (0, max(0, _LAGS - shown.items.shape[1])), value=-1)
+        profiles = self.likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
+        every = items.unsqueeze(1).expand(-1, _LAGS, -1).reshape(-1, count)
+        alike = self.likeness.to_candidates(profiles, every).view(batch, _LAGS, count)
         repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
-        inputs = _columns(torch.stack(alike, 1), repeated, rewards, steps.unsqueeze(1))
-        return torch.sigmoid(self._log_odds(inputs.flatten(0, 1))).view(-1, items.shape[1])
+        inputs = [_columns(alike, repeated, each, steps.unsqueeze(1)) for each in rewards]
+        ends = torch.sigmoid(self._log_odds(torch.cat(inputs).flatten(0, 1)))
+        return [*ends.view(-1, batch, count).unbind(0)]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""

@@ -123,6 +123,7 @@ def begin(
     return runs
 
 
+@pytest.mark.slow
 def test_cells_are_measured_once_and_screening_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

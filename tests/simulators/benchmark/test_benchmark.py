@@ -224,6 +224,7 @@ def test_a_task_that_the_budget_leaves_out_is_swept_if_it_is_named(tmp_path: Pat
     assert {cell.task for cell in named.cells("sweeps")} == {"synthetic-taobao"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,14 +1,17 @@
 """onnxruntime answers a request that comes alone as torch does."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+from torch import Tensor
 
 from tests.recommending.test_responder import answered
 from tests.support.served import (
     FULL,
+    boredom,
     histories,
     learn_tastes,
     requests_of,
@@ -26,14 +29,15 @@ pytest.importorskip("onnxscript")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    trained = trained_run(tmp_path_factory.mktemp("query"))
+    trained = trained_run(tmp_path_factory.mktemp("scores"))
     learn_tastes(trained)
-    return trained
+    assert trained.reward_model is not None
+    return replace(trained, session_end=boredom(trained.reward_model.likeness))
 
 
-@pytest.fixture(scope="module")
-def fast(trained: TrainedPolicy) -> Responder:
-    return responder(trained, rule=FULL, k=24, engine=ONNXRUNTIME)
+@pytest.fixture(scope="module", params=[FULL, replace(FULL, lookahead=2.0)], ids=["full", "ahead"])
+def fast(trained: TrainedPolicy, request: pytest.FixtureRequest) -> Responder:
+    return responder(trained, rule=request.param, k=24, engine=ONNXRUNTIME)
 
 
 @pytest.mark.slow
@@ -43,13 +47,13 @@ def test_answers_are_those_of_torch(
     asked = [*requests_of(histories()), {"user_id": "new", "request_id": "1"}]
     graph, alone = fast._scorer._engine, []
 
-    def counted(sessions: Sessions) -> Any:
+    def counted(sessions: Sessions, excluded: Tensor) -> Any:
         alone.append(len(sessions.users))
         assert graph is not None
-        return graph(sessions)
+        return graph(sessions, excluded)
 
     monkeypatch.setattr(fast._scorer, "_engine", counted)
-    expected = answered(responder(trained, rule=FULL, k=24), asked)
+    expected = answered(responder(trained, rule=fast.rule, k=24), asked)
     one_by_one = pd.concat([answered(fast, [each]) for each in asked], ignore_index=True)
     pd.testing.assert_frame_equal(one_by_one, expected, rtol=1e-5, atol=1e-5)
     assert alone == [1] * len(asked)
@@ -59,7 +63,7 @@ def test_answers_are_those_of_torch(
 
 @pytest.mark.slow
 def test_the_run_s_own_scorer_stays_as_it_is(trained: TrainedPolicy, fast: Responder) -> None:
-    assert trained.scorer(FULL)._engine is None
+    assert trained.scorer(fast.rule)._engine is None
 
 
 def test_policies_that_score_in_their_own_way_are_refused(tmp_path: Path) -> None:

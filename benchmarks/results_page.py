@@ -23,13 +23,14 @@ from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import latest, read_rows
+from ucfrec_control.benchmark.spread import spreads
 
 ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
 PICTURES = ROOT / "docs" / "assets" / "tables"
 FILES = (
     *("recommendation", "counterfactual_copies"),
-    *("control", "control_robustness", "control_histories"),
+    *("control", "control_robustness", "control_histories", "control_spread"),
 )
 PAPER = """\
 | method | KuaiRand R_cum | R_avg | KuaiRec R_cum | R_avg | VirtualTB R_cum | R_avg |
@@ -396,6 +397,20 @@ def robustness(rows: Sequence[ResultRow]) -> str:
     return "\n\n".join(parts)
 
 
+def spread(rows: Sequence[ResultRow]) -> str:
+    """Standard deviations of scores, raw and averaged, over seeds and over last checkpoints."""
+    lines = []
+    for line in spreads(rows):
+        score, over_seeds, over_last = (
+            NONE if math.isnan(line[name]) else rounded(line[name])
+            for name in ("score", "sd_seeds", "sd_last")
+        )
+        about = (line["task"].removesuffix("-zoo"), line["method"], line["weights"])
+        lines.append((*about, line["seeds"], score, over_seeds, line["checkpoints"], over_last))
+    head = ("file", "method", "weights", "seeds", "score", "sd over seeds", "checkpoints")
+    return markdown_table((*head, "sd over checkpoints"), lines)
+
+
 def of(name: str, table: str) -> Callable[[_Files], Sequence[ResultRow]]:
     """Chooses the rows of a table of a file."""
     return lambda files: [row for row in files.get(name, ()) if row.table == table]
@@ -506,8 +521,9 @@ SECTIONS = (
         "Normalized scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
         "of the authors' training (IQL: 50,000 in batches of 64, CQL: 10,000). Learning rates were "
         "chosen on validation loss by one search for all methods. Without a standard error there "
-        "is one seed, and a difference may be chance. At equal steps UCF is between DT and DC, "
-        "and all sequence policies are behind cloning the best quarter of the trajectories.",
+        "is one seed, and a difference may be chance. At these equal steps UCF is between DT and "
+        "DC, and all sequence policies are behind cloning the best quarter of the trajectories; "
+        "longer trainings may differ.",
         f"`{CONTROL} main`",
         of("control", "main"),
         scores,
@@ -528,11 +544,21 @@ SECTIONS = (
         "Trained on the best quarter of the trajectories, with histories of 1 and of 5 steps "
         "(`context`) at as many predictions per update, beside the rows with 20 steps and behavior "
         "cloning. Tried after the scores with 20 steps on `hopper_medium-expert` were seen. "
-        "UCF and LSDT without a history are level and have the highest means: MuJoCo's "
-        "observation is the whole state, and a history adds only who acted with what noise.",
+        "UCF and LSDT without a history are level and have the highest means of the small budget: "
+        "MuJoCo's observation is the whole state, and a history adds only who acted with what "
+        "noise.",
         f"`python benchmarks/control_histories.py --out runs/control` {IN_TAG}",
         histories,
         partial(scores, references=("ucf-wo-count-best-25-x2-context-1",)),
+    ),
+    Section(
+        "Control: raw and averaged weights",
+        "10,000 steps in batches of 64 windows of 8 steps at width 128, learning rate 1e-3, 50 "
+        "episodes. Each training gives both: the weights of a step, and their exponential moving "
+        "average (0.999). Checkpoints are 1,000 steps apart, the last ones of each training.",
+        "`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count`",
+        of("control_spread", "spread"),
+        spread,
     ),
     Section(
         "Control: ways to pursue reward",

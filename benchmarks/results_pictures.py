@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from ucfrec.reporting.plot_style import OURS, PAGE, PLAIN, save, styled
 from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.spread import AVERAGING, BACK
 
 
 @styled
 def draw(files: Mapping[str, Sequence[ResultRow]], order: Sequence[str], folder: Path) -> None:
-    """Draw the returns in each simulator of Table 2, and control's scores.
+    """Draw the returns in each simulator of Table 2, control's scores, and those of checkpoints.
 
     Args:
         files: rows by the name of their file.
@@ -30,6 +31,8 @@ def draw(files: Mapping[str, Sequence[ResultRow]], order: Sequence[str], folder:
         rows = [row for row in files["control"] if row.table == table]
         label = "normalized score (mean ± sd over training seeds)"
         _panels(rows, "task", label, folder, f"control-{table}")
+    if files["control_spread"]:
+        _checkpoints(files["control_spread"], folder, "control-spread")
     for drawn in folder.glob("*.png"):
         drawn.unlink()
 
@@ -48,6 +51,26 @@ def _panels(rows: Sequence[ResultRow], by: str, label: str, folder: Path, name: 
     for axes in panels[len(groups) :]:
         axes.set_visible(False)
     figure.supxlabel(label, fontsize=8)
+    save(figure, folder, name)
+
+
+def _checkpoints(rows: Sequence[ResultRow], folder: Path, name: str) -> None:
+    """A panel for each file: the scores of every training's last checkpoints, raw and averaged."""
+    files = grouped(rows, lambda row: row.task.removesuffix("-zoo"))
+    figure = Figure(figsize=(PAGE, 2.2))
+    panels = figure.subplots(1, len(files), sharey=True, squeeze=False).ravel()
+    for axes, (title, own) in zip(panels, files.items(), strict=True):
+        axes.set_title(title)
+        seeds = sorted({row.training_seed for row in own if row.training_seed is not None})
+        axes.set_xticks(seeds, [f"seed {seed}" for seed in seeds])
+        for weights, color, aside in (("raw", PLAIN, -0.15), ("averaged", OURS, 0.15)):
+            shown = [row for row in own if row.conditions[AVERAGING] == weights]
+            at = [(row.training_seed or 0) + aside for row in shown]
+            last = [row.conditions[BACK] == 0 for row in shown]
+            sizes = [26 if each else 7 for each in last]
+            axes.scatter(at, [row.value for row in shown], sizes, color=color, label=weights)
+    panels[0].set_ylabel("normalized score")
+    panels[0].legend(loc="best")
     save(figure, folder, name)
 
 

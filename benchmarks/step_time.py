@@ -19,7 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ucfrec.arrays import Float64Array
 from ucfrec.episodes.windows import Windows
+from ucfrec.fitting.average import WeightAverage
 from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
@@ -33,6 +35,8 @@ RESULTS = Path("runs/step_time/results.jsonl")
 SIZES = {"state": 91, "action": 27, "items": 0}
 POLICIES = ("dt", "dc", "lsdt", "ucf", "dt4rec", "cdt4rec", "edt4rec", "sasrec", "bc")
 REFERENCE = "reference_dc"
+AVERAGED = "-averaged"
+"""End of the names of policies whose weights are averaged."""
 
 
 def windows(batch: int, context: int) -> Windows:
@@ -50,13 +54,17 @@ def windows(batch: int, context: int) -> Windows:
 Step = Callable[[], None]
 
 
-def step_of(policy: SequencePolicy, batch: Windows) -> Step:
-    """A training step of one of our policies."""
+def step_of(policy: SequencePolicy, batch: Windows, decay: float = 0.0) -> Step:
+    """A training step of one of our policies, with its weights averaged if `decay` is not 0."""
     optimizer = RowAdamW(policy.parameters(), fused=True)
+    average = WeightAverage(policy, decay) if decay else None
 
     def step() -> None:
         value, _ = policy.loss(batch)
+        moved = None if average is None else average.before_step()
         descend(value, policy, optimizer)
+        if average is not None and moved is not None:
+            average.after_step(moved)
 
     return step
 
@@ -98,6 +106,12 @@ def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer) -
     optimizer.step()
 
 
+def quantiles(times: Float64Array, others: Float64Array) -> Float64Array:
+    """10% quantile, median and 90% quantile of the ratio of times of the same rounds."""
+    found: Float64Array = np.quantile(times / others, [0.1, 0.5, 0.9])
+    return found
+
+
 def seconds(step: Step) -> float:
     """CPU seconds of a step."""
     began = time.thread_time()
@@ -113,6 +127,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20, help="timed rounds (default: 20)")
     parser.add_argument("--policy", action="append", choices=POLICIES, help="repeatable (all)")
     parser.add_argument(
+        "--average",
+        type=float,
+        default=0.0,
+        metavar="DECAY",
+        help="also time steps that average the weights, as train.average (off)",
+    )
+    parser.add_argument(
         "--reference", type=Path, metavar="CLONE", help="Decision ConvFormer's code"
     )
     parser.add_argument(
@@ -127,17 +148,24 @@ def main() -> None:
         settings = [f"policy.dim={options.dim}", f"policy.context={options.context}"]
         config = resolve_config(name, None, settings).policy
         steps[name] = step_of(policy_class(name)(config, SIZES), batch)
+        if options.average:
+            averaged = policy_class(name)(config, SIZES)
+            steps[f"{name}{AVERAGED}"] = step_of(averaged, batch, options.average)
     if options.reference is not None:
         steps[REFERENCE] = reference_step(options.reference, options.dim, batch)
     taken = np.array(
         [[seconds(step) for step in steps.values()] for _ in range(options.rounds + 2)][2:]
     )
     times = dict(zip(steps, taken.T, strict=True))
+    for name in steps:
+        if name.endswith(AVERAGED):
+            low, middle, high = quantiles(times[name], times[name.removesuffix(AVERAGED)])
+            print(f"{name}: {middle:.3f} [{low:.3f}, {high:.3f}] times the step without averaging")
     peers = {f"ratio_to_{peer}": peer for peer in ("dc", REFERENCE) if peer in steps}
     sizes = {name: getattr(options, name) for name in ("dim", "context", "batch", "rounds")}
     lines = []
     for name, own in times.items():
-        low, middle, high = np.quantile(own / times["dt"], [0.1, 0.5, 0.9])
+        low, middle, high = quantiles(own, times["dt"])
         of_peers = {key: float(np.median(own / times[peer])) for key, peer in peers.items()}
         of_reference = f"{of_peers[f'ratio_to_{REFERENCE}']:.3f}" if REFERENCE in steps else "–"
         dt_ratio = f"{middle:.2f} [{low:.2f}, {high:.2f}]"
@@ -147,7 +175,7 @@ def main() -> None:
             table="step-time",
             task="random windows",
             method=name,
-            policy=name,
+            policy=name.removesuffix(AVERAGED),
             conditions=sizes,
             metric="ratio",
             metrics={"ratio": middle, "ratio_10": low, "ratio_90": high, **of_peers},

@@ -19,6 +19,8 @@ CONTROL = Program(
         "train": "train a policy on a store; resumes",
         "evaluate": "normalised scores of trained policies",
         "benchmark": "every method on the zoo files; resumes",
+        "spread": "how much scores vary between trainings and checkpoints; resumes",
+        "contexts": "contexts by score, with other episodes; resumes",
         "rates": "learning rates by validation loss; resumes",
         "robustness": "scores lost to distractors; resumes",
         "reproduce": "one table or figure of the paper; resumes",

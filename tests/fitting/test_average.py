@@ -1,6 +1,7 @@
 """Averaged weights: the formula, tables whose rows rest, resuming, what is saved."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.support.together import together
+from ucfrec.fitting import distributed
 from ucfrec.fitting.average import WeightAverage
-from ucfrec.fitting.checkpoint import load_tensors, load_trained
+from ucfrec.fitting.checkpoint import load_tensors, load_trained, save_tensors
 from ucfrec.fitting.loop import LoopConfig, fit
 
 AVERAGED = LoopConfig(
@@ -36,6 +39,10 @@ def draw(generator: np.random.Generator) -> Tensor:
     return torch.from_numpy(generator.integers(ROWS - 5, size=4))  # the last five rows never move
 
 
+def loss(module: nn.Module, rows: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    return (module(rows) - rows.float().unsqueeze(1) / ROWS).square().mean(), {}
+
+
 def train(
     folder: Path, config: LoopConfig = AVERAGED, stop_at: int | None = None, validated: bool = True
 ) -> tuple[Lookup, list[list[Tensor]]]:
@@ -50,13 +57,11 @@ def train(
             raise KeyboardInterrupt
         return draw(generator)
 
-    def loss(rows: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        return (module(rows) - rows.float().unsqueeze(1) / ROWS).square().mean(), {}
-
     def validate() -> float:
-        return float(loss(torch.arange(ROWS))[0])
+        return float(loss(module, torch.arange(ROWS))[0])
 
-    fit(module, stopping, loss, config, folder, seed=0, validate=validate if validated else None)
+    given = module, stopping, partial(loss, module), config, folder
+    fit(*given, seed=0, validate=validate if validated else None)
     return module, seen
 
 
@@ -89,6 +94,35 @@ def test_an_interrupted_training_ends_with_the_same_bits(tmp_path: Path) -> None
         other, _ = load_tensors(tmp_path / "parts" / name)
         assert one.keys() == other.keys()
         assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_processes_that_train_together_have_the_same_averages(tmp_path: Path) -> None:
+    """Also of rows that a batch moves in one of the processes only."""
+
+    def work(folder: Path) -> None:
+        module, own = Lookup(), distributed.share(AVERAGED.batch_size)
+
+        def validate() -> float:  # inside, the weights are the averages
+            save_tensors(folder / f"{distributed.rank()}.safetensors", module.state_dict(), {})
+            return 0.0
+
+        fit(
+            *(module, lambda generator: draw(generator)[own], partial(loss, module)),
+            *(AVERAGED, folder),
+            seed=0,
+            validate=validate,
+            rows=lambda batch: float(len(batch)),
+        )
+
+    work(tmp_path / "one")
+    together(2, lambda: work(tmp_path / "two"), tmp_path)
+    alone, first, second = (
+        load_tensors(tmp_path / file)[0]
+        for file in ("one/0.safetensors", "two/0.safetensors", "two/1.safetensors")
+    )
+    for name, mean in alone.items():
+        assert torch.equal(first[name], second[name])
+        torch.testing.assert_close(first[name], mean, rtol=1e-3, atol=1e-4)
 
 
 def test_averaging_does_not_change_the_training_itself(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Budget:
-    """The size of a benchmark; every budget measures all methods."""
+    """The size of a benchmark."""
 
     name: str
     tasks: tuple[str, ...]
@@ -91,6 +91,8 @@ class Budget:
     """Further settings of single policies, by name."""
     of_methods: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Further settings of single methods, by name; they win over the method's own."""
+    methods: tuple[str, ...] = ()
+    """Methods that are measured where none are named; empty for all of the table."""
     fewer_seeds: Mapping[str, int] = field(default_factory=dict)
     """Training seeds of methods and tasks that have fewer, by name."""
     seeds_in: Mapping[str, int] = field(default_factory=dict)

@@ -1,10 +1,10 @@
 """Options shared by the benchmark commands of `ucfrec` and `ucfrec-control`."""
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError, damage_explained
@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell
     from ucfrec.benchmark.estimate import Costs
     from ucfrec.benchmark.grid import Measurement
+
+
+BUDGETS: Final = {
+    "small": "for two CPU cores",
+    "full": "larger logs, more seeds and training steps",
+}
+"""What the budgets of benchmarks are, by name."""
 
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
@@ -51,20 +58,24 @@ def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> Non
 
 
 def budget_options(
-    parser: argparse.ArgumentParser, task: str = "--task", seeds: str = "--training-seeds"
+    parser: argparse.ArgumentParser,
+    task: str = "--task",
+    seeds: str = "--training-seeds",
+    budgets: Mapping[str, str] = BUDGETS,
 ) -> None:
     """Add the options that select what a benchmark measures, and how much of it.
 
     Args:
         task: name of the option for tasks, kept as `tasks`.
         seeds: name of the option for the number of training seeds, kept as `training_seeds`.
+        budgets: what each budget is, by name; the first is the default.
     """
     parser.add_argument(
         "--budget",
-        choices=["small", "full"],
-        default="small",
-        help="small (for two CPU cores) or full (larger logs, more seeds and training steps) "
-        "(default: small)",
+        choices=list(budgets),
+        default=next(iter(budgets)),
+        help=f"{', '.join(f'{name} ({what})' for name, what in budgets.items())} "
+        f"(default: {next(iter(budgets))})",
     )
     for name, kept in ((task, "tasks"), ("--method", "methods")):
         parser.add_argument(

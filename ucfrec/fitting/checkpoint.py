@@ -135,9 +135,22 @@ def load_trained(path: Path) -> dict[str, Tensor]:
         InputError: the file is missing or damaged.
     """
     tensors, counters = load_tensors(path)
-    weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
+    weights = _raw(tensors)
     with damage_explained(path, REMEDY):
         return weights | averages(tensors, weights, counters)
+
+
+def load_raw(path: Path) -> dict[str, Tensor]:
+    """The weights in a file of `save_training` as they were at its step, without averaging.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    return _raw(load_tensors(path)[0])
+
+
+def _raw(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
 
 
 def _require_shapes(

@@ -5,6 +5,7 @@ from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec_control.benchmark.methods import (
+    CONTEXTS,
     EQUAL_TIME,
     LAMBDA,
     LONGER,
@@ -12,8 +13,11 @@ from ucfrec_control.benchmark.methods import (
     PURSUING,
     RATES,
     ROBUSTNESS,
+    SPREAD,
     TABLES,
+    WITH_HISTORY,
     WITH_TIME,
+    WITHOUT_TIME,
 )
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 
@@ -33,13 +37,24 @@ MEDIUM: Final = tuple(f"{task}_medium-zoo" for task in _TASKS)
 _SWEPT: Final = ("hopper_medium-zoo", "halfcheetah_medium-zoo")
 """Files of Tables 9 and 10."""
 _TRIED: Final = ("halfcheetah_medium-expert-zoo", "hopper_medium-zoo", "walker2d_mixed-zoo")
-"""Files of the search for learning rates: each task and each kind of data once."""
+"""Files of the searches for learning rates and contexts: each task and kind of data once."""
+_SPREAD: Final = ("hopper_medium-zoo", "walker2d_medium-zoo", "hopper_mixed-zoo")
+"""Files on which scores vary most between trainings."""
 _FEWER: Final = {
     **{table: _SWEPT for table in TABLES if table not in (MAIN, PURSUING, EQUAL_TIME, LAMBDA)},
     ROBUSTNESS: MEDIUM,
     RATES: _TRIED,
+    CONTEXTS: _TRIED,
+    SPREAD: _SPREAD,
 }
-TRIED_RATES: Final = {"small": (2e-3, 6e-3, 2e-2), "full": (1e-4, 3e-4, 1e-3)}
+TRIED_CONTEXTS: Final = (8, 20)
+SEARCH_SEED: Final = 2000
+"""Seed of the episodes by which contexts are chosen, other than that of reported scores."""
+TRIED_RATES: Final = {
+    "small": (2e-3, 6e-3, 2e-2),
+    "medium": (3e-4, 1e-3, 3e-3),
+    "full": (1e-4, 3e-4, 1e-3),
+}
 """Learning rates that are tried, by the name of the budget."""
 BUDGETS: Final = {
     # Batches, steps and width are reduced; no file and no method is excluded.
@@ -80,6 +95,38 @@ BUDGETS: Final = {
         # one seed says what they cost.
         fewer_seeds=dict.fromkeys(("cql", *WITH_TIME), 1),
     ),
+    # Trainings long enough to tell methods apart: averaged weights, ten times as many windows as
+    # the small budget and twice its width. Few enough for one computer in a day.
+    "medium": Budget(
+        name="medium",
+        tasks=ZOO,
+        tasks_of=_FEWER,
+        methods=WITHOUT_TIME,
+        seeds=2,
+        seeds_in={ROBUSTNESS: 2, RATES: 1, CONTEXTS: 1, SPREAD: 4},
+        evaluation=Evaluation(episodes=50, seed=1000),
+        settings=(
+            "train.steps=10000",
+            "train.batch_size=64",
+            "train.warmup_steps=500",
+            "train.validate_every=1000",
+            "train.learning_rate=1e-3",
+            "train.cosine=false",
+            "train.average=0.999",
+            "policy.dim=128",
+            "policy.context=8",
+            "crm.epochs=3",
+            "crm.learning_rate=4e-3",
+            "csg.epochs=5",
+        ),
+        of_policies={
+            # As many predictions per update as 64 windows of 8 steps.
+            "bc": ("train.batch_size=512", "policy.context=1"),
+            "iql": ("steps=200000",),
+            "cql": ("steps=50000",),
+        },
+        of_methods=_longer(10_000),
+    ),
     # Seeds, episodes, steps, widths and targets of the paper and of each method's authors.
     "full": Budget(
         name="full",
@@ -100,11 +147,15 @@ def budget_of(table: str, name: str) -> Budget:
     """The budget `name` of a table of scores, of the robustness table or of the search for rates,
     with its tasks as `Budget.tasks`."""
     budget = BUDGETS[name]
+    methods_of = {MAIN: budget.methods, SPREAD: budget.methods, CONTEXTS: WITH_HISTORY}
+    searched = replace(budget.evaluation, seed=SEARCH_SEED)
+    evaluation = searched if table == CONTEXTS else budget.evaluation
     every = budget.evaluation.all_targets and table in (MAIN, PURSUING, EQUAL_TIME)
     return replace(
         budget,
         tasks=budget.tasks_in(table),
         tasks_of={},
         seeds=budget.seeds_in.get(table, budget.seeds),
-        evaluation=replace(budget.evaluation, all_targets=every),
+        methods=methods_of.get(table, ()),
+        evaluation=replace(evaluation, all_targets=every),
     )

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 from ucfrec.benchmark.cells import Method, augmented_ucf
 
-SCORES, ROBUSTNESS, RATES = "control", "robustness", "rates"
+SCORES, ROBUSTNESS, RATES, SPREAD = "control", "robustness", "rates", "spread"
+CONTEXTS = "contexts"
 """Suites of the rows."""
 Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"
@@ -38,6 +39,13 @@ METHODS: Methods = {
 UCF's preset has no embedding of time steps, the presets of DT, DC and LSDT have one; `ucf-w-time`
 and `…-wo-time` are the reverse. `ucf-wo-arch` has none, as UCF.
 """
+WITHOUT_TIME = (
+    *("ucf", "ucf-wo-count", "dc-wo-time", "dt-wo-time", "lsdt-wo-time"),
+    *("bc", "bc-10", "bc-25"),
+)
+"""Methods of a training long enough to be trusted: one of each architecture, and cloning."""
+WITH_HISTORY = ("ucf-wo-count", "dc-wo-time", "dt-wo-time", "lsdt-wo-time")
+"""One of those of each policy that takes a history."""
 WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
 """Methods with embeddings of time steps of which there is one without."""
 

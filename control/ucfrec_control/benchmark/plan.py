@@ -10,11 +10,22 @@ from ucfrec.benchmark.grid import chosen
 from ucfrec.benchmark.plan import Plan, Presets
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec_control.benchmark.budgets import TRIED_RATES
-from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
-from ucfrec_control.benchmark.methods import RATES, ROBUST, ROBUSTNESS, SCORES, TABLES
+from ucfrec_control.benchmark.budgets import TRIED_CONTEXTS, TRIED_RATES
+from ucfrec_control.benchmark.measure import CONTEXT, DISTRACTOR, RATE
+from ucfrec_control.benchmark.methods import (
+    CONTEXTS,
+    MAIN,
+    RATES,
+    ROBUST,
+    ROBUSTNESS,
+    SCORES,
+    SPREAD,
+    TABLES,
+)
 from ucfrec_control.benchmark.rates import SEARCHED, settings_of
+from ucfrec_control.benchmark.spread import BACK
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
+from ucfrec_control.training.kept import KEPT, kept_steps
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
 
@@ -38,12 +49,54 @@ def score_cells(
     Raises:
         InputError: a file is missing, or a method is not in the table.
     """
-    selected = _selected(TABLES[table], methods)
+    selected = _selected(TABLES[table], methods or budget.methods)
     plan = _plan(SCORES, folder, budget)
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
             store = zoo_store(data, stores_of(folder), file)
             yield from plan.trained(table, Task(file, store), selected)
+
+
+def context_cells(
+    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = ()
+) -> Iterator[Cell]:
+    """The cells of methods of the main table with each of `TRIED_CONTEXTS`; arguments and errors as
+    of `score_cells`, which shares the runs of the context that it is given."""
+    names = methods or budget.methods
+    for context in TRIED_CONTEXTS:
+        given = with_contexts(budget, dict.fromkeys(names, context))
+        for cell in score_cells(data, folder, given, MAIN, names):
+            yield replace(cell, suite=CONTEXTS, table=CONTEXTS, conditions={CONTEXT: context})
+
+
+def with_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
+    """`budget` with contexts of single methods."""
+    settings = dict(budget.of_methods)
+    for name, context in contexts.items():
+        settings[name] = (*settings.get(name, ()), f"policy.context={context}")
+    return replace(budget, of_methods=settings)
+
+
+def spread_cells(
+    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = (), checkpoints: int = KEPT
+) -> Iterator[Cell]:
+    """A cell for each of the last checkpoints of the trainings of the main table.
+
+    Args:
+        data, folder, budget, methods: as of `score_cells`, whose runs they share.
+        checkpoints: number of last checkpoints, at most `KEPT`.
+
+    Raises:
+        InputError: as `score_cells`, or a method is trained without averaging.
+    """
+    for cell in score_cells(data, folder, budget, MAIN, methods):
+        if cell.policy in ALGORITHMS or not cell.config.train.average:
+            raise InputError(
+                f"{cell.method} of budget {budget.name} is trained without train.average, so it "
+                "has no averaged weights; name another --method, or --budget medium"
+            )
+        for back in range(min(checkpoints, len(kept_steps(cell.config.train)))):
+            yield replace(cell, suite=SPREAD, table=SPREAD, conditions={BACK: back})
 
 
 def robustness_cells(

@@ -16,10 +16,10 @@ from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
 from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.benchmark.rates import chosen_rates
 from ucfrec_control.commands.options import (
+    choices_options,
     control_grid_options,
     data_given,
     narrowed,
-    rates_option,
 )
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="every method (main), ways to pursue reward, all trained for as long as DT or "
         "LSDT (equal-time), or a sweep over UCF's settings",
     )
-    rates_option(parser)
+    choices_options(parser)
     control_grid_options(parser)
 
 

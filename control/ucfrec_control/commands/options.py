@@ -4,16 +4,25 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from ucfrec.benchmark.cells import Budget
 from ucfrec.commands.grid_options import budget_options, grid_options
 from ucfrec.errors import InputError, one_line
+from ucfrec_control.benchmark.methods import METHODS
+from ucfrec_control.benchmark.plan import with_contexts
 from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import find_task
 
+BUDGETS: Final = {
+    "small": "a quick look: policies have not learned all they can",
+    "medium": "averaged weights, 16 times the windows; about 20 core hours for the main table",
+    "full": "the steps, seeds and episodes of the papers",
+}
+"""What the budgets are, by name."""
 MAX_RETURN = "max"
 """`--target` for the largest return that the policy expects in each state."""
 
@@ -32,14 +41,35 @@ def source_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
 
 
-def rates_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option for learning rates other than those of the package."""
+def choices_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options for what `rates` and `contexts` chose."""
     parser.add_argument(
         "--rates",
         type=Path,
         metavar="TOML",
         help="learning rates that `ucfrec-control rates --toml` wrote (those of the package)",
     )
+    parser.add_argument(
+        "--context",
+        dest="contexts",
+        type=context_given,
+        action="append",
+        default=[],
+        metavar="METHOD=STEPS",
+        help="steps of history of a method, as `contexts` prints it; repeatable (the budget's)",
+    )
+
+
+def context_given(text: str) -> tuple[str, int]:
+    """The value of `--context`.
+
+    Raises:
+        ArgumentTypeError: `text` is not METHOD=STEPS.
+    """
+    method, _, steps = text.partition("=")
+    if method not in METHODS or not steps.isdecimal() or not 1 <= int(steps[:6]) <= 1000:
+        raise argparse.ArgumentTypeError(f"{text:.40} is not METHOD=STEPS, as in ucf=8")
+    return method, int(steps)
 
 
 def data_option(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +92,7 @@ def data_given(options: argparse.Namespace) -> Path:
 def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -> None:
     """Add the options for what a benchmark measures, and where it keeps its runs and rows."""
     if budget:
-        budget_options(parser, "--file", "--seeds")
+        budget_options(parser, "--file", "--seeds", BUDGETS)
     grid_options(parser, "runs/control", 1)
 
 
@@ -92,7 +122,7 @@ def describe_source(trajectories: Trajectories) -> str:
 
 
 def narrowed(budget: Budget, options: argparse.Namespace) -> Budget:
-    """`budget` with the files, seeds and rates of the options.
+    """`budget` with the files, seeds, rates and contexts of the options.
 
     Raises:
         InputError: `--seeds` is below 1, or the file of `--rates` has none of the budget.
@@ -100,7 +130,8 @@ def narrowed(budget: Budget, options: argparse.Namespace) -> Budget:
     found = budget.narrowed(
         options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
     )
-    return dataclasses.replace(found, rates=_rates_given(options))
+    found = dataclasses.replace(found, rates=_rates_given(options))
+    return with_contexts(found, dict(options.contexts))
 
 
 def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:

@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, help="updates of a training (the budget's)")
     parser.add_argument("--toml", type=Path, metavar="FILE", help="write the choice here")
     control_grid_options(parser)
-    parser.set_defaults(rates=None)
+    parser.set_defaults(rates=None, contexts=[])
 
 
 def run(options: argparse.Namespace) -> None:

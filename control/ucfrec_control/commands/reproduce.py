@@ -17,11 +17,12 @@ from ucfrec_control.benchmark.reproduce import (
 )
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import (
+    BUDGETS,
+    choices_options,
     control_grid_options,
     data_given,
     data_option,
     narrowed,
-    rates_option,
 )
 from ucfrec_control.commands.robustness import print_robustness
 
@@ -30,14 +31,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `reproduce`."""
     parser.add_argument("part", choices=list(PARTS), help="table or figure of the paper")
     data_option(parser)
-    parser.add_argument("--budget", default="small", choices=["small", "full"])
+    parser.add_argument("--budget", default="small", choices=list(BUDGETS))
     parser.add_argument(
         "--seeds",
         dest="training_seeds",
         type=int,
         help="number of training seeds (default: set by --budget)",
     )
-    rates_option(parser)
+    choices_options(parser)
     control_grid_options(parser, budget=False)
     parser.set_defaults(tasks=[], evaluation_seed=None)
 

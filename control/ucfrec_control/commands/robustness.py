@@ -24,18 +24,18 @@ from ucfrec_control.benchmark.robustness import (
     screening_rows,
 )
 from ucfrec_control.commands.options import (
+    choices_options,
     control_grid_options,
     data_given,
     data_option,
     narrowed,
-    rates_option,
 )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
     data_option(parser)
-    rates_option(parser)
+    choices_options(parser)
     control_grid_options(parser)
 
 

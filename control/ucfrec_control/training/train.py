@@ -9,6 +9,7 @@ from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
@@ -81,17 +82,18 @@ def train_control(
     *,
     screening: str | None = None,
     shared: SharedStages = OWN,
+    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
     """`ucfrec.runs.screened.train_screened` on a control store.
 
     Args:
         out: run folder; an interrupted run resumes.
         screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
-        shared: as `ucfrec.runs.run.train_run` has it.
+        shared, callbacks: as `ucfrec.runs.run.train_run` has them.
 
     Raises:
         InputError: as `train_screened`, or the store is not a control store.
     """
     dataset_of(store)
     about = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, about, shared)
+    return train_screened(store, out, config, screening, about, shared, callbacks)

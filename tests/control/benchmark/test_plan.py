@@ -1,5 +1,6 @@
 """Every table's cells are what their names say, and %BC goes through the benchmark."""
 
+from argparse import ArgumentTypeError
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -14,9 +15,10 @@ from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
 from ucfrec.results.rows_file import read_rows
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of
-from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
+from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, TRIED_CONTEXTS, budget_of
+from ucfrec_control.benchmark.measure import CONTEXT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import (
+    CONTEXTS,
     EQUAL_TIME,
     MAIN,
     METHODS,
@@ -26,9 +28,11 @@ from ucfrec_control.benchmark.methods import (
     ROBUSTNESS,
     SCREENED,
     TABLES,
+    WITH_HISTORY,
 )
-from ucfrec_control.benchmark.plan import score_cells
+from ucfrec_control.benchmark.plan import context_cells, score_cells, with_contexts
 from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.training.evaluate import load_run
@@ -52,7 +56,7 @@ def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     }
 
 
-@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("size", BUDGETS)
 @pytest.mark.parametrize("table", TABLES)
 def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
     budget = budget_of(table, size)
@@ -90,7 +94,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert (main["ucf"].augment.copies > 0, main["dt"].augment.copies) == (True, 0)
     assert main["ucf-wo-arch"].policy_name == "dt"
     assert main["ucf-wo-arch"].augment.copies > 0
-    for size in ("small", "full"):
+    for size in BUDGETS:
         timed = resolved(EQUAL_TIME, BUDGETS[size], file)
         steps = {name: config.train.steps for name, config in timed.items()}
         assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
@@ -108,7 +112,7 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
-@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("size", BUDGETS)
 def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
     """They share their runs."""
     for file in budget_of("gate", size).tasks:
@@ -133,6 +137,36 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
     assert trained.items() <= METHODS.items()
     assert {replace(method, screening=None) for method in SCREENED.values()} == {METHODS["ucf"]}
     assert len(budget_of(ROBUSTNESS, "full").tasks) == 3, "Appendix G.4"
+
+
+def test_contexts_are_chosen_with_other_episodes_in_runs_of_the_main_table(tmp_path: Path) -> None:
+    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8))
+    made = {"tasks": ("hopper_medium-made",), "tasks_of": {}}
+    budget = replace(budget_of(CONTEXTS, "medium"), **made)
+    cells = list(context_cells(tmp_path, tmp_path / "out", budget))
+    assert {cell.method for cell in cells} == set(WITH_HISTORY)
+    assert {cell.conditions[CONTEXT] for cell in cells} == set(TRIED_CONTEXTS)
+    reported = replace(budget_of(MAIN, "medium"), **made)
+    assert {cell.evaluation.seed for cell in cells} != {reported.evaluation.seed}
+    chosen = with_contexts(reported, {"dc-wo-time": 20})
+    runs = {
+        cell.method: (cell.run, cell.config.policy.context)
+        for cell in score_cells(tmp_path, tmp_path / "out", chosen, MAIN)
+        if cell.training_seed == 0
+    }
+    for cell in cells:
+        assert cell.config.policy.context == cell.conditions[CONTEXT]
+        shared = (cell.run, cell.config.policy.context) == runs[cell.method]
+        assert shared == ((cell.method, cell.conditions[CONTEXT]) == ("dc-wo-time", 20))
+    assert {runs[name][1] for name in ("ucf", "dt-wo-time")} == {8}
+    assert {runs[name][1] for name in ("bc", "bc-10", "bc-25")} == {1}
+
+
+@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
+def test_what_is_no_context_is_refused(given: str) -> None:
+    assert context_given("ucf=20") == ("ucf", 20)
+    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
+        context_given(given)
 
 
 @pytest.mark.slow

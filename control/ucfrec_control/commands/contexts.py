@@ -1,0 +1,56 @@
+"""`ucfrec-control contexts`: which context each method scores best with; resumes."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+
+from ucfrec.benchmark.cells import Cell
+from ucfrec.benchmark.tables import over_seeds
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.reporting.statistics import grouped, summary
+from ucfrec.reporting.tables import format_rows
+from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec_control.benchmark.costs import costs
+from ucfrec_control.benchmark.measure import CONTEXT, SCORE_MEASUREMENT
+from ucfrec_control.benchmark.methods import CONTEXTS
+from ucfrec_control.benchmark.plan import context_cells
+from ucfrec_control.commands.options import (
+    control_grid_options,
+    data_given,
+    data_option,
+    narrowed,
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `contexts`."""
+    data_option(parser)
+    control_grid_options(parser)
+    parser.set_defaults(budget="medium", rates=None, contexts=[])
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run `ucfrec-control contexts`."""
+    budget = narrowed(budget_of(CONTEXTS, options.budget), options)
+
+    def cells() -> Iterator[Cell]:
+        return context_cells(data_given(options), options.out, budget, options.methods)
+
+    rows = rows_of(options, CONTEXTS, (), cells, SCORE_MEASUREMENT, costs)
+    with rows_explained(options):
+        last = [row for row in rows if row.checkpoint == "last"]
+        by, values = ("task", "method", CONTEXT), ("score", "validation_loss")
+        print(format_rows(over_seeds([row.as_line() for row in last], by, values), (*by, *values)))
+        print(f"\nhighest mean score: {' '.join(_chosen(last))}\nrows: {results_given(options)}")
+
+
+def _chosen(rows: Sequence[ResultRow]) -> list[str]:
+    """The option `--context` for each method: the context with the highest mean over files."""
+    found = []
+    for method, own in grouped(rows, lambda row: row.method).items():
+        means = {
+            context: summary(row.value for row in each).mean
+            for context, each in grouped(own, lambda row: row.conditions[CONTEXT]).items()
+        }
+        found.append(f"--context {method}={max(means, key=lambda context: means[context])}")
+    return found

@@ -23,8 +23,10 @@ from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 
-_MOST_STEPS = 4000
-"""Validation rows that are ranked at most."""
+_FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
+"""Validation rows that are ranked at most, in large and in small catalogues …"""
+_SCORES = 2e8
+"""… and in between, as many as have so many scores. Hits are rare: few rows say little of a rule."""
 _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
 _PRIOR = 10.0
@@ -35,9 +37,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     """Choose the reward weight of the rule; its other parts stay.
 
     Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
-    cannot be distinguished the one with the most hits; without any, no reward weight. If the next
-    larger of the candidates overlaps too little, reward weights between the two are tried. The
-    first candidates are the configured ones; of more than 4,000 validation rows, so many are drawn.
+    cannot be distinguished the one with the most hits; without any, those count whose hits cannot
+    be distinguished from the most. If the next larger of the candidates overlaps too little, reward
+    weights between the two are tried. The first candidates are the configured ones; of many
+    validation rows, 4,000 to 20,000 are drawn.
     """
     scorer, tried = problem.scorer, list[_Tried]()
     rows = _Rows.of(problem.train, problem.validation, problem.seed)
@@ -68,7 +71,7 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
         candidates=[each.summary for each in tried],
         warning=""
         if best.overlaps
-        else "; WARNING: no candidate does, this one has no reward weight",
+        else "; WARNING: no candidate does, this one is among those with the most hits",
         details={"reward_weights_of_halves": halves},
     )
 
@@ -129,10 +132,12 @@ def _error_of_sum(values: Float64Array, users: IntArray) -> float:
 
 
 def _best(tried: Sequence[_Tried]) -> _Tried:
-    """The rule to choose; the first if none overlaps enough."""
+    """The rule to choose; if none overlaps enough, of those that hit as often as any."""
     allowed = [each for each in tried if each.overlaps]
     if not allowed:
-        return tried[0]
+        most = max((each.summary for each in tried), key=lambda each: each.gain)
+        enough = most.gain - most.gain_error
+        allowed = [each for each in tried if each.summary.gain >= enough]
     top = max(allowed, key=lambda each: each.summary.item_rate)
     level = [each for each in allowed if each.levels_with(top)]
     return max(level, key=lambda each: each.summary.hits)
@@ -157,8 +162,9 @@ class _Rows:
     @classmethod
     def of(cls, train: EpisodeStore, validation: EpisodeStore, seed: int) -> "_Rows":
         numbers = np.arange(validation.n_steps)
-        if len(numbers) > _MOST_STEPS:
-            drawn = np.random.default_rng(seed).choice(len(numbers), _MOST_STEPS, replace=False)
+        most = int(np.clip(_SCORES / len(train.item_states.embeddings), _FEWEST_STEPS, _MOST_STEPS))
+        if len(numbers) > most:
+            drawn = np.random.default_rng(seed).choice(len(numbers), most, replace=False)
             numbers = np.sort(drawn)
         episodes, steps = validation.locate(numbers)
         items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)

@@ -26,7 +26,7 @@ from ucfrec.episodes.store import EpisodeStore
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
 """Validation rows that are ranked at most, in large and in small catalogues …"""
 _SCORES = 2e8
-"""… and in between, as many as have so many scores. Hits are rare: few rows say little of a rule."""
+"""… and in between, as many as have so many scores. Few rows say little where hits are rare."""
 _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
 _PRIOR = 10.0

@@ -115,8 +115,8 @@ def explanation(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, OSError):
         return explain_os_error(error)
-    if isinstance(error, ModuleNotFoundError) and (extras := _extras_with(error.name or "")):
-        return f"{error.name} is not installed; install {' or '.join(extras)}"
+    if isinstance(error, ModuleNotFoundError) and (extra := _extra_with(error.name or "")):
+        return f"{error.name} is not installed; install ucfrec[{extra}]"
     text = str(error)
     if isinstance(error, MemoryError) or any(phrase in text for phrase in _NO_MEMORY):
         reason = f" ({text:.120})" if text else ""
@@ -129,12 +129,16 @@ def explanation(error: BaseException) -> str | None:
     return None
 
 
-def _extras_with(module: str) -> list[str]:
-    """The extras of ucfrec that bring a module which has the name of its distribution."""
+def _extra_with(module: str) -> str | None:
+    """The smallest extra of ucfrec that brings a module which has the name of its distribution."""
     name = re.escape(module.partition(".")[0].replace("_", "-"))
-    offered = re.compile(rf"{name}\b[^-].*; extra == .(?!dev|docs)(\w+).", re.IGNORECASE)
-    found = (offered.match(each) for each in metadata.requires("ucfrec") or ())
-    return [f"ucfrec[{match[1]}]" for match in found if match]
+    extras: dict[str, list[str]] = {}
+    for each in metadata.requires("ucfrec") or ():
+        if found := re.search(r"; extra == .(?!dev|docs)(\w+).", each):
+            extras.setdefault(found[1], []).append(each)
+    offered = re.compile(rf"{name}\b[^-]", re.IGNORECASE)
+    having = [extra for extra, own in extras.items() if any(map(offered.match, own))]
+    return min(having, key=lambda extra: len(extras[extra]), default=None)
 
 
 _NO_MEMORY: Final = (

@@ -25,6 +25,7 @@ KINDS = ("tangent", "faithful")
 SETTINGS = {
     "train.steps": "4", "train.validate_every": "2", "policy.dim": "16", "policy.context": "5",
     "crm.epochs": "3", "csg.epochs": "2", "csg.lambda_band": "1.0", "augment.epsilon_r": "1.0",
+    "augment.copies": "1",
 }  # fmt: skip
 
 

@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
+PLAIN = ("policy.exposure=false", "rule.choose=false")
+"""Settings of a method as its authors describe it: the best item at the largest training return."""
 METHODS: dict[str, tuple[str, ...]] = {
-    "bc": ("bc",),
-    "dt": ("dt",),
+    "bc": ("bc", *PLAIN),
+    "dt": ("dt", *PLAIN),
     SHARED: ("dt", "policy.exposure=true", "rule.choose=true"),
     "ucf-no-augmentation": ("ucf",),
     "ucf": ("ucf", "augment.copies=1"),

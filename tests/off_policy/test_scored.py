@@ -1,10 +1,12 @@
 """Estimates from scored rows are those from the logs that were scored."""
 
+import math
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -32,7 +34,7 @@ def scored_parts(folder: Path, trained: TrainedPolicy, out: Path, lacking: int) 
         frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
     (out / "scored").mkdir()
     for part, (begin, end) in enumerate(((0, 70), (70, 71), (71, len(frame)))):
-        table = scored.pa.Table.from_pandas(frame[begin:end], preserve_index=False)
+        table = pa.Table.from_pandas(frame[begin:end], preserve_index=False)
         table = table.replace_schema_metadata(about_scores(trained, RULE))
         pq.write_table(table, out / "scored" / f"part-{part}.parquet")
     return out / "scored"
@@ -89,6 +91,45 @@ def test_what_was_not_scored_by_the_run_and_rule_is_refused(
     shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
     with pytest.raises(InputError, match="not numbered in order"):
         estimated(parts)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "says"),
+    [
+        ("session", pa.string(), "column session has type string, not whole numbers"),
+        ("timestamp", pa.string(), "column timestamp has type string, not whole numbers"),
+        ("reward", pa.string(), "column reward has type string, not floating point numbers"),
+        ("propensity", 0.0, "propensities must be above 0"),
+        ("probability", 1e300, "lie between 0 and 1"),
+        ("probability", math.nan, "target is not finite"),
+    ],
+)
+def test_scored_rows_with_other_values_are_refused(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, column: str, values: object, says: str
+) -> None:
+    parts = scored_parts(folder, trained, tmp_path, 0)
+    file = next(iter(sorted(parts.iterdir())))
+    table = pq.read_table(file)
+    changed = (
+        table[column].cast(values)
+        if isinstance(values, pa.DataType)
+        else pa.array([values] * table.num_rows)
+    )
+    table = table.set_column(table.schema.get_field_index(column), column, changed)
+    pq.write_table(table, file)
+    with pytest.raises(InputError, match=says):
+        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
+
+
+def test_damaged_scored_rows_are_named(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    file = next(iter(sorted(scored_parts(folder, trained, tmp_path, 0).iterdir())))
+    content = bytearray(file.read_bytes())
+    content[100:400] = bytes(300)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=rf"{file.name} is damaged"):
+        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
 
 
 def test_the_command_reads_what_score_writes(

@@ -36,6 +36,10 @@ _USED: Final = (
     *(schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP),
     *(SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY),
 )
+_WHOLE: Final = (schema.TIMESTAMP, SESSION)
+_NUMBERS: Final = (schema.REWARD, schema.PROPENSITY, PROBABILITY)
+_ROUNDING: Final = 1e-6
+"""By how much a probability may be above 1."""
 _WEIGHED: Final = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
 _NOTES: Final = (
     "from scored rows: without models of the reward there is no DR",
@@ -105,6 +109,16 @@ def _files(paths: Sequence[Path], about: Mapping[str, str]) -> list[Path]:
                 f"{file} has no column {', '.join(lacking)}; name what ucfrec score made of logs "
                 "with propensities"
             )
+        for names, fits, kind in (
+            (_WHOLE, pa.types.is_integer, "whole numbers"),
+            (_NUMBERS, pa.types.is_floating, "floating point numbers"),
+        ):
+            for name in names:
+                if not fits(columns.field(name).type):
+                    raise InputError(
+                        f"{file}: column {name} has type {columns.field(name).type}, not {kind}; "
+                        "name what ucfrec score wrote, unchanged"
+                    )
         metadata = columns.metadata or {}
         for name, value in about.items():
             if (scored := metadata.get(name.encode(), b"").decode(errors="replace")) != value:
@@ -117,9 +131,15 @@ def _files(paths: Sequence[Path], about: Mapping[str, str]) -> list[Path]:
 
 def _batches(files: Sequence[Path], names: Sequence[str]) -> Iterator[dict[str, Array]]:
     for file in files:
-        with pq.ParquetFile(file) as source:
-            for batch in source.iter_batches(_BATCH_ROWS, columns=list(names)):
-                yield {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
+        try:
+            with pq.ParquetFile(file) as source:
+                for batch in source.iter_batches(_BATCH_ROWS, columns=list(names)):
+                    columns = {name: batch.column(name) for name in names}
+                    yield {n: each.to_numpy(zero_copy_only=False) for n, each in columns.items()}
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(
+                f"{file} is damaged ({one_line(str(error)):.200}); write it with ucfrec score again"
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -152,11 +172,16 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
             session=rows[SESSION] - rows[SESSION][0],
             reward=rows[schema.REWARD].astype(np.float64),
             propensity=rows[schema.PROPENSITY].astype(np.float64),
-            target=np.minimum(rows[PROBABILITY].astype(np.float64), 1.0),
+            target=_at_most_1(rows[PROBABILITY].astype(np.float64)),
             discount=discount,
         )
         yield _Chunk(steps, numbers)
         session, user, users = rows[SESSION][-1], owners[-1], int(numbers[-1]) + 1
+
+
+def _at_most_1(probabilities: Float64Array) -> Float64Array:
+    """The probabilities without rounding errors above 1."""
+    return np.where(probabilities < 1 + _ROUNDING, np.minimum(probabilities, 1.0), probabilities)
 
 
 def _whole_sessions(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:

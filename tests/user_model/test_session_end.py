@@ -65,8 +65,24 @@ def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
     inputs = logged.shown, items, logged.rewards, logged.steps
     again = SessionEnd.of(likeness, {**end.tensors})
     np.testing.assert_array_equal(again.probabilities(*inputs), end.probabilities(*inputs))
-    with pytest.raises(ValueError, match="beyond any input"):
-        SessionEnd.of(likeness, {**end.tensors, "inputs": end.tensors["inputs"] + 2**15})
+    with pytest.raises(ValueError, match="beyond the last input"):
+        SessionEnd.of(likeness, {**end.tensors, "inputs": end.tensors["inputs"] + 16})
+    for name, tensor in end.tensors.items():
+        with pytest.raises(ValueError, match=r"inputs|float64"):
+            SessionEnd.of(likeness, {**end.tensors, name: tensor.float()})
+    with pytest.raises(ValueError, match="leaves"):
+        SessionEnd.of(likeness, {**end.tensors, "leaves": end.tensors["leaves"][:, 1:]})
+
+
+def test_a_regression_of_other_inputs_is_refused() -> None:
+    likeness, logged = planted_ends(400)
+    end, report = SessionEnd.fit(likeness, logged, part_of(logged, slice(0)), 0)
+    assert report.kept == "constant"
+    again = SessionEnd.of(likeness, {**end.tensors})
+    assert again.tensors["bias"] == end.tensors["bias"]
+    for name, tensor in end.tensors.items():
+        with pytest.raises(ValueError, match=f"{name} does not fit"):
+            SessionEnd.of(likeness, {**end.tensors, name: tensor.repeat(2)})
 
 
 def test_all_items_at_once_end_sessions_as_each_alone() -> None:

@@ -21,6 +21,8 @@ _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
 _LAGS: Final = 6
 """Items shown before whose likeness counts."""
+_INPUTS: Final = 4 + _LAGS + 3 + 3
+"""Number of inputs; see `_columns`."""
 _REWARD: Final = 3
 """Number of the input that is the step's reward."""
 _REMEMBERED: Final = 10
@@ -142,11 +144,15 @@ class SessionEnd:
 
         Raises:
             KeyError: some are missing.
-            ValueError: they are no trees.
+            ValueError: they are neither trees nor a regression of these inputs.
         """
         if "thresholds" in tensors:
-            return cls(likeness, BoostedTrees.of(tensors).tensors())
-        return cls(likeness, {name: tensors[name] for name in _LOGISTIC})
+            return cls(likeness, BoostedTrees.of(tensors, _INPUTS).tensors())
+        found = {name: tensors[name] for name in _LOGISTIC}
+        for name, each in found.items():
+            if each.shape != (() if name == "bias" else (_INPUTS,)) or each.dtype != torch.float64:
+                raise ValueError(f"{name} does not fit the inputs")
+        return cls(likeness, found)
 
     def __post_init__(self) -> None:
         trees = BoostedTrees(**self.tensors) if "thresholds" in self.tensors else None

@@ -66,8 +66,11 @@ class BoostedTrees:
         return {name: getattr(self, name) for name in _TENSORS}
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Tensor]) -> Self:
+    def of(cls, tensors: Mapping[str, Tensor], count: int) -> Self:
         """From `tensors`; unlike those of `fit`, they may come from anywhere.
+
+        Args:
+            count: number of inputs.
 
         Raises:
             ValueError: they are no trees.
@@ -75,8 +78,10 @@ class BoostedTrees:
         inputs, thresholds, leaves, base = (tensors[name] for name in _TENSORS)
         if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
             raise ValueError("inputs are no numbers of inputs")
-        if bool(((inputs < 0) | (inputs >= 2**15)).any()):
-            raise ValueError("inputs are beyond any input")
+        if bool(((inputs < 0) | (inputs >= count)).any()):
+            raise ValueError("inputs are beyond the last input")
+        if any(each.dtype != torch.float64 for each in (thresholds, leaves, base)):
+            raise ValueError("thresholds, leaves and base are not float64")
         shapes = thresholds.shape, leaves.shape, base.shape
         if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
             raise ValueError("thresholds, leaves and base do not fit the inputs")

@@ -31,6 +31,7 @@ lint: .venv/dev  ## Style.
 
 types: .venv/dev  ## Types, strict.
 	$(BIN)/mypy
+	$(BIN)/mypy examples/*.py benchmarks/*.py
 
 docs: .venv/docs  ## Build the pages into build/docs; a broken link or reference fails.
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

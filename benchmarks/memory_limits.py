@@ -36,8 +36,10 @@ OBSERVATION = 1024
 """Numbers of an observation in the wide log."""
 ITEMS, ROWS_PER_USER, BATCH = 500, 20, 20_000
 START_MS = 1_700_000_000_000
-SMALL = ("train.steps=30", "train.validate_every=30", "policy.dim=32", "policy.context=5")
-SMALL += ("rule.choose=false", "augment.copies=0")
+SMALL = (
+    *("train.steps=30", "train.validate_every=30", "policy.dim=32", "policy.context=5"),
+    "rule.choose=false",
+)
 SECONDS = 0.02
 """Between two looks at the memory of a process."""
 

@@ -11,6 +11,7 @@ rows to results.jsonl in --out, or to --results, and prints the table of `ucfrec
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -76,14 +77,14 @@ def main() -> None:
     runs = []
     for policy in options.policy or ["ucf"]:
         runs.append(out / "-".join([policy, str(options.seed), *options.set]).replace("/", "-"))
-        about = ("--policy", policy, "--seed", str(options.seed), "--no-refit")
-        run("train", store, "--out", runs[-1], *about, *settings)
+        given = ("--policy", policy, "--seed", str(options.seed), "--no-refit")
+        run("train", store, "--out", runs[-1], *given, *settings)
     results = options.results or options.out / "results.jsonl"
     for folder in runs:
         run("rank", folder, "--json", folder.with_suffix(".json"))
-        about = {"suite": "next-period", "table": "next-period", "task": "kuairand"}
+        about: dict[str, Any] = dict.fromkeys(("suite", "table"), "next-period")
         rows = [
-            replace(row, **about, conditions={"days": days, "k": row["k"]})
+            replace(row, **about, task="kuairand", conditions={"days": days, "k": row["k"]})
             for row in read_results(folder.with_suffix(".json"))
         ]
         append_rows(results, [row for row in rows if row.config_hash is None])

@@ -72,6 +72,7 @@ def make_log(folder: Path, rows: int, seed: int) -> None:
                 writer.close()
             path = folder / f"log-{begin // FILE_ROWS:03d}.parquet"
             writer = pq.ParquetWriter(path, table.schema)
+        assert writer is not None
         writer.write_table(table)
     assert writer is not None
     writer.close()
@@ -182,7 +183,7 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
             found.append(measure(method, log, out, options.memory_limit))
             shutil.rmtree(out)
     median = {name: np.median(found, axis=0) for name, found in taken.items()}
-    lines = []
+    lines = list[tuple[str, ...]]()
     for method, found in taken.items():
         cpu, wall, peak = median[method]
         ratios = np.divide([c for c, _, _ in found], [c for c, _, _ in taken["prepare"]])
@@ -212,8 +213,8 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
         )
         append_rows(options.results, [row])
         about = f"{middle:.2f} [{low:.2f}, {high:.2f}]"
-        lines.append((f"{rows:,}", method, f"{cpu:.2f}", f"{cpu / rows * 1e6:.2f}", about))
-        lines[-1] += (f"{wall:.1f}", f"{metrics['peak_mib']:,.0f}")
+        times = f"{cpu:.2f}", f"{cpu / rows * 1e6:.2f}", about
+        lines.append((f"{rows:,}", method, *times, f"{wall:.1f}", f"{metrics['peak_mib']:,.0f}"))
     return lines
 
 

@@ -244,8 +244,9 @@ def estimates(rows: Sequence[ResultRow]) -> str:
     for environment, own in grouped(rows, lambda row: str(row.environment)).items():
         logs = grouped(own, lambda row: str(row.log_seed)).items()
         of_logs = ", ".join(f"log {name}: {off(group)}" for name, group in logs)
-        lines.append((environment, len(own), off(own), of_logs))
-    head = ("environment", "rows", "mean absolute error", "by log")
+        near = sum(abs(r.metrics["estimated_value"] - r.value) <= r.value / 10 for r in own)
+        lines.append((environment, len(own), near, off(own), of_logs))
+    head = ("environment", "rows", "within 10%", "mean absolute error", "by log")
     return f"{pivot(rows, cell)}\n\n{markdown_table(head, lines)}"
 
 

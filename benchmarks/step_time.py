@@ -72,12 +72,12 @@ def step_of(policy: SequencePolicy, batch: Windows, decay: float = 0.0) -> Step:
 def reference_step(clone: Path, dim: int, batch: Windows) -> Step:
     """A training step of Decision ConvFormer's own code, as its trainer takes it."""
     sys.path.insert(0, str(clone / "gym"))
-    from models.decision_convformer import DecisionConvFormer
+    from models.decision_convformer import DecisionConvFormer  # type: ignore[import-not-found]
 
     original = torch.Tensor.to
 
     def stays(tensor: Tensor, *args: object, **kwargs: object) -> Tensor:
-        return tensor if args == ("cuda",) else original(tensor, *args, **kwargs)  # type: ignore[call-overload,no-any-return]
+        return tensor if args == ("cuda",) else original(tensor, *args, **kwargs)  # type: ignore[call-overload]
 
     torch.Tensor.to = stays  # type: ignore[method-assign,assignment]  # it always asks for a GPU
     network = DecisionConvFormer(
@@ -91,9 +91,10 @@ def reference_step(clone: Path, dim: int, batch: Windows) -> Step:
         returns = batch.returns_to_go.unsqueeze(-1)
         predicted = network(batch.states, batch.actions, returns, batch.timesteps)
         steps = batch.mask.reshape(-1)
-        loss = nn.functional.mse_loss(
-            *(each.reshape(-1, SIZES["action"])[steps] for each in (predicted, batch.actions))
+        found, asked = (
+            each.reshape(-1, SIZES["action"])[steps] for each in (predicted, batch.actions)
         )
+        loss = nn.functional.mse_loss(found, asked)
         descend(loss, network, optimizer)
 
     return step

@@ -70,7 +70,7 @@ class Shop:
     def propensities(self, visitor: int) -> np.ndarray:
         """Probabilities (P,) with which the shop's recommender shows each product."""
         weight = np.exp(0.6 * self.guess[visitor])
-        return 0.7 * weight / weight.sum() + 0.3 / PRODUCTS
+        return np.asarray(0.7 * weight / weight.sum() + 0.3 / PRODUCTS)
 
     def view_probability(self, visitor: int, product: int, shown: list[int]) -> float:
         """Probability of a view; a category shown in the last two steps is less interesting."""
@@ -78,9 +78,12 @@ class Shop:
         return float(1 / (1 + np.exp(1.2 * repeats - self.affinity[visitor, product])))
 
 
-def session(shop: Shop, visitor: int, rng: np.random.Generator, bot: bool = False) -> list[tuple]:
+Row = tuple[int, int, int, int, float]
+
+
+def session(shop: Shop, visitor: int, rng: np.random.Generator, bot: bool = False) -> list[Row]:
     """Rows of one visit: product, view, cart, buy, propensity. Visitors who view stay longer."""
-    rows: list[tuple] = []
+    rows: list[Row] = []
     shown: list[int] = []
     chances = shop.propensities(visitor)
     while True:

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from ucfrec.benchmark.cells import Method, augmented_ucf
 
-SCORES, ROBUSTNESS, RATES, SPREAD = "control", "robustness", "rates", "spread"
-CONTEXTS = "contexts"
+SCORES, ROBUSTNESS, RATES = "control", "robustness", "rates"
+CONTEXTS, SPREAD = "contexts", "spread"
 """Suites of the rows."""
 Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"

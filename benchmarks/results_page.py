@@ -467,8 +467,9 @@ SECTIONS = (
         "the tags of the last ten items. Bold is the highest mean of a column among policies that "
         "do not know the simulator. The shared components decide, not the network: with them all "
         "methods are level in the catalogue and in KuaiRand, and behavior cloning is ahead of UCF "
-        "by 2 in SARDINE. Rules of the catalogue have a lookahead, others have none. `ucf` has "
-        "augmented states, `ucf-wo-count` has none, as is the default.",
+        "by 2 in SARDINE. A lookahead was among the candidates in the catalogue, and for `ucf` and "
+        "`bc+shared` in SARDINE. `ucf` has augmented states, `ucf-wo-count` has none, as is the "
+        "default.",
         f"`{RUN} main`",
         of("recommendation", "main"),
         returns,

@@ -15,7 +15,7 @@ from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.logged import SHOWN
 from ucfrec.choosing.problem import Problem
-from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
+from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -61,7 +61,7 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
     trained = TrainedPolicy.load(folder / "run")
     _, validation = training_views(EpisodeStore.open(folder / "store"))
     episodes, steps = validation.all_steps()
-    liked = liked_steps(validation, episodes, steps)
+    liked = liked_rewards(validation, validation.column("reward"))
     items = validation.step_values("item", episodes, steps)
     candidates = read_json(folder / "run" / "run.json")["rule"]["candidates"]
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2

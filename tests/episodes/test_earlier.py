@@ -1,5 +1,7 @@
 """Earlier rows of the users of a later log agree with a slow reader."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec import schema
+from ucfrec.episodes import view as view_module
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
@@ -44,6 +47,9 @@ def test_the_rows_before_a_step_are_those_of_the_user(
     view = rows.continued(gap)
 
     assert view.n_steps == later.n_steps
+    for long_enough in (1, 1000):
+        with patch.object(view_module, "_LONG_ENOUGH", long_enough):
+            assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
     episodes, steps = view.all_steps()
     recent = rows.recent(np.arange(view.n_steps), 4)
     owner, seen = rows.seen(np.arange(view.n_steps))

@@ -835,10 +835,15 @@ def test_the_same_episodes_make_the_same_bytes(folder: Path) -> None:
     assert contents(folder / "a") == contents(folder / "b")
 
 
-def test_steps_in_batches_are_all_steps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("long_enough", [1, 1000])
+def test_steps_in_batches_are_all_steps(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, long_enough: int
+) -> None:
+    """Also where they are read as slices across shards."""
     monkeypatch.setattr(view_module, "_BATCH_STEPS", 7)
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    for view in (store, store.select(np.array([2, 0, 2]))):
+    monkeypatch.setattr(view_module, "_LONG_ENOUGH", long_enough)
+    store = write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
+    for view in (store, store.select(np.array([2, 0, 2])), store.select(np.array([1, 2, 0]))):
         episodes, steps = zip(*view.step_batches(), strict=True)
         assert len(episodes) == -(-view.n_steps // 7)
         listed = view.all_steps()

@@ -55,9 +55,9 @@ def test_an_expression_says_what_is_liked(
     folder: Path, expression: str, expected: set[float]
 ) -> None:
     store = EpisodeStore.open(folder / "store")
-    steps = store.all_steps()
-    liked = LikedExpression(Expression(expression, "--liked"), "rating")(store, *steps)
-    rewards = store.step_values(schema.REWARD, *steps).astype(np.float64).round(3)
+    rewards = store.column(schema.REWARD)
+    liked = LikedExpression(Expression(expression, "--liked"), "rating")(store, rewards)
+    rewards = rewards.astype(np.float64).round(3)
     assert set(rewards[liked].tolist()) == expected
     assert not expected & set(rewards[~liked].tolist())
 

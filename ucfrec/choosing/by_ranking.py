@@ -20,7 +20,7 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import RankedRule, RuleChoice
 from ucfrec.choosing.logged import SHOWN, LoggedScores
 from ucfrec.choosing.problem import Problem
-from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
+from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
@@ -168,6 +168,7 @@ class _Rows:
             numbers = np.sort(drawn)
         episodes, steps = validation.locate(numbers)
         items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+        rewards = validation.step_values(schema.REWARD, episodes, steps)
         counts = TrainingCounts.of(validation)
         shown, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
         rates = (likes + _PRIOR * likes.sum() / shown.sum()) / (shown + _PRIOR)
@@ -177,7 +178,7 @@ class _Rows:
         most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
         return cls(
             *(validation, users, episodes, steps, items),
-            *(liked_steps(validation, episodes, steps), np.isin(items, most_liked), rates),
+            *(liked_rewards(validation, rewards), np.isin(items, most_liked), rates),
         )
 
 

@@ -13,7 +13,7 @@ from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, logged_history
 from ucfrec.acting.sessions import History, seen_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.item_counts import liked_steps
+from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.weights import effective_number
 from ucfrec.episodes.windows import Windows
@@ -124,7 +124,7 @@ class LoggedEvidence:
         self._episodes, self._steps = self._view.all_steps()
         at = self._episodes, self._steps
         self._items = torch.from_numpy(self._view.step_values(schema.ITEM, *at).astype(np.int64))
-        self._liked = liked_steps(self._view, *at)
+        self._liked = liked_rewards(self._view, self._view.column(schema.REWARD))
         self._propensities: Float64Array | None = None
         if schema.PROPENSITY in view.record.columns:
             logged = self._view.step_values(schema.PROPENSITY, *at).astype(np.float64)

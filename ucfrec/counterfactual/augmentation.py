@@ -41,8 +41,8 @@ def require_rewards_vary(train: EpisodeStore) -> None:
     Raises:
         InputError: all training rewards are equal.
     """
-    rewards = (train.step_values(schema.REWARD, *steps) for steps in train.step_batches())
-    found = np.unique([extreme for part in rewards for extreme in (part.min(), part.max())])
+    rewards = train.column_batches(schema.REWARD)
+    found = np.unique([extreme for (part,) in rewards for extreme in (part.min(), part.max())])
     if len(found) == 1:
         raise InputError(
             f"all {train.n_steps:,} training rewards of {train.path} equal {found[0]:g}: there is "

@@ -76,6 +76,17 @@ class StepColumn:
         values = self._taken(index)
         return values if self._kept is None else values[..., self._kept]
 
+    def between(self, begin: int, end: int) -> Array:
+        """The values from index `begin` to before `end`; of one shard, without a copy."""
+        first = int(np.searchsorted(self._bounds, begin, side="right")) - 1
+        last = int(np.searchsorted(self._bounds, end, side="left"))
+        parts = [
+            np.asarray(part[max(begin - low, 0) : end - low])
+            for part, low in zip(self._parts[first:last], self._bounds[first:last], strict=True)
+        ]
+        values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return values if self._kept is None else values[..., self._kept]
+
     def _taken(self, index: IntArray) -> Array:
         if len(self._parts) == 1:
             return np.asarray(self._parts[0][index])

@@ -242,6 +242,14 @@ class Columns:
         """
         return self._column(name).take(index)
 
+    def step_range(self, name: str, begin: int, end: int) -> Array:
+        """Values of step column `name` from step `begin` of the store to before step `end`.
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        return self._column(name).between(begin, end)
+
     def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
         """The logged states (without edits) before the given steps.
 

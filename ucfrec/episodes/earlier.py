@@ -170,6 +170,10 @@ class _JoinedColumn(StepColumn):
         """A copy of the values at the indices `index`, of any shape."""
         return _joined(self._name, self._rows.later, self._rows.earlier, self._source[index])
 
+    def between(self, begin: int, end: int) -> Array:
+        """The values from index `begin` to before `end`."""
+        return self.take(np.arange(begin, end))
+
 
 class _ContinuedColumns(Columns):
     """The columns of later episodes, each with the earlier rows of its session before it."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import BoolArray, IntArray
+from ucfrec.arrays import Array, BoolArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
@@ -19,18 +19,17 @@ LIKED = 0.6
 threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
 
 
-def liked_steps(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> BoolArray:
-    """Whether each step was liked: its reward, scaled as in item states, is at least `LIKED`.
+def liked_rewards(store: EpisodeStore, rewards: Array) -> BoolArray:
+    """Whether steps were liked: their reward, scaled as in item states, is at least `LIKED`.
 
     Args:
         store: a view of a store of items.
-        episodes: (N,) positions in the view.
-        steps: (N,) steps of those episodes.
+        rewards: (N,) of some of its steps.
 
     Returns:
         (N,) bool.
     """
-    states, rewards = store.item_states, store.step_values(schema.REWARD, episodes, steps)
+    states = store.item_states
     scaled = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
     return np.asarray(scaled >= LIKED)
 
@@ -50,14 +49,13 @@ class TrainingCounts:
     def of(
         cls,
         train: EpisodeStore,
-        liked_of: Callable[[EpisodeStore, IntArray, IntArray], BoolArray] = liked_steps,
+        liked_of: Callable[[EpisodeStore, Array], BoolArray] = liked_rewards,
     ) -> "TrainingCounts":
-        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_steps`."""
+        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`."""
         shown, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
-        for steps in train.step_batches():
-            items = train.step_values(schema.ITEM, *steps)
+        for items, rewards in train.column_batches(schema.ITEM, schema.REWARD):
             shown += np.bincount(items, minlength=len(shown))
-            liked += np.bincount(items[liked_of(train, *steps)], minlength=len(liked))
+            liked += np.bincount(items[liked_of(train, rewards)], minlength=len(liked))
         return cls(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:

@@ -18,6 +18,8 @@ from ucfrec.errors import InputError
 _OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
 """Step columns in which an action copy differs from its source."""
 _BATCH_STEPS = 2**20
+_LONG_ENOUGH = 1000
+"""Mean number of steps from which consecutive steps are read as slices."""
 
 
 class EpisodeView:
@@ -268,14 +270,35 @@ class EpisodeView:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        parts = [self.step_values(name, *steps) for steps in self.step_batches()]
+        parts = [part for (part,) in self.column_batches(name)]
         return np.concatenate(parts) if parts else self.step_values(name, *self.all_steps())
+
+    def column_batches(self, *names: str) -> Iterator[tuple[Array, ...]]:
+        """Step columns at `all_steps`, some steps at a time.
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        if not self.n_steps:
+            return
+        ends = (self._columns.starts + self._columns.lengths)[self._sources]
+        begins = ends - self._counts
+        apart = begins[1:] != ends[:-1]
+        begins, ends = begins[np.append(True, apart)], ends[np.append(apart, True)]
+        if self.overlay is not None or len(begins) > self.n_steps // _LONG_ENOUGH:
+            for steps in self.step_batches():
+                yield tuple(self.step_values(name, *steps) for name in names)
+            return
+        for begin, end in zip(begins, ends, strict=True):
+            for first in range(begin, end, _BATCH_STEPS):
+                last = min(first + _BATCH_STEPS, end)
+                yield tuple(self._columns.step_range(name, first, last) for name in names)
 
     def item_counts(self) -> IntArray:
         """(n_items,) number of steps of the view that show each item; for stores of items only."""
         counts = np.zeros(len(self.item_states.embeddings), dtype=np.int64)
-        for steps in self.step_batches():
-            counts += np.bincount(self.step_values(schema.ITEM, *steps), minlength=len(counts))
+        for (items,) in self.column_batches(schema.ITEM):
+            counts += np.bincount(items, minlength=len(counts))
         return counts
 
     @cached_property

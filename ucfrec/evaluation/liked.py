@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_counts import LIKED, liked_steps
+from ucfrec.arrays import Array, BoolArray
+from ucfrec.episodes.item_counts import LIKED, liked_rewards
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -21,10 +21,10 @@ _ROWS: Final = "steps"
 
 
 class Liked(Protocol):
-    """Says of steps whether they were liked; `str` of it states by what."""
+    """Says by their rewards whether steps were liked; `str` of it states by what."""
 
-    def __call__(self, store: EpisodeStore, episodes: IntArray, steps: IntArray) -> BoolArray:
-        """(N,) of the N steps of `store`."""
+    def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
+        """(N,) of N steps of `store`, given their rewards (N,)."""
 
 
 class LikedByRange:
@@ -33,9 +33,9 @@ class LikedByRange:
     def __init__(self, states: ItemStates) -> None:
         self._low, self._high = float(states.reward_low), float(states.reward_high)
 
-    def __call__(self, store: EpisodeStore, episodes: IntArray, steps: IntArray) -> BoolArray:
-        """(N,) of the N steps of `store`."""
-        return liked_steps(store, episodes, steps)
+    def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
+        """(N,) of N steps of `store`, given their rewards (N,)."""
+        return liked_rewards(store, rewards)
 
     def __str__(self) -> str:
         least = self._low + LIKED * (self._high - self._low)
@@ -61,9 +61,8 @@ class LikedExpression:
             self._names.setdefault(reward.casefold(), reward)
         self._of(np.zeros(1))  # so that an unusable expression is refused at once
 
-    def __call__(self, store: EpisodeStore, episodes: IntArray, steps: IntArray) -> BoolArray:
-        """(N,) of the N steps of `store`."""
-        rewards = store.step_values(schema.REWARD, episodes, steps)
+    def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
+        """(N,) of N steps of `store`, given their rewards (N,)."""
         values, places = np.unique(rewards, return_inverse=True)
         # The shortest decimals: as float64, 0.7 of float32 would be less than 0.7.
         return self._of(values.astype(str).astype(np.float64))[places]

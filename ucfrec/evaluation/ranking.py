@@ -20,7 +20,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.group_auc import group_auc
-from ucfrec.episodes.item_counts import liked_steps
+from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
@@ -187,13 +187,12 @@ class Period:
     n_items: int
 
     @classmethod
-    def of(cls, store: EpisodeStore, users: Array, liked: Liked = liked_steps) -> "Period":
+    def of(cls, store: EpisodeStore, users: Array, liked: Liked = liked_rewards) -> "Period":
         """The steps of `store`; `users` (E,) are the user identifiers of its E episodes, and
         `liked` says of steps whether they were liked."""
-        episodes, steps = store.all_steps()
-        items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-        n_items = len(store.item_states.embeddings)
-        return cls(users[episodes], items, liked(store, episodes, steps), n_items)
+        n_items, episodes = len(store.item_states.embeddings), store.all_steps()[0]
+        items = store.column(schema.ITEM).astype(np.int64)
+        return cls(users[episodes], items, liked(store, store.column(schema.REWARD)), n_items)
 
     @property
     def item_rates(self) -> Float64Array:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
-from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
+from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.ranking import Ranker, Steps
@@ -141,7 +141,7 @@ class MatrixFactorisation:
         train: EpisodeStore,
         popularity: Tensor,
         seed: int,
-        liked_of: Liked = liked_steps,
+        liked_of: Liked = liked_rewards,
     ) -> None:
         from implicit.als import AlternatingLeastSquares
         from implicit.bpr import BayesianPersonalizedRanking
@@ -149,10 +149,9 @@ class MatrixFactorisation:
 
         self.name = name
 
-        episodes, steps = train.all_steps()
-        users = train.episode_values(schema.USER).astype(np.int64)[episodes]
-        items = train.step_values(schema.ITEM, episodes, steps)
-        liked = liked_of(train, episodes, steps).astype(np.float32)
+        users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
+        items = train.column(schema.ITEM)
+        liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
         shape = (int(users.max()) + 1, len(popularity))
         matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
         matrix.eliminate_zeros()
@@ -175,7 +174,7 @@ class MatrixFactorisation:
 
 
 def recent_rankers(
-    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_steps
+    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_rewards
 ) -> list[Ranker]:
     """Clicks and click rate with half-lives, which the validation split of the store chooses.
 
@@ -194,7 +193,7 @@ def recent_rankers(
 
 
 def baselines(
-    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_steps
+    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_rewards
 ) -> list[Ranker]:
     """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
     clicks, ALS and BPR.

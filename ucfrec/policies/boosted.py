@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_counts import LIKED, TrainingCounts, liked_steps
+from ucfrec.episodes.item_counts import LIKED, TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
@@ -125,7 +125,7 @@ class BoostedPolicy(SequencePolicy):
             device = self.shown.device
             found = self._inputs(windows.to(device), items.to(device), of_items.to(device))
             inputs.append(found[:, 0].cpu().numpy())
-            target.append(liked_steps(train, *at))
+            target.append(liked_rewards(train, train.step_values(schema.REWARD, *at)))
         return np.concatenate(inputs), np.concatenate(target)
 
     def _rate(self, liked: Tensor, shown: Tensor) -> Tensor:

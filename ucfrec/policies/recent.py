@@ -11,8 +11,8 @@ from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
+from ucfrec.arrays import Array, BoolArray
+from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.policies.base import PolicyConfig
 from ucfrec.policies.item_rate import ItemRatePolicy, liked_rates
@@ -24,7 +24,7 @@ _HOUR_MS: Final = 3_600_000
 _SMOOTHING: Final = 1.0
 """Clicks that are added to all items together."""
 
-LikedOf = Callable[[EpisodeStore, IntArray, IntArray], BoolArray]
+LikedOf = Callable[[EpisodeStore, Array], BoolArray]
 
 
 @settings_table("policy")
@@ -84,7 +84,7 @@ class RecentRatePolicy(ItemRatePolicy):
 
     @classmethod
     def best(
-        cls, train: EpisodeStore, validation: EpisodeStore, liked_of: LikedOf = liked_steps
+        cls, train: EpisodeStore, validation: EpisodeStore, liked_of: LikedOf = liked_rewards
     ) -> float:
         """The half-life (hours) with the lowest loss on validation episodes."""
         held_out = TrainingCounts.of(validation, liked_of)
@@ -116,7 +116,7 @@ class RecentClicksPolicy(RecentRatePolicy):
 
 
 def decayed_counts(
-    train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_steps
+    train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_rewards
 ) -> TrainingCounts:
     """Counts of shown and liked steps, float64, in which older steps count less.
 
@@ -128,12 +128,11 @@ def decayed_counts(
     shown, liked = np.zeros(n_items), np.zeros(n_items)
     timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
     last = int(train.column(schema.TIMESTAMP).max()) if timed else 0
-    for steps in train.step_batches():
-        items = train.step_values(schema.ITEM, *steps).astype(np.int64)
+    names = (schema.ITEM, schema.REWARD, *([schema.TIMESTAMP] if timed else []))
+    for items, rewards, *times in train.column_batches(*names):
         weights = np.ones(len(items))
         if timed:
-            age = last - train.step_values(schema.TIMESTAMP, *steps).astype(np.int64)
-            weights = np.exp2(-age / (half_life * _HOUR_MS))
+            weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
         shown += np.bincount(items, weights, n_items)
-        liked += np.bincount(items, weights * liked_of(train, *steps), n_items)
+        liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
     return TrainingCounts(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)

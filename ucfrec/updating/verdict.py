@@ -8,7 +8,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.item_counts import liked_steps
+from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
 from ucfrec.off_policy.score import scored_steps
@@ -41,15 +41,17 @@ def compare_runs(
     places = rows.all_steps()
     user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
     found = _Logged.of(new, rows), _Logged.of(old, as_known(rows, old))
-    liked = liked_steps(rows, *places)
+    reward = rows.column(schema.REWARD)
+    liked = liked_rewards(rows, reward)
     differences = [_ranked(*found, liked, user, seed)]
     if schema.PROPENSITY in rows.record.columns:
-        reward = rows.step_values(schema.REWARD, *places).astype(np.float64)
-        propensity = rows.step_values(schema.PROPENSITY, *places).astype(np.float64)
+        propensity = rows.column(schema.PROPENSITY).astype(np.float64)
         if (weighed := propensity > 0).any():
             weights = np.stack([each.probability for each in found], axis=1)[weighed]
             weights /= propensity[weighed, None]
-            differences.append(_valued(weights, reward[weighed], user[weighed], seed))
+            differences.append(
+                _valued(weights, reward[weighed].astype(np.float64), user[weighed], seed)
+            )
     decisive = differences[-1]
     results: dict[int, Literal["better", "no significant difference", "worse"]] = {
         1: "better", 0: "no significant difference", -1: "worse"

@@ -36,8 +36,8 @@ class LoggedRewards:
     def of(cls, store: EpisodeStore) -> "LoggedRewards":
         """Those of all steps of a store."""
         found = [
-            np.unique(store.step_values(schema.REWARD, *steps), return_counts=True)
-            for steps in store.step_batches()
+            np.unique(rewards, return_counts=True)
+            for (rewards,) in store.column_batches(schema.REWARD)
         ]
         rewards, place = np.unique(np.concatenate([each for each, _ in found]), return_inverse=True)
         counts = np.bincount(place, np.concatenate([each for _, each in found]))

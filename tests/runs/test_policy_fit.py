@@ -8,16 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.support.short_validation import ALL_BATCHES, short_validation
 from tests.support.together import together
 from ucfrec.commands.cli import main
+from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.run import train_run
+from ucfrec.runs.start import new_policy
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = [
@@ -108,3 +112,26 @@ def test_torchrun_is_the_same_command(store: Path, tmp_path: Path) -> None:
     again = started(store, tmp_path / "two", "--set", "train.steps=5")
     assert again.returncode != 0
     assert again.stderr.count("was started with another") == 1
+
+
+def test_new_episodes_are_half_of_every_batch(tmp_path: Path) -> None:
+    """So few steps suffice to learn what only they show, beside what all others show."""
+    rng = np.random.default_rng(0)
+    n, new = 4000, 40
+    item = rng.integers(2, size=n)
+    item[-new:] = 2
+    columns = {"item": item.astype(np.int32), "reward": rng.random(n).astype(np.float32)}
+    states = ItemStates(torch.randn(4, 3), torch.zeros(0, 0), 0.0, 1.0)
+    store = EpisodeStore.from_arrays(columns, np.full(n // 4, 4), None, states)
+    config = resolve_config(
+        "bc", None, ["train.steps=60", "train.learning_rate=0.01", "train.warmup_steps=0"]
+    )
+    shares = []
+    for newest in (None, np.arange(n // 4 - new // 4, n // 4)):
+        policy = new_policy(store, config)
+        fit_policy(policy, store, None, tmp_path / str(newest is None), config, newest=newest)
+        first = store.windows(np.arange(9), np.zeros(9, dtype=np.int64), 1)
+        with torch.no_grad():
+            shares.append(float(policy.act(first).softmax(-1)[:, 2].mean()))
+    assert shares[0] < 0.05
+    assert 0.3 < shares[1] < 0.7

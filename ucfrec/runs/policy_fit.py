@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.fitting import distributed
@@ -27,6 +28,7 @@ def fit_policy(
     out: Path,
     config: Config,
     start: Path | None = None,
+    newest: IntArray | None = None,
     callbacks: Callbacks = SILENT,
 ) -> Fit:
     """Train the policy, or resume its training.
@@ -37,6 +39,8 @@ def fit_policy(
         validation: held-out episodes; None to keep the last weights.
         start: weights of another training to go on from; of a policy that is fitted without
             gradients, only what was chosen on held-out episodes is taken from there.
+        newest: positions in `train` of episodes that half of every batch is drawn from; None to
+            draw all uniformly.
 
     Raises:
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
@@ -53,10 +57,15 @@ def fit_policy(
     if solve is not None:
         with distributed.leader_first():
             return fit_once(policy, solve, out / "policy", validate, config.policy_name, callbacks)
-    own = distributed.share(config.train.batch_size)
+    size, own = config.train.batch_size, distributed.share(config.train.batch_size)
+    newest = np.array([], dtype=np.int64) if newest is None else newest
+    recent = base.select(newest)
 
     def draw(generator: np.random.Generator) -> Windows:
-        episodes, steps = train.draw_steps(generator, config.train.batch_size)
+        episodes, steps = train.draw_steps(generator, size)
+        if len(newest):
+            of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
+            episodes[::2] = newest[of_recent]
         return train.windows(episodes[own], steps[own], k).to(device)
 
     def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:

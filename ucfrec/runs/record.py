@@ -200,8 +200,10 @@ class Update(Entry):
     """Its fingerprint."""
     settings_from_nothing: dict[str, Any]
     """Those of a training that does not start from the weights of another run."""
+    episodes: Annotated[int, Field(ge=1)]
+    """Number of episodes of the new logs, which are the last of the store."""
     appended: dict[str, Any]
-    """Counts of the new logs; see `ucfrec.logs.append.append_logs`."""
+    """Other counts of the new logs; see `ucfrec.logs.append.append_logs`."""
     drift: dict[str, Any] | None = None
     """See `ucfrec.updating.drift`."""
     verdict: UpdateVerdict | None = None

@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ucfrec.acting.scorer import Scorer
+from ucfrec.arrays import IntArray
 from ucfrec.choosing.choose import choose_rule
 from ucfrec.choosing.problem import Problem
 from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
@@ -30,7 +32,7 @@ from ucfrec.policies.checks import require_sound
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation
+from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation, read_record
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
@@ -220,7 +222,17 @@ def _train_policy(
     train = run.train if overlay is None else run.train.with_overlay(overlay)
     start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
     validation = run.validation if refit_of is None else None
-    return fit_policy(run.policy, train, validation, run.out, run.config, start, callbacks)
+    newest = _newest(run.record if refit_of is None else read_record(refit_of), train)
+    given = run.policy, train, validation, run.out, run.config, start, newest, callbacks
+    return fit_policy(*given)
+
+
+def _newest(record: RunRecord, train: EpisodeStore) -> IntArray | None:
+    """Positions among the training episodes of those that an update added; None for none."""
+    if record.update is None:
+        return None
+    first = train.record.n_episodes - record.update.episodes
+    return np.flatnonzero(train.episode_ids >= first)
 
 
 def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:

@@ -87,6 +87,7 @@ def update_run(
         of=run.resolve().name,
         run=trained.fingerprint,
         settings_from_nothing=asdict(full),
+        episodes=counts["episodes"],
         appended=_numbers(counts),
     )
     about = {"update": update, "dropped_observations": trained.dropped}
@@ -110,7 +111,7 @@ def _compared(
 ) -> RunRecord:
     """Write the drift of the new rows and the verdict to the record of the new run."""
     assert record.update is not None
-    seed, first = record.config.seed, opened.n_episodes - counts["episodes"]
+    seed, first = record.config.seed, opened.n_episodes - record.update.episodes
     added = opened.select(np.arange(first, opened.n_episodes))
     found = drift(trained, before.split("train"), added, counts, seed)
     new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)

@@ -75,7 +75,7 @@ def budget_options(
         choices=list(budgets),
         default=next(iter(budgets)),
         help=f"{', '.join(f'{name} ({what})' for name, what in budgets.items())} "
-        f"(default: {next(iter(budgets))})",
+        "(default: %(default)s)",
     )
     for name, kept in ((task, "tasks"), ("--method", "methods")):
         parser.add_argument(

@@ -78,14 +78,14 @@ def test_evaluate_writes_the_rows_it_prints(
 ) -> None:
     out = tmp_path / "rows.json"
     run = str(folder / f"{environment}-run")
-    arguments = ["evaluate", run, "--env", environment, "--episodes", "40", "--seed", "7"]
+    arguments = ["evaluate", run, "--env", environment, "--episodes", "10", "--seed", "7"]
     arguments += ["--behavior", "random", "--json", str(out)]
     assert main(arguments) == 0
     rows = read_results(out)
     assert [row.method for row in rows] == ["ucf", "random"]
     for row in rows:
         assert row.environment == environment
-        assert (row["episodes"], row.evaluation_seed) == (40, 7)
+        assert (row["episodes"], row.evaluation_seed) == (10, 7)
         assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
     assert "R_avg_episode" in capsys.readouterr().out

@@ -69,7 +69,7 @@ def test_python_and_files_agree(fitted: tuple[Recommender, Path], log: pd.DataFr
         lambda log: pd.concat([log.assign(reward=-9.0), log]),
     ],
 )
-@pytest.mark.parametrize("rows", [1, 60, 4000])
+@pytest.mark.parametrize("rows", [1, 2000])
 def test_frames_that_say_the_same_have_the_same_histories(
     fitted: tuple[Recommender, Path],
     rows: int,
@@ -91,8 +91,9 @@ def test_frames_that_say_the_same_have_the_same_histories(
         np.testing.assert_array_equal(getattr(plain, name), values, err_msg=name)
 
 
-@pytest.mark.parametrize("session_by", ["gap", "session_id", "user"])
-@pytest.mark.parametrize("observed", [False, True])
+@pytest.mark.parametrize(
+    ("session_by", "observed"), [("gap", True), ("session_id", False), ("user", True)]
+)
 def test_scores_are_the_policys_at_the_next_step(
     log: pd.DataFrame, tmp_path: Path, session_by: str, observed: bool
 ) -> None:
@@ -277,19 +278,17 @@ def times_of_every_type() -> dict[str, Callable[[pd.Series], object]]:
 
 
 @pytest.mark.parametrize("kind", times_of_every_type())
-@pytest.mark.parametrize("zone", ["UTC", "America/New_York"])
 def test_times_mean_the_same_here_and_in_prepare(
     fitted: tuple[Recommender, Path],
     log: pd.DataFrame,
     tmp_path: Path,
     kind: str,
-    zone: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     policy, _ = fitted
     whole = log.assign(timestamp=log.timestamp // 1000 * 1000)
     typed = whole.assign(timestamp=times_of_every_type()[kind](whole.timestamp))
-    monkeypatch.setenv("TZ", zone)
+    monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
         pd.testing.assert_frame_equal(policy.recommend(typed), policy.recommend(whole))

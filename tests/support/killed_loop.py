@@ -27,7 +27,7 @@ from ucfrec.runs.promoted import promote, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import update_run
 
-LIVES = 12
+LIVES = 8
 """Of work that has no end."""
 
 
@@ -95,7 +95,7 @@ WORK: dict[str, tuple[Callable[[Path], None], Callable[[Path], None], float]] = 
     "update": (update, lambda folder: None, 1.0),
     "promote": (promote_often, promoted_is_whole, 0.3),
     "join": (join, joined_is_whole, 0.1),
-    "exposures": (write_exposures, exposures_are_whole, 0.8),
+    "exposures": (write_exposures, exposures_are_whole, 0.6),
 }
 
 

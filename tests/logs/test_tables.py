@@ -53,8 +53,10 @@ def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
 # Folders
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-@pytest.mark.parametrize("name", ["user_id", "item_id", "reward", "timestamp"])
+@pytest.mark.parametrize(
+    ("name", "suffix"),
+    [("user_id", ".csv"), ("item_id", ".parquet"), ("reward", ".csv"), ("timestamp", ".parquet")],
+)
 def test_the_name_of_a_folder_replaces_no_column(tmp_path: Path, name: str, suffix: str) -> None:
     log = make_log()
     write(log, tmp_path / f"{name}=7" / f"log{suffix}")
@@ -226,8 +228,16 @@ def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> N
 # Identifiers
 
 
-@pytest.mark.parametrize("late", ["007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é"])
-@pytest.mark.parametrize("rows", [40, 21_000])
+@pytest.mark.parametrize(
+    ("late", "rows"),
+    [
+        *(
+            (late, 40)
+            for late in ("007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é")
+        ),
+        *((late, 21_000) for late in ("007", "1e1", "7 ", "é")),
+    ],
+)
 def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows: int) -> None:
     """Also where DuckDB, which looks at the first rows, takes the column for whole numbers."""
     ids = [*map(str, np.arange(rows) % 49 + 1)]
@@ -311,11 +321,13 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
     assert (report["steps"], report["unknown_propensities"]) == (1500, 700)
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize(
+    ("suffix", "kind"),
+    [(".parquet", "object"), (".parquet", "float64"), (".parquet", "string"), (".csv", "object")],
+)
 @pytest.mark.parametrize(
     "name", ["propensity", "session_id", "is_random", "observation", "feedback"]
 )
-@pytest.mark.parametrize("kind", ["object", "float64", "string"])
 def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     tmp_path: Path, suffix: str, name: str, kind: str
 ) -> None:

@@ -80,17 +80,15 @@ def test_two_runs_share_the_users_and_term_writes_the_exposures_of_every_answer(
         assert process.wait(60) == 0
     assert {answer["arm"] for answer in answers} == {"a", "b"}
     shown = pd.concat(map(pd.read_parquet, folder.iterdir()))
+    names = ["user_id", "arm", "request_id", "position", "item_id", "propensity"]
     expected = [
-        (str(answer["user_id"]), answer["arm"], item["item_id"], answer["request_id"], position)
+        (str(answer["user_id"]), answer["arm"], answer["request_id"], position, *item)
         for answer in answers
-        for position, item in enumerate(answer["items"], 1)
+        for position, item in enumerate(
+            ((each["item_id"], each["propensity"]) for each in answer["items"]), 1
+        )
     ]
-    found = shown[["user_id", "arm", "item_id", "request_id", "position"]]
-    assert sorted(found.itertuples(index=False, name=None)) == sorted(expected)
-    chances = {
-        (a["request_id"], i["item_id"]): i["propensity"] for a in answers for i in a["items"]
-    }
-    assert dict(zip(zip(shown.request_id, shown.item_id), shown.propensity)) == chances
+    assert sorted(shown[names].itertuples(index=False, name=None)) == sorted(expected)
 
 
 def test_term_ends_it_after_the_requests_in_flight(trained: TrainedPolicy) -> None:

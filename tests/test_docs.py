@@ -49,8 +49,7 @@ def _script(name: str) -> ModuleType:
 
 
 @pytest.mark.parametrize(
-    ("page", "command"),
-    [(page.name, command) for page in PAGES[1:] for command in page.commands()],
+    ("page", "command"), [(page.name, command) for page in PAGES[1:] for command in page.commands()]
 )
 def test_the_commands_parse(page: str, command: str) -> None:
     parse(command)

@@ -311,9 +311,7 @@ def test_callbacks_see_every_step_and_what_is_logged(folder: Path, tmp_path: Pat
         )
     counted: list[int] = []
     Recommender("item-rate").fit(
-        folder / "store",
-        tmp_path / "rate",
-        on_validation=lambda step, _: counted.append(step),
+        folder / "store", tmp_path / "rate", on_validation=lambda step, _: counted.append(step)
     )
     assert counted == [1]
 

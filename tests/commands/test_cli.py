@@ -421,10 +421,7 @@ def test_a_run_of_another_store_or_configuration_is_refused(
         (["evaluate", "nowhere", "--env", "synthetic-taobao"], "nowhere is not a run folder"),
         (["evaluate", "--env", "synthetic-taobao"], "name a run folder"),
         (["evaluate", "--env", "taobao", "--behavior", "random"], "no simulator is called"),
-        (
-            ["evaluate", "--env", "synthetic-taobao", "--behavior", "best"],
-            "it has .*optimal",
-        ),
+        (["evaluate", "--env", "synthetic-taobao", "--behavior", "best"], "it has .*optimal"),
         (["prepare", "nowhere.parquet", "--out", "store"], "nowhere.parquet does not exist"),
         (["report"], "name a run folder"),
     ],

@@ -432,22 +432,10 @@ FAULTS: dict[str, tuple[Change, PrepareOptions, str]] = {
         PrepareOptions(min_steps=1000),
         r"no session is left: none of the \d+ clean rows",
     ),
-    "no training": (
-        lambda log: None,
-        PrepareOptions(split=(5.0, 6.0)),
-        r"training split",
-    ),
+    "no training": (lambda log: None, PrepareOptions(split=(5.0, 6.0)), r"training split"),
     "aggregate": (lambda log: None, PrepareOptions(reward="sum(reward)"), r"no scalar SQL"),
-    "window": (
-        lambda log: None,
-        PrepareOptions(reward="lag(reward) OVER ()"),
-        r"no scalar SQL",
-    ),
-    "subquery": (
-        lambda log: None,
-        PrepareOptions(reward="(SELECT 1)"),
-        r"no scalar SQL",
-    ),
+    "window": (lambda log: None, PrepareOptions(reward="lag(reward) OVER ()"), r"no scalar SQL"),
+    "subquery": (lambda log: None, PrepareOptions(reward="(SELECT 1)"), r"no scalar SQL"),
     "broken SQL": (lambda log: None, PrepareOptions(reward="reward +"), r"no scalar SQL"),
     "unequal lists": (
         lambda log: log.__setitem__("observation", [[1.0] * (1 + (i == 7)) for i in log.index]),

@@ -151,11 +151,7 @@ USERS = pd.DataFrame(
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 @pytest.mark.parametrize(
     "second",
-    [
-        ["user_id", "spend", "age"],
-        ["spend", "age", "user_id"],
-        ["AGE", "User_ID", "spend"],
-    ],
+    [["user_id", "spend", "age"], ["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]],
 )
 def test_parts_of_features_are_joined_by_the_names_of_their_columns(
     tmp_path: Path, suffix: str, second: list[str]

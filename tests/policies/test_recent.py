@@ -11,12 +11,7 @@ import torch
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
-from ucfrec.policies.recent import (
-    HALF_LIVES,
-    RecentClicksPolicy,
-    RecentRatePolicy,
-    decayed_counts,
-)
+from ucfrec.policies.recent import HALF_LIVES, RecentClicksPolicy, RecentRatePolicy, decayed_counts
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -337,10 +337,7 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         lambda log: log.assign(timestamp="noon"),
         r"timestamp \(timestamp\) is 'noon', no ISO 8601 time nor milliseconds",
     ),
-    "text for rewards": (
-        lambda log: log.assign(reward="good"),
-        r"reward \(reward\) is VARCHAR",
-    ),
+    "text for rewards": (lambda log: log.assign(reward="good"), r"reward \(reward\) is VARCHAR"),
     "fractions for users": (
         lambda log: log.assign(user_id=log.user_id + 0.5),
         r"user_id \(user_id\) is DOUBLE",

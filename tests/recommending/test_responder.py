@@ -90,9 +90,7 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
-def test_a_request_id_gives_the_same_answer_and_another_draws_again(
-    trained: TrainedPolicy,
-) -> None:
+def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: TrainedPolicy) -> None:
     by = responder(trained, k=9, rule=DecisionRule(3.0, temperature=4.0))
     given = [Request(user_id=7, request_id=name) for name in ("a", "a", "b")] + [Request(user_id=7)]
     one, same, other, made = by.answers(given)

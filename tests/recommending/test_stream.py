@@ -12,14 +12,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.support.served import (
-    as_frame,
-    histories,
-    requests_of,
-    responder,
-    trained_run,
-    with_rule,
-)
+from tests.support.served import as_frame, histories, requests_of, responder, trained_run, with_rule
 from ucfrec.commands.cli import main
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.stream import answer_stream

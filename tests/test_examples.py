@@ -27,14 +27,22 @@ SETTINGS = (
     "rule.sessions=50",
 )
 SMALLER = {
-    "shop": {"SESSIONS, ITEMS = 1000": "SESSIONS, ITEMS = 100"},
+    "shop": {
+        "SESSIONS, ITEMS = 1000": "SESSIONS, ITEMS = 100",
+        "--set policy.dim=32 2>": "--set policy.dim=32 --set rule.sessions=10 2>",
+    },
     "evaluation": {
         "--sessions 2500": "--sessions 400",
         "--sessions 800": "--sessions 200",
         "--episodes 400": "--episodes 40",
         "train.steps=600": "train.steps=60",
+        '--set policy.dim=32"': '--set policy.dim=32 --set rule.sessions=10 --set crm.epochs=2"',
     },
-    "control": {"range(150)": "range(60)", "train.steps=400": "train.steps=40"},
+    "control": {
+        "range(150)": "range(60)",
+        "train.steps=400": "train.steps=40",
+        "--set policy.context=5": "--set policy.context=5 --set crm.epochs=2",
+    },
 }
 """Numbers of a notebook that its code runs as well without, and whose results nothing checks."""
 NOTEBOOKS = tuple(SMALLER)

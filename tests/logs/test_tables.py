@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.support.logs import write
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -31,15 +32,6 @@ def make_log(rows: int = 400, users: int = 100, step: int = 600_000) -> pd.DataF
     log["timestamp"] = START + step * np.arange(rows)
     log["reward"] = (generator.random(rows) < 0.3) * 1.0
     return log
-
-
-def write(frame: pd.DataFrame, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".csv":
-        frame.to_csv(path, index=False)
-    else:
-        frame.to_parquet(path, index=False)
-    return path
 
 
 def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import write
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping, read_mapping
@@ -25,14 +26,6 @@ def make_log(times: "pd.Series[str] | pd.DatetimeIndex | pd.Index[str]") -> pd.D
             "reward": generator.integers(0, 2, n),
         }
     )
-
-
-def write(frame: pd.DataFrame, path: Path) -> Path:
-    if path.suffix == ".csv":
-        frame.to_csv(path, index=False)
-    else:
-        frame.to_parquet(path, index=False)
-    return path
 
 
 def days(begin: str, n: int, rows: int = 3000) -> pd.DatetimeIndex:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
+from tests.support.logs import store_of
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
@@ -18,8 +19,7 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.recommending import histories
 from ucfrec.recommending.histories import histories_of_files
-from ucfrec.recommending.recommend import recommend, uniforms
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.recommending.recommend import uniforms
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
@@ -44,20 +44,8 @@ def log() -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def fitted(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> tuple[Recommender, Path]:
     folder = tmp_path_factory.mktemp("recommend")
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    store = EpisodeStore.open(folder / "store")
+    store = store_of(log, folder, reward="reward", session_by="gap", gap_minutes=20)
     return Recommender("ucf", settings=SETTINGS).fit(store, folder / "run"), folder
-
-
-def test_python_and_files_agree(fitted: tuple[Recommender, Path], log: pd.DataFrame) -> None:
-    policy, folder = fitted
-    from_frame = policy.recommend(log, k=5)
-    trained = TrainedPolicy.load(folder / "run")
-    batches = histories_of_files(trained, [folder / "log.parquet"], LogMapping())
-    (from_files,) = recommend(trained, batches, 5)
-    pd.testing.assert_frame_equal(from_frame, from_files, check_dtype=False)
 
 
 @pytest.mark.parametrize(
@@ -171,16 +159,6 @@ def test_only_the_latest_session_makes_the_state_but_all_is_seen(
     pd.testing.assert_frame_equal(alone, both)
     filtered = policy.recommend(pd.concat([earlier, recent]), k=30)
     assert not set(filtered.item_id) & {*earlier.item_id, *recent.item_id}
-
-
-def test_a_loaded_policy_is_the_one_saved(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
-) -> None:
-    policy, _ = fitted
-    policy.save(tmp_path / "copy")
-    loaded = Recommender.load(tmp_path / "copy")
-    assert loaded.config == policy.config
-    pd.testing.assert_frame_equal(loaded.recommend(log), policy.recommend(log))
 
 
 def test_the_command_equals_the_python_api(

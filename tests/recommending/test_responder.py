@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from tests.support.served import FULL, as_frame, histories, requests_of, responder
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
@@ -18,11 +18,6 @@ from ucfrec.recommending.requests import HistoryReader, Request, Row
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("served"))
 
 
 def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:

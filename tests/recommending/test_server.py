@@ -15,18 +15,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.support.served import trained_run
 from ucfrec.commands.cli import main
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 httpx = pytest.importorskip("httpx")
 pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi_offline")
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("server"))
 
 
 @contextmanager

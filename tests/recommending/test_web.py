@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from tests.support.served import FULL, as_frame, histories, requests_of, responder
 from ucfrec.commands.cli import main
 from ucfrec.commands.serve import _allowed_hosts
 from ucfrec.recommending.requests import Limits
@@ -24,11 +24,6 @@ pytest.importorskip("fastapi_offline")
 pytest.importorskip("prometheus_client")
 # After the check that they are installed.
 from ucfrec.recommending.web import ServerLimits, application  # noqa: E402
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("web"))
 
 
 @asynccontextmanager

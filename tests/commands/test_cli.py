@@ -275,7 +275,9 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(catalog[0], tmp_path / "run")
-    run, logs, card = str(tmp_path / "run"), str(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    run, logs = str(tmp_path / "run"), str(tmp_path / "sessions.parquet")
+    log, card = pd.read_parquet(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    log[log.session_id < 100].to_parquet(logs)
     trained = card.read_text()
     assert "# Model card: ucf" in trained
     assert "| reward | `is_click` |" in trained
@@ -299,7 +301,7 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, _ = catalog
-    collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
+    collected = ["--behavior", "random", "--sessions", "800", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
     out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
     asked = [

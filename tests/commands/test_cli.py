@@ -301,7 +301,7 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, _ = catalog
-    collected = ["--behavior", "random", "--sessions", "800", "--out", str(tmp_path / "logs")]
+    collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
     assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
     out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
     asked = [

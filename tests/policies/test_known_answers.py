@@ -32,7 +32,7 @@ EXTRA = {
     "dt4rec": ["policy.layers=1", "policy.negatives=1"],
     "edt4rec": ["policy.cql_steps=20"],
     "lsdt": ["policy.kernel_groups=4"],
-    "sasrec": ["train.steps=80", "train.learning_rate=0.005"],
+    "sasrec": ["train.steps=120", "train.learning_rate=0.005"],
     "gsasrec": ["train.steps=80", "train.learning_rate=0.005"],
 }
 

@@ -17,7 +17,7 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 	$(PYTEST) -m "not slow"
 
 test-slow: .venv/dev  ## The slow tests: trainings and simulations that take many seconds each.
-	$(PYTEST) --dist worksteal -m slow
+	$(PYTEST) --dist worksteal -m slow $$(grep -rl --include "test_*.py" mark.slow tests)
 
 # SCALE is a share of the cases. What build/torture.jsonl has for this code is not measured again.
 SCALE ?= 1

@@ -7,12 +7,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-import torch
 from hypothesis import settings
 
-from tests.support.short_validation import short_validation
-
-settings.register_profile("ucfrec", deadline=None, derandomize=True, database=None, max_examples=40)
+settings.register_profile("ucfrec", deadline=None, derandomize=True, database=None, max_examples=25)
 settings.load_profile("ucfrec")
 
 
@@ -24,6 +21,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
     """Small tensors gain nothing from threads, and other processes share the cores."""
+    import torch  # not above: the process that hands out the tests reads this file, too
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -33,11 +32,13 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def few_windows() -> Iterator[None]:
     """A training of a few steps would spend most of its time validating."""
+    from tests.support.short_validation import short_validation
+
     with short_validation():
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def spark() -> Iterator[Any]:
     """A small local session, which commands use in place of one of their own."""
     sql = pytest.importorskip("pyspark.sql")

@@ -281,13 +281,6 @@ def test_users_of_the_store_need_no_frame(fitted: Recommender, log: pd.DataFrame
         fitted.recommend(users=[999])
 
 
-def test_recommend_leaves_out_what_fit_leaves_out(fitted: Recommender, log: pd.DataFrame) -> None:
-    holes = log.assign(reward=log.reward.mask(log.index < 5))
-    with pytest.warns(UserWarning, match=r"5 of 1,500 rows were excluded \(5: reward is missing"):
-        found = fitted.recommend(holes, k=3)
-    pd.testing.assert_frame_equal(found, fitted.recommend(log.iloc[5:], k=3))
-
-
 def test_callbacks_see_every_step_and_what_is_logged(folder: Path, tmp_path: Path) -> None:
     steps: list[int] = []
     validations: dict[int, Mapping[str, float]] = {}
@@ -311,9 +304,7 @@ def test_callbacks_see_every_step_and_what_is_logged(folder: Path, tmp_path: Pat
         )
     counted: list[int] = []
     Recommender("item-rate").fit(
-        folder / "store",
-        tmp_path / "rate",
-        on_validation=lambda step, _: counted.append(step),
+        folder / "store", tmp_path / "rate", on_validation=lambda step, _: counted.append(step)
     )
     assert counted == [1]
 

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 from dataclasses import FrozenInstanceError, asdict, fields, replace
 from typing import Annotated, Literal
 
@@ -103,17 +101,6 @@ def test_positions_and_what_is_missing_are_named_too() -> None:
     with pytest.raises(SettingError, match="no room for 6") as caught:
         replace(Shop(2), width=6)
     assert caught.value.keys == ("shop.shelves", "shop.width")
-
-
-def test_help_and_prepare_start_without_it() -> None:
-    program = (
-        "import sys, ucfrec.commands.cli, ucfrec.commands.prepare; "
-        "print({'pydantic', 'gymnasium'} & set(sys.modules))"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert ended.stdout.strip() == "set()"
 
 
 def test_fields_are_described_where_they_were_first_explained() -> None:

@@ -307,7 +307,14 @@ def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
         assert logged_history(trained.scorer(rule), *at)[0].shown.items.shape == (1, MEMORY)
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(
+    ("trained", "rule"),
+    [
+        *(("session", rule) for rule in RULES),
+        *(("horizon", rule) for rule in ("minimum", "learned", "weighted")),
+    ],
+    indirect=["trained"],
+)
 def test_played_scored_ranked_and_recommended_alike(
     folder: Path, trained: TrainedPolicy, rule: str, tmp_path: Path
 ) -> None:

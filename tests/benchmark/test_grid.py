@@ -24,13 +24,7 @@ Cell = tuple[str, int]
 
 
 def _key(cell: Cell) -> RowKey:
-    return RowKey(
-        suite="s",
-        table="squares",
-        task=str(cell[1]),
-        method="m",
-        policy="p",
-    )
+    return RowKey(suite="s", table="squares", task=str(cell[1]), method="m", policy="p")
 
 
 def _config(cell: Cell) -> dict[str, Any] | None:

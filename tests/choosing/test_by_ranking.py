@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.logs import store_of
 from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
@@ -18,7 +19,6 @@ from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -32,10 +32,14 @@ SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copie
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranking")
-    tagged_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="user", embedding_size=6)
-    prepare([folder / "log.parquet"], tagged_mapping(folder), folder / "store", options)
-    store = EpisodeStore.open(folder / "store")
+    store = store_of(
+        tagged_log(),
+        folder,
+        tagged_mapping(folder),
+        reward="reward",
+        session_by="user",
+        embedding_size=6,
+    )
     train_run(store, folder / "run", resolve_config("ucf", None, SETTINGS))
     return folder
 

@@ -25,7 +25,6 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.record import RuleRecord, read_record
-from ucfrec.runs.refit import SHARE, refit
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
@@ -363,21 +362,3 @@ def test_a_finished_run_that_is_trained_again_keeps_its_rule(
     after = read_json(folder / "run" / "run.json")
     assert after["rule"] == before["rule"]
     assert TrainedPolicy.load(folder / "run").rule == trained.rule
-
-
-def test_a_refit_learns_from_all_rows_and_chooses_nothing_anew(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    store = EpisodeStore.open(folder / "store")
-    record = refit(store, folder / "run", tmp_path / "refit")
-    again = TrainedPolicy.load(tmp_path / "refit")
-    assert record.train_steps == store.n_steps > trained.record.train_steps
-    assert record.finished.steps == max(1, round(SHARE * trained.record.finished.best_step))
-    assert "policy        trained on all rows, up to step" in record.describe()
-    assert again.rule == trained.rule
-    assert again.reward_model is not None
-    assert trained.reward_model is not None
-    assert not torch.equal(again.reward_model.item, trained.reward_model.item)
-    assert again.counts is not None
-    assert int(again.counts.shown.sum()) == store.n_steps
-    assert np.isfinite(again.training_returns).all()

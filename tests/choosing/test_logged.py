@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.logs import store_of
 from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
@@ -14,7 +15,6 @@ from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.logged import LoggedEvidence
 from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -36,9 +36,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on a log that shows any item alike, and says so."""
     folder = tmp_path_factory.mktemp("evidence")
     log = tagged_log().assign(propensity=1 / ITEMS)
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
-    prepare([folder / "log.parquet"], tagged_mapping(folder), folder / "store", options)
+    store_of(
+        log,
+        folder,
+        tagged_mapping(folder),
+        reward="reward",
+        session_by="gap",
+        gap_minutes=120,
+        embedding_size=6,
+    )
     store, settings = EpisodeStore.open(folder / "store"), [*SETTINGS, *RULE, "rule.evidence=3"]
     train_run(store, folder / "run", resolve_config("dt", None, settings))
     return folder

@@ -78,14 +78,14 @@ def test_evaluate_writes_the_rows_it_prints(
 ) -> None:
     out = tmp_path / "rows.json"
     run = str(folder / f"{environment}-run")
-    arguments = ["evaluate", run, "--env", environment, "--episodes", "40", "--seed", "7"]
+    arguments = ["evaluate", run, "--env", environment, "--episodes", "10", "--seed", "7"]
     arguments += ["--behavior", "random", "--json", str(out)]
     assert main(arguments) == 0
     rows = read_results(out)
     assert [row.method for row in rows] == ["ucf", "random"]
     for row in rows:
         assert row.environment == environment
-        assert (row["episodes"], row.evaluation_seed) == (40, 7)
+        assert (row["episodes"], row.evaluation_seed) == (10, 7)
         assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
         assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
     assert "R_avg_episode" in capsys.readouterr().out
@@ -275,7 +275,9 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(catalog[0], tmp_path / "run")
-    run, logs, card = str(tmp_path / "run"), str(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    run, logs = str(tmp_path / "run"), str(tmp_path / "sessions.parquet")
+    log, card = pd.read_parquet(catalog[1]), tmp_path / "run" / "MODEL_CARD.md"
+    log[log.session_id < 100].to_parquet(logs)
     trained = card.read_text()
     assert "# Model card: ucf" in trained
     assert "| reward | `is_click` |" in trained
@@ -421,10 +423,7 @@ def test_a_run_of_another_store_or_configuration_is_refused(
         (["evaluate", "nowhere", "--env", "synthetic-taobao"], "nowhere is not a run folder"),
         (["evaluate", "--env", "synthetic-taobao"], "name a run folder"),
         (["evaluate", "--env", "taobao", "--behavior", "random"], "no simulator is called"),
-        (
-            ["evaluate", "--env", "synthetic-taobao", "--behavior", "best"],
-            "it has .*optimal",
-        ),
+        (["evaluate", "--env", "synthetic-taobao", "--behavior", "best"], "it has .*optimal"),
         (["prepare", "nowhere.parquet", "--out", "store"], "nowhere.parquet does not exist"),
         (["report"], "name a run folder"),
     ],

@@ -16,8 +16,8 @@ from ucfrec.commands.demo import (
 from ucfrec.results.rows_file import read_results
 
 TINY = DemoConfig(
-    sessions=400,
-    episodes=200,
+    sessions=300,
+    episodes=100,
     settings=("train.steps=20", "crm.epochs=1", "rule.sessions=10"),
     context=4,
     dim=16,

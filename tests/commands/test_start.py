@@ -1,5 +1,6 @@
-"""A command imports what it uses and nothing else; each is started in a process of its own."""
+"""A command imports what it uses and nothing else; seen in processes of its own."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,31 +12,34 @@ from ucfrec.commands.cli import UCFREC
 
 START = 1_700_000_000_000
 SLOW_TO_IMPORT = {"torch", "sklearn", "scipy", "pandas", "duckdb", "pyarrow", "gymnasium"}
+SLOW_TO_IMPORT |= {"pydantic"}
 TRAINING = {f"ucfrec.{room}" for room in ("policies", "counterfactual", "runs", "fitting.loop")}
 ACTING = {"gymnasium", "ucfrec.acting", "ucfrec.evaluation"}
 
 
-def loaded(*arguments: object) -> set[str]:
-    """Modules in memory when `ucfrec ARGUMENTS` ends."""
+def loaded(*lines: tuple[object, ...]) -> list[set[str]]:
+    """Modules in memory when `ucfrec LINE` ends, for each line in turn, in one process."""
     code = (
-        "import sys\n"
+        "import json, sys\n"
         "from ucfrec.commands.cli import main\n"
-        "try:\n"
-        "    status = main(sys.argv[1:])\n"
-        "except SystemExit as end:\n"
-        "    status = end.code\n"
-        "print('\\n', *sys.modules, file=sys.stderr)\n"
-        "sys.exit(status)\n"
+        "for line in json.loads(sys.argv[1]):\n"
+        "    try:\n"
+        "        status = main(line)\n"
+        "    except SystemExit as end:\n"
+        "        status = end.code\n"
+        "    assert status == 0\n"
+        "    print('\\n', *sys.modules, file=sys.stderr)\n"
     )
-    return modules(code, *map(str, arguments))
+    return modules(code, json.dumps([[*map(str, line)] for line in lines]))
 
 
-def modules(code: str, *arguments: str) -> set[str]:
+def modules(code: str, *arguments: str) -> list[set[str]]:
+    """Modules in memory, as code prints them in lines that begin with a blank."""
     ended = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0, ended.stderr
-    return set(ended.stderr.splitlines()[-1].split())
+    return [{*line.split()} for line in ended.stderr.splitlines() if line.startswith(" ")]
 
 
 @pytest.fixture(scope="module")
@@ -50,36 +54,41 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", sorted(UCFREC.commands))
-def test_help_needs_no_slow_import(command: str) -> None:
-    assert not loaded(command, "--help") & SLOW_TO_IMPORT
+def test_help_needs_no_slow_import() -> None:
+    found = loaded(*((command, "--help") for command in UCFREC.commands))
+    assert len(found) == len(UCFREC.commands)
+    assert not found[-1] & SLOW_TO_IMPORT
 
 
-def test_checking_a_log_needs_neither_torch_nor_pandas(log: Path) -> None:
-    found = loaded("prepare", log, "--validate")
-    assert not found & (SLOW_TO_IMPORT - {"duckdb", "pyarrow"} | TRAINING | ACTING)
-
-
-def test_preparing_a_log_needs_neither_torch_nor_pandas(log: Path, tmp_path: Path) -> None:
-    found = loaded("prepare", log, "--out", tmp_path / "store")
-    assert not found & (SLOW_TO_IMPORT - {"duckdb", "pyarrow", "scipy"} | TRAINING | ACTING)
+def test_checking_and_preparing_a_log_need_neither_torch_nor_pandas(
+    log: Path, tmp_path: Path
+) -> None:
+    checked, prepared = loaded(
+        ("prepare", log, "--validate"), ("prepare", log, "--out", tmp_path / "store")
+    )
+    unused = SLOW_TO_IMPORT - {"duckdb", "pyarrow"} | TRAINING | ACTING
+    assert not checked & unused
+    assert not prepared & (unused - {"scipy"})
 
 
 def test_collecting_needs_no_training_code(tmp_path: Path) -> None:
-    logs = tmp_path / "logs"
-    found = loaded("collect", "--env", "synthetic-catalog", "--sessions", 5, "--out", logs)
+    out = tmp_path / "logs"
+    (found,) = loaded(("collect", "--env", "synthetic-catalog", "--sessions", 5, "--out", out))
     assert not found & (TRAINING | {"sklearn", "duckdb"})
 
 
-@pytest.mark.parametrize(
-    ("module", "needed"),
-    [
-        ("ucfrec.runs.trained_policy", {"torch", "pyarrow"}),
-        ("ucfrec.runs.run", {"torch", "pyarrow"}),
-        ("ucfrec.off_policy.evaluate", {"torch", "pyarrow", "duckdb", "pandas", "scipy"}),
-        ("ucfrec.recommending.recommend", {"torch", "pyarrow", "pandas", "duckdb"}),
-    ],
-)
-def test_what_works_on_a_run_imports_what_it_uses(module: str, needed: set[str]) -> None:
-    found = modules(f"import sys, {module}\nprint('', *sys.modules, file=sys.stderr)")
-    assert found & SLOW_TO_IMPORT <= needed
+USED = {
+    "ucfrec.runs.trained_policy": {"torch", "pyarrow"},
+    "ucfrec.runs.run": {"torch", "pyarrow"},
+    "ucfrec.recommending.recommend": {"torch", "pyarrow", "pandas", "duckdb"},
+    "ucfrec.off_policy.evaluate": {"torch", "pyarrow", "pandas", "duckdb", "scipy"},
+}
+"""Modules in an order in which each uses what those before it use."""
+
+
+def test_what_works_on_a_run_imports_what_it_uses() -> None:
+    code = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\n"
+    found = modules(code + "    print('', *sys.modules, file=sys.stderr)\n", *USED)
+    assert len(found) == len(USED)
+    for each, used in zip(found, USED.values(), strict=True):
+        assert each & SLOW_TO_IMPORT <= used | {"pydantic"}

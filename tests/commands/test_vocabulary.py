@@ -64,10 +64,7 @@ def _texts() -> Iterator[tuple[str, str]]:
             yield name, _prose(path)
     for path in sorted((ROOT / "examples").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        yield (
-            str(path.relative_to(ROOT)),
-            "\n".join("".join(cell["source"]) for cell in cells),
-        )
+        yield (str(path.relative_to(ROOT)), "\n".join("".join(cell["source"]) for cell in cells))
 
 
 def _prose(path: Path) -> str:

@@ -140,9 +140,7 @@ def hopper(
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(
-    ("config", "varied"),
-    [(TANGENT, True), (FAITHFUL, False)],
-    ids=["tangent", "faithful"],
+    ("config", "varied"), [(TANGENT, True), (FAITHFUL, False)], ids=["tangent", "faithful"]
 )
 def test_edit_collapse_on_hopper(
     hopper: tuple[CausalRewardModel, Transitions, Transitions],

@@ -9,12 +9,7 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    Posterior,
-    kl_to_prior,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, Posterior, kl_to_prior
 from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
 from ucfrec.errors import InputError
 

@@ -14,7 +14,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
-from ucfrec.plugins import load_plugin
 from ucfrec_datasets.kuairand import DATASET
 
 KEYS = ["user_id", "video_id", "time_ms"]
@@ -130,10 +129,6 @@ def test_the_statistics_are_joined_only_when_named(tmp_path: Path) -> None:
     assert len(DATASET.resolve([tmp_path, statistics], LogMapping())[1].item_features) == 2
 
 
-def test_it_is_announced() -> None:
-    assert load_plugin("datasets", "kuairand") is not None
-
-
 @pytest.mark.realdata
 def test_duplicates_are_those_an_independent_count_finds() -> None:
     folder, log = real_log()
@@ -145,19 +140,6 @@ def test_duplicates_are_those_an_independent_count_finds() -> None:
     assert report["rows_read"] == len(log) == 94_784
     assert report["users"] == log["user_id"].nunique()
     assert report["items"] == log["video_id"].nunique()
-
-
-@pytest.mark.realdata
-def test_the_real_log_in_shuffled_order_gives_the_same_store(tmp_path: Path) -> None:
-    folder, log = real_log()
-    _, mapping = DATASET.resolve([folder], LogMapping())
-    log.sample(frac=1, random_state=0).to_csv(tmp_path / "log_standard_x.csv", index=False)
-    for name, source in (("a", folder), ("b", tmp_path / "log_standard_x.csv")):
-        files, _ = DATASET.resolve([source], LogMapping())
-        prepare(files, mapping, tmp_path / name, PrepareOptions(embedding_size=8))
-    stores = [EpisodeStore.open(tmp_path / name) for name in "ab"]
-    assert stores[0].record.fingerprint == stores[1].record.fingerprint
-    assert stores[0].item_states.embeddings.equal(stores[1].item_states.embeddings)
 
 
 @pytest.mark.realdata

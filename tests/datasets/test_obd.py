@@ -20,7 +20,6 @@ from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.verdict import conclude
-from ucfrec.plugins import load_plugin
 from ucfrec_datasets.obd import DATASET
 
 ITEMS, POSITIONS, ROWS = 6, 3, 400
@@ -125,10 +124,6 @@ def test_item_features_are_those_of_the_campaign(tmp_path: Path) -> None:
         (tmp_path / name).write_text("item_id\n0\n")
     _, mapping = DATASET.resolve([tmp_path / "random_men.csv"], LogMapping())
     assert mapping.item_features[0].files == (tmp_path / "item_context_men.csv",)
-
-
-def test_it_is_announced() -> None:
-    assert load_plugin("datasets", "obd") is DATASET
 
 
 def real(policy: str) -> tuple[Path, pd.DataFrame]:

@@ -6,17 +6,15 @@ import matplotlib as mpl
 import pandas as pd
 
 from tests.recommending.test_recommend import random_log
+from tests.support.logs import store_of
 from ucfrec import EpisodeStore
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs import LogMapping, prepare
 
 
 def test_the_frame_has_the_rows_of_the_log(tmp_path: Path) -> None:
     log = random_log(rows=300).assign(propensity=0.25)
     log["user_id"] = "u" + log.user_id.astype(str)
-    log.to_parquet(tmp_path / "log.parquet")
-    options = PrepareOptions(session_by="gap", gap_minutes=60)
-    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
-    store = EpisodeStore.open(tmp_path / "store")
+    store = store_of(log, tmp_path, session_by="gap", gap_minutes=60)
     frame = store.to_frame()
     keys = ["user_id", "timestamp", "item_id", "reward", "propensity"]
     found = frame[keys].sort_values(keys, ignore_index=True)

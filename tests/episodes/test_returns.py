@@ -40,13 +40,6 @@ def test_other_rewards_within_rounding(episodes: list[list[float]]) -> None:
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
 
 
-@given(episodes_of_eighths)
-def test_episodes_do_not_touch_each_other(episodes: list[list[float]]) -> None:
-    together = returns_to_go(*flat(episodes))
-    apart = [returns_to_go(*flat([episode])) for episode in episodes]
-    assert np.array_equal(together, np.concatenate(apart))
-
-
 def test_a_long_store_keeps_its_digits() -> None:
     """Prefix sums are differenced: in float32 they would have lost the last episodes."""
     rng = np.random.default_rng(0)

@@ -71,13 +71,7 @@ def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]
     seed=st.integers(0, 99),
 )
 def test_training_and_acting_agree_to_the_last_bit(
-    lengths: list[int],
-    rows: int,
-    length: int,
-    window: int,
-    users: int,
-    observation: int,
-    seed: int,
+    lengths: list[int], rows: int, length: int, window: int, users: int, observation: int, seed: int
 ) -> None:
     episodes = random_episodes(lengths, seed, observation)
     rng = np.random.default_rng(seed)

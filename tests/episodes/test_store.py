@@ -132,10 +132,7 @@ def test_splits_are_counted_in_the_record(folder: Path) -> None:
     store = write_store(folder / "store", episodes, shard_steps=6)
     for number, name in enumerate(schema.SPLITS):
         mine = [e for e in episodes if e.split == number]
-        assert store.record.splits[name] == {
-            "episodes": len(mine),
-            "steps": sum(map(len, mine)),
-        }
+        assert store.record.splits[name] == {"episodes": len(mine), "steps": sum(map(len, mine))}
 
 
 def test_without_a_split_everything_is_for_training(folder: Path) -> None:

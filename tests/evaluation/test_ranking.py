@@ -14,6 +14,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from tests.recommending.test_recommend import SETTINGS, random_log
+from tests.support.logs import store_of
 from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.item_counts import TrainingCounts
@@ -90,10 +91,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     log = pd.DataFrame({"user_id": rng.integers(60, size=n), "item_id": rng.integers(40, size=n)})
     log["is_click"] = (log.user_id % 2 == log.item_id % 2) & (rng.random(n) < 0.9)
     log["timestamp"] = 1_700_000_000_000 + 60_000 * np.arange(n)
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="is_click", session_by="user")
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(log, folder, reward="is_click", session_by="user")
 
 
 def alone(store: EpisodeStore) -> Later:

@@ -17,13 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import (
-    atomic_file,
-    atomic_folder,
-    read_json,
-    write_json,
-    write_sealed_json,
-)
+from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json, write_sealed_json
 from ucfrec.fitting.checkpoint import save_tensors
 
 

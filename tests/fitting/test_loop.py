@@ -63,43 +63,35 @@ def left_alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fit]:
 
 
 @pytest.fixture(scope="module")
-def killed_often(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, dict[str, Any]]]:
-    folders = [tmp_path_factory.mktemp("killed") for _ in range(2)]
+def killed_often(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("killed")
     script = subprocess.run(
-        [sys.executable, ROOT / "tests" / "support" / "killed_training.py", "1", *folders],
+        [sys.executable, ROOT / "tests" / "support" / "killed_training.py", "1", folder],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=600,
     )
     assert script.returncode == 0, script.stderr
-    return list(zip(folders, json.loads(script.stdout), strict=True))
+    return folder, json.loads(script.stdout)
 
 
-@pytest.mark.parametrize("name", ["best.safetensors", "last.safetensors"])
 def test_killed_training_ends_as_if_left_alone(
-    left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]], name: str
+    left_alone: tuple[Path, Fit], killed_often: tuple[Path, dict[str, Any]]
 ) -> None:
-    calm, calm_fit = left_alone
-    expected, _ = load_tensors(calm / name)
-    for folder, ended in killed_often:
-        assert ended["killed"] >= 3
-        for key in ("steps", "best_step", "best_validation"):
-            assert ended[key] == getattr(calm_fit, key)
-        tensors, _ = load_tensors(folder / name)
-        assert tensors.keys() == expected.keys()
-        for key, tensor in tensors.items():
+    (calm, calm_fit), (folder, ended) = left_alone, killed_often
+    assert ended["killed"] >= 3
+    for key in ("steps", "best_step", "best_validation"):
+        assert ended[key] == getattr(calm_fit, key)
+    for name in ("best.safetensors", "last.safetensors"):
+        expected, found = (load_tensors(each / name)[0] for each in (calm, folder))
+        assert found.keys() == expected.keys()
+        for key, tensor in found.items():
             assert torch.equal(tensor, expected[key]), key
-
-
-def test_every_validation_of_a_killed_training_is_logged(
-    left_alone: tuple[Path, Fit], killed_often: list[tuple[Path, dict[str, Any]]]
-) -> None:
     every = range(killed_training.EVERY, killed_training.STEPS + 1, killed_training.EVERY)
-    expected = read_metrics(left_alone[0])["validation_loss"]
-    assert list(expected) == list(every)
-    for folder, _ in killed_often:
-        assert read_metrics(folder)["validation_loss"] == expected
+    losses, logged = (read_metrics(each)["validation_loss"] for each in (calm, folder))
+    assert list(losses) == list(every)
+    assert logged == losses
 
 
 def test_a_longer_training_goes_on_where_a_shorter_one_ended(tmp_path: Path) -> None:

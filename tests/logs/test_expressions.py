@@ -305,17 +305,16 @@ def test_no_way_in_lets_an_attack_through(
         ["score", run, log, "--out", out],
         ["ope", run, log, "--json", out],
     ]
-    # Two of the ten ways each: more than twenty attacks come by every way.
-    place = BY_COMMAND.index(name)
-    for way in (ways[(place + step) % len(ways)] for step in (0, 5)):
-        capsys.readouterr()
-        assert main(way) == 2, way
-        printed = capsys.readouterr()
-        line = printed.err.strip()
-        assert line.isprintable(), line
-        assert len(line) < 1000
-        assert SECRET not in printed.out + printed.err
-        assert snapshot(tmp_path) == before
+    # One of the ten ways each: more than ten attacks come by every way.
+    way = ways[BY_COMMAND.index(name) % len(ways)]
+    capsys.readouterr()
+    assert main(way) == 2, way
+    printed = capsys.readouterr()
+    line = printed.err.strip()
+    assert line.isprintable(), line
+    assert len(line) < 1000
+    assert SECRET not in printed.out + printed.err
+    assert snapshot(tmp_path) == before
 
 
 def test_messages_say_where_the_expression_is_and_what_is_allowed(
@@ -434,7 +433,7 @@ SQL_WORDS = """
 WORDS = st.sampled_from([*SQL_WORDS.split(), "\n"])
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(text=st.one_of(st.lists(WORDS, max_size=12).map(" ".join), st.text(max_size=40)))
 def test_soup_is_refused_or_is_a_value_of_each_row(
     connection: duckdb.DuckDBPyConnection, table: Table, text: str

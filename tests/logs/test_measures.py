@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import store_of
 from ucfrec import schema
 from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs import measures
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.measures import Moments
-from ucfrec.logs.prepare import PrepareOptions, prepare
 
 
 def test_batches_give_the_moments_of_all() -> None:
@@ -43,10 +43,7 @@ def prepared(tmp_path: Path, rewards: Array, mapping: LogMapping | None = None) 
             "reward": rewards,
         }
     ).sample(frac=1, random_state=1)
-    log.to_parquet(tmp_path / "log.parquet")
-    options = PrepareOptions(split=(1.0, 0.0, 0.0), embedding_size=2)
-    prepare([tmp_path / "log.parquet"], mapping or LogMapping(), tmp_path / "store", options)
-    return EpisodeStore.open(tmp_path / "store")
+    return store_of(log, tmp_path, mapping or LogMapping(), split=(1.0, 0.0, 0.0), embedding_size=2)
 
 
 def counted(values: Array, found: dict[str, Any]) -> None:

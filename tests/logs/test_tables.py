@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.support.logs import write
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -33,15 +34,6 @@ def make_log(rows: int = 400, users: int = 100, step: int = 600_000) -> pd.DataF
     return log
 
 
-def write(frame: pd.DataFrame, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".csv":
-        frame.to_csv(path, index=False)
-    else:
-        frame.to_parquet(path, index=False)
-    return path
-
-
 def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
     """The report of a folder and its meta.json's fingerprint, with features as files say."""
     logs, mapping = generic.DATASET.resolve([folder], LogMapping(columns))
@@ -53,8 +45,10 @@ def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
 # Folders
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-@pytest.mark.parametrize("name", ["user_id", "item_id", "reward", "timestamp"])
+@pytest.mark.parametrize(
+    ("name", "suffix"),
+    [("user_id", ".csv"), ("item_id", ".parquet"), ("reward", ".csv"), ("timestamp", ".parquet")],
+)
 def test_the_name_of_a_folder_replaces_no_column(tmp_path: Path, name: str, suffix: str) -> None:
     log = make_log()
     write(log, tmp_path / f"{name}=7" / f"log{suffix}")
@@ -149,11 +143,7 @@ USERS = pd.DataFrame(
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 @pytest.mark.parametrize(
     "second",
-    [
-        ["user_id", "spend", "age"],
-        ["spend", "age", "user_id"],
-        ["AGE", "User_ID", "spend"],
-    ],
+    [["user_id", "spend", "age"], ["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]],
 )
 def test_parts_of_features_are_joined_by_the_names_of_their_columns(
     tmp_path: Path, suffix: str, second: list[str]
@@ -226,8 +216,16 @@ def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> N
 # Identifiers
 
 
-@pytest.mark.parametrize("late", ["007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é"])
-@pytest.mark.parametrize("rows", [40, 21_000])
+@pytest.mark.parametrize(
+    ("late", "rows"),
+    [
+        *(
+            (late, 40)
+            for late in ("007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é")
+        ),
+        *((late, 21_000) for late in ("007", "1e1", "7 ", "é")),
+    ],
+)
 def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows: int) -> None:
     """Also where DuckDB, which looks at the first rows, takes the column for whole numbers."""
     ids = [*map(str, np.arange(rows) % 49 + 1)]
@@ -311,11 +309,13 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
     assert (report["steps"], report["unknown_propensities"]) == (1500, 700)
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize(
+    ("suffix", "kind"),
+    [(".parquet", "object"), (".parquet", "float64"), (".parquet", "string"), (".csv", "object")],
+)
 @pytest.mark.parametrize(
     "name", ["propensity", "session_id", "is_random", "observation", "feedback"]
 )
-@pytest.mark.parametrize("kind", ["object", "float64", "string"])
 def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     tmp_path: Path, suffix: str, name: str, kind: str
 ) -> None:

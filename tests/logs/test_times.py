@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import write
 from ucfrec.errors import InputError
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping, read_mapping
@@ -27,14 +28,6 @@ def make_log(times: "pd.Series[str] | pd.DatetimeIndex | pd.Index[str]") -> pd.D
     )
 
 
-def write(frame: pd.DataFrame, path: Path) -> Path:
-    if path.suffix == ".csv":
-        frame.to_csv(path, index=False)
-    else:
-        frame.to_parquet(path, index=False)
-    return path
-
-
 def days(begin: str, n: int, rows: int = 3000) -> pd.DatetimeIndex:
     return pd.DatetimeIndex(
         pd.Timestamp(begin) + pd.to_timedelta(np.arange(rows) * (n * 86_400 / rows), unit="s")
@@ -46,9 +39,20 @@ def range_of(path: Path, mapping: LogMapping | None = None) -> list[str]:
     return [f"{pd.Timestamp(each, unit='ms'):%Y-%m-%d}" for each in report["time_range_ms"]]
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-@pytest.mark.parametrize("sign", ["/", ".", "-"])
-@pytest.mark.parametrize("clock", ["", " %H:%M", " %H:%M:%S", ", %H:%M:%S", " %I:%M:%S %p"])
+@pytest.mark.parametrize(
+    ("suffix", "sign", "clock"),
+    [
+        (".csv", "/", ""),
+        (".parquet", ".", ""),
+        (".csv", "-", " %H:%M"),
+        (".parquet", "/", " %H:%M:%S"),
+        (".csv", ".", " %H:%M:%S"),
+        (".parquet", "-", ", %H:%M:%S"),
+        (".csv", "/", ", %H:%M:%S"),
+        (".parquet", "/", " %I:%M:%S %p"),
+        (".csv", "-", " %I:%M:%S %p"),
+    ],
+)
 def test_an_order_of_day_and_month_that_no_row_settles_is_a_question(
     tmp_path: Path, suffix: str, sign: str, clock: str
 ) -> None:

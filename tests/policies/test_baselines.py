@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.policies.test_ucf import (
-    CATALOG,
-    VECTORS,
-    both_heads,
-    build,
-    changed_at,
-    random_windows,
-)
+from tests.policies.test_ucf import CATALOG, VECTORS, both_heads, build, changed_at, random_windows
 from tests.support.episodes import lengths_of, random_episodes, some_states, write_store
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows

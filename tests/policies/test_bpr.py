@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import store_of
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.results.rows_file import read_results
 
 PEERS = ("bpr", "gsasrec", "boosted")
@@ -24,10 +24,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
     log["timestamp"] = 1_700_000_000_000 + 60_000 * np.arange(n)
     # Most of what is shown was liked: gSASRec sees which items were shown, and no rewards.
     log = log[(log.reward > 0) | (rng.random(n) < 0.05)]
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="user")
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(log, folder, reward="reward", session_by="user")
 
 
 @pytest.mark.parametrize("name", PEERS)

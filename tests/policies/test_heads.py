@@ -140,8 +140,7 @@ def test_its_gradient_approaches_the_full_one() -> None:
     for samples in (20, 100, 1000):
         sampling(head, samples)
         sampled = gradients_of(
-            head,
-            lambda: torch.stack([head.loss(features, actions) for _ in range(40)]).mean(),
+            head, lambda: torch.stack([head.loss(features, actions) for _ in range(40)]).mean()
         )
         differences.append(float((sampled - full).norm() / full.norm()))
     assert differences[0] > differences[1] > differences[2]

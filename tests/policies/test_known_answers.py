@@ -13,14 +13,14 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-KINDS, STEPS, SESSIONS = 4, 3, 500
+KINDS, STEPS, SESSIONS = 4, 3, 400
 KNOWS_NOBODY = ("popular", "item-rate", "recent-clicks", "recent-rate")
 SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "bpr", "boosted")
 ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:])
 SETTINGS = [
-    "train.steps=80",
-    "train.validate_every=80",
-    "train.learning_rate=0.005",
+    "train.steps=45",
+    "train.validate_every=45",
+    "train.learning_rate=0.01",
     "train.warmup_steps=0",
     "train.batch_size=64",
     "policy.context=3",
@@ -30,8 +30,10 @@ SETTINGS = [
 ]
 EXTRA = {
     "dt4rec": ["policy.layers=1", "policy.negatives=1"],
-    "edt4rec": ["policy.cql_steps=30"],
+    "edt4rec": ["policy.cql_steps=20"],
     "lsdt": ["policy.kernel_groups=4"],
+    "sasrec": ["train.steps=120", "train.learning_rate=0.005"],
+    "gsasrec": ["train.steps=80", "train.learning_rate=0.005"],
 }
 
 

@@ -8,15 +8,10 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.support.logs import store_of
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
-from ucfrec.policies.recent import (
-    HALF_LIVES,
-    RecentClicksPolicy,
-    RecentRatePolicy,
-    decayed_counts,
-)
+from ucfrec.policies.recent import HALF_LIVES, RecentClicksPolicy, RecentRatePolicy, decayed_counts
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -24,7 +19,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 ITEMS, DAYS = 20, 10
 
 
-def store_of(folder: Path, drifts: bool) -> EpisodeStore:
+def drifting_store(folder: Path, drifts: bool) -> EpisodeStore:
     """A log in which, if it drifts, other items are liked every day."""
     rng, n = np.random.default_rng(0), 8000
     log = pd.DataFrame(
@@ -34,14 +29,11 @@ def store_of(folder: Path, drifts: bool) -> EpisodeStore:
     log["timestamp"] = 1_700_000_000_000 + (days * 86_400_000).astype(np.int64)
     favourite = (log.item_id + (days.astype(int) if drifts else 0)) % 10 < 3
     log["reward"] = (rng.random(n) < np.where(favourite, 0.8, 0.1)).astype(float)
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="user", split=(0.85, 0.05, 0.1))
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(log, folder, reward="reward", session_by="user", split=(0.85, 0.05, 0.1))
 
 
 def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
-    train = store_of(tmp_path, drifts=False).split("train")
+    train = drifting_store(tmp_path, drifts=False).split("train")
     whole, half = decayed_counts(train, math.inf), decayed_counts(train, 24.0)
     exact = TrainingCounts.of(train)
     torch.testing.assert_close(whole.shown, exact.shown.double())
@@ -59,14 +51,14 @@ def test_the_half_life_is_short_where_tastes_change(
     found = {}
     for drifts in (False, True):
         (tmp_path / str(drifts)).mkdir()
-        store = store_of(tmp_path / str(drifts), drifts)
+        store = drifting_store(tmp_path / str(drifts), drifts)
         found[drifts] = kind.best(store.split("train"), store.split("validation"))
     assert found[True] <= 24 < 96 <= found[False]
     assert {*found.values()} <= {*HALF_LIVES}
 
 
 def test_a_run_beats_the_item_rate_where_tastes_change(tmp_path: Path) -> None:
-    store = store_of(tmp_path, drifts=True)
+    store = drifting_store(tmp_path, drifts=True)
     test, rates = store.split("test"), []
     liked = test.column("reward") > 0
     for name in ("item-rate", "recent-rate", "recent-clicks"):

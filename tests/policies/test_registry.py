@@ -143,18 +143,6 @@ def test_every_name_is_a_learner(name: str) -> None:
     assert issubclass(policy_class(name), SequencePolicy)
 
 
-def test_names_are_known_without_importing_any_learner() -> None:
-    program = (
-        "import sys; from ucfrec.policies.registry import policy_names; "
-        "assert 'lsdt' in policy_names(); "
-        "print({'torch', 'pydantic', 'gymnasium', 'ucfrec.policies.ucf'} & set(sys.modules))"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert ended.stdout.strip() == "set()"
-
-
 @pytest.mark.usefixtures("installed")
 def test_an_installed_learner_is_trained_listed_and_read_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

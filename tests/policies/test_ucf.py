@@ -212,8 +212,8 @@ def trained_attention(lambda_mask: float) -> tuple[Tensor, Tensor]:
     torch.manual_seed(0)
     policy = UCFPolicy(UCFConfig(**SMALL, dropout=0.0, lambda_mask=lambda_mask), VECTORS)
     windows = random_windows(VECTORS)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
-    for _ in range(150):
+    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-2)
+    for _ in range(60):
         optimizer.zero_grad()
         policy.loss(windows)[0].backward()
         optimizer.step()

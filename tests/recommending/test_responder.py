@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from tests.support.served import FULL, as_frame, histories, requests_of, responder
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
@@ -18,11 +18,6 @@ from ucfrec.recommending.requests import HistoryReader, Request, Row
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("served"))
 
 
 def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:
@@ -90,9 +85,7 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
-def test_a_request_id_gives_the_same_answer_and_another_draws_again(
-    trained: TrainedPolicy,
-) -> None:
+def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: TrainedPolicy) -> None:
     by = responder(trained, k=9, rule=DecisionRule(3.0, temperature=4.0))
     given = [Request(user_id=7, request_id=name) for name in ("a", "a", "b")] + [Request(user_id=7)]
     one, same, other, made = by.answers(given)

@@ -12,23 +12,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.support.served import (
-    as_frame,
-    histories,
-    requests_of,
-    responder,
-    trained_run,
-    with_rule,
-)
+from tests.support.served import as_frame, histories, requests_of, responder, with_rule
 from ucfrec.commands.cli import main
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.stream import answer_stream
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("stream"))
 
 
 class Blocks:

@@ -1,5 +1,6 @@
 """The application: answers equal to the command's, one clear error per bad request, limits."""
 
+import argparse
 import asyncio
 import json
 import time
@@ -11,8 +12,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder, trained_run
+from tests.support.served import FULL, as_frame, histories, requests_of, responder
 from ucfrec.commands.cli import main
+from ucfrec.commands.serve import _allowed_hosts
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -22,11 +24,6 @@ pytest.importorskip("fastapi_offline")
 pytest.importorskip("prometheus_client")
 # After the check that they are installed.
 from ucfrec.recommending.web import ServerLimits, application  # noqa: E402
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
-    return trained_run(tmp_path_factory.mktemp("web"))
 
 
 @asynccontextmanager
@@ -233,3 +230,28 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     assert "https://" not in page.text
     assert (nothing.status_code, nothing.json()) == (404, {"error": "Not Found"})
     assert (wrong_method.status_code, wrong_method.json()) == (405, {"error": "Method Not Allowed"})
+
+
+@pytest.mark.parametrize(
+    ("hosts", "answered"),
+    [
+        ("shop.example, *.shop.example", {"shop.example": 200, "a.shop.example": 200, "b": 400}),
+        ("*", {"anything": 200}),
+        ("::1", {"[::1]": 200, "[::2]:80": 400}),
+    ],
+)
+def test_hosts_that_are_allowed(
+    trained: TrainedPolicy, hosts: str, answered: dict[str, int]
+) -> None:
+    given = _allowed_hosts(argparse.Namespace(allowed_hosts=hosts))
+
+    async def statuses() -> dict[str, int]:
+        app = application(responder(trained), ServerLimits(), given)
+        transport = httpx.ASGITransport(app=app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
+            return {
+                host: (await http.get("/health", headers={"Host": host})).status_code
+                for host in answered
+            }
+
+    assert asyncio.run(statuses()) == answered

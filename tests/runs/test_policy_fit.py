@@ -92,11 +92,7 @@ def started(store: Path, run: Path, *more: str) -> "subprocess.CompletedProcess[
     ]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.run(
-        command,
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=300,
+        command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=300
     )
 
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from tests.recommending.test_recommend import random_log
+from tests.support.logs import store_of
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.off_policy.score import held_out_sessions
 from ucfrec.runs.record import REFIT, RunRecord
 from ucfrec.runs.refit import SHARE, refit_within
@@ -25,9 +25,7 @@ SETS = [word for each in (*TINY, "train.learning_rate=0.01") for word in ("--set
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("refit")
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="user")
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    store_of(random_log(), folder, reward="reward", session_by="user")
     assert main(["train", str(folder / "store"), "--out", str(folder / "run"), *SETS]) == 0
     return folder
 
@@ -42,6 +40,12 @@ def test_a_trained_run_acts_by_weights_that_have_seen_all_rows(folder: Path) -> 
     assert whole.folder == split.folder == run
     assert not torch.equal(whole.policy.head.correction, split.policy.head.correction)  # type: ignore[arg-type]
     assert torch.equal(whole.policy.state_mean, split.policy.state_mean)
+    assert whole.reward_model is not None
+    assert split.reward_model is not None
+    assert not torch.equal(whole.reward_model.item, split.reward_model.item)
+    assert whole.counts is not None
+    assert int(whole.counts.shown.sum()) == store.n_steps
+    assert "policy        trained on all rows, up to step" in whole.record.describe()
     assert main(["verify", str(run)]) == 0
 
 

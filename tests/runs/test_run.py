@@ -1,11 +1,8 @@
 """Runs: resumable at any moment, complete in themselves, honest about what they did."""
 
 import json
-import os
 import re
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ import torch
 
 from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
+from tests.support.killed import kills
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
@@ -23,8 +21,6 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -50,21 +46,11 @@ def left_alone(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_killed_at_any_moment_ends_as_if_left_alone(
-    store: Path, left_alone: Path, tmp_path: Path
-) -> None:
-    ended = subprocess.run(
-        [sys.executable, ROOT / "tests" / "support" / "killed_run.py", store, tmp_path / "run"],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert ended.returncode == 0, ended.stderr
-    assert int(ended.stdout.split()[-1]) >= 3
+def test_a_run_killed_at_any_moment_ends_as_if_left_alone(store: Path, left_alone: Path) -> None:
+    assert kills("run", store.parent) >= 3
     for name in ("overlay", "policy/best", "policy/last"):
         expected, _ = load_tensors(left_alone / f"{name}.safetensors")
-        tensors, _ = load_tensors(tmp_path / "run" / f"{name}.safetensors")
+        tensors, _ = load_tensors(store.parent / "killed" / f"{name}.safetensors")
         assert tensors.keys() == expected.keys()
         for key, tensor in tensors.items():
             assert torch.equal(tensor, expected[key]), f"{name} {key}"

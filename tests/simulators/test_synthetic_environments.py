@@ -86,7 +86,7 @@ def test_the_optimum_depends_on_user_and_page() -> None:
 def test_taobao_behaviors_are_ordered_and_expectations_are_those_played() -> None:
     rates = {}
     for behavior in ("random", "zero", "best-constant", "mixture", "optimal"):
-        episodes = played(TAOBAO, behavior, 3000)
+        episodes = played(TAOBAO, behavior, 1000)
         rates[behavior] = episodes.returns.sum() / episodes.lengths.sum()
     assert rates["random"] * 3 < rates["zero"] < rates["best-constant"]
     assert rates["random"] * 3 < rates["mixture"] < rates["best-constant"] / 2
@@ -100,7 +100,7 @@ def test_taobao_sessions_are_about_eight_pages() -> None:
     assert (lengths.min(), lengths.max()) == (1, 100)
 
 
-@pytest.mark.parametrize("max_turn", [1, 2, 4, 5, 6])
+@pytest.mark.parametrize("max_turn", [1, 2, 5])
 def test_rotation_is_optimal_by_brute_force(max_turn: int) -> None:
     env = SyntheticCatalog(
         1, n_items=6, n_tags=4, n_users=3, boredom_window=3, max_turn=max_turn, environment_seed=5
@@ -128,7 +128,7 @@ def test_rotation_earns_its_expected_return() -> None:
         first_steps.update(step.episodes.tolist())
         served.append(step.user_ids[fresh])
 
-    episodes = rollout(env, actor, 3000, 3, record)
+    episodes = rollout(env, actor, 1000, 3, record)
     assert (episodes.lengths == env.max_turn).all()
     luck = episodes.returns.sum() - env.optimal_returns()[np.concatenate(served)].sum()
     assert abs(luck) < 4 * np.sqrt(0.25 * episodes.lengths.sum())

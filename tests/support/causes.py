@@ -13,10 +13,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 
 QUICK = ScreeningConfig(
-    hidden=48,
-    shared_steps=300,
-    own_steps=100,
-    measurement=MeasurementConfig(trees=25),
+    hidden=48, shared_steps=300, own_steps=100, measurement=MeasurementConfig(trees=25)
 )
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 

@@ -1,9 +1,9 @@
-"""Parts of the daily loop in processes that are killed at random moments.
+"""A training, and parts of the daily loop, in processes that are killed at random moments.
 
-    python killed_loop.py update|promote|join|exposures FOLDER
+    python killed_loop.py run|update|promote|join|exposures FOLDER
 
-`FOLDER` has what `tests.support.later` and `tests.support.served` make. Prints how many processes
-were killed. What is left after each kill is checked here, the end by the caller.
+`FOLDER` has what the work needs, such as what `tests.support.served` makes. Prints how many
+processes were killed. What is left after each kill is checked here, the end by the caller.
 """
 
 import random
@@ -17,6 +17,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
+from tests.support import killed_run
 from tests.support.killed_training import life, optimizer_imported
 from tests.support.later import later_mapping
 from tests.support.short_validation import short_validation
@@ -27,7 +28,7 @@ from ucfrec.runs.promoted import promote, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import update_run
 
-LIVES = 12
+LIVES = 8
 """Of work that has no end."""
 
 
@@ -91,11 +92,17 @@ def exposures_are_whole(folder: Path) -> None:
         assert given - len(rows) // 2 < 2000
 
 
+def run(folder: Path) -> None:
+    """A whole run, until it is done."""
+    killed_run.train(folder / "store", folder / "killed")
+
+
 WORK: dict[str, tuple[Callable[[Path], None], Callable[[Path], None], float]] = {
+    "run": (run, lambda folder: None, 1.0),
     "update": (update, lambda folder: None, 1.0),
     "promote": (promote_often, promoted_is_whole, 0.3),
     "join": (join, joined_is_whole, 0.1),
-    "exposures": (write_exposures, exposures_are_whole, 0.8),
+    "exposures": (write_exposures, exposures_are_whole, 0.6),
 }
 
 

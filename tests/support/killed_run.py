@@ -1,17 +1,7 @@
-"""A whole run (reward model, edits, policy) killed at random moments until it gets to its end.
+"""A whole run (reward model, edits, policy) that `tests.support.killed_loop` kills."""
 
-    python killed_run.py STORE RUN
-
-Prints how often it was killed.
-"""
-
-import random
-import sys
 from pathlib import Path
 
-import torch
-
-from tests.support.killed_training import life, optimizer_imported
 from tests.support.short_validation import short_validation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
@@ -32,19 +22,3 @@ def train(store: Path, run: Path) -> None:
     config = resolve_config("ucf", None, [*SETTINGS, *copies], seed=3)
     with short_validation():
         train_run(EpisodeStore.open(store), run, config)
-
-
-def main() -> None:
-    torch.set_num_threads(1)
-    optimizer_imported()
-    store, run = map(Path, sys.argv[1:])
-    moments, killed = random.Random(0), 0
-    while not life(
-        lambda folder: train(store, folder), run, moments.uniform(0.1, 1.0) * 1.5**killed
-    ):
-        killed += 1
-    print(killed)
-
-
-if __name__ == "__main__":
-    main()

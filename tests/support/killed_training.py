@@ -1,8 +1,8 @@
 """Trains a small module in processes that are killed at random moments, until one gets to the end.
 
-    python killed_training.py SEED FOLDER...
+    python killed_training.py SEED FOLDER
 
-Prints, for each folder, how many processes were killed and what the last one's loop returned. One
+Prints how many processes were killed and what the last one's loop returned. One
 interpreter imports torch; each life of the training is a fork of it.
 """
 
@@ -101,14 +101,11 @@ def main() -> None:
     torch.set_num_threads(1)
     optimizer_imported()
     moments = random.Random(int(sys.argv[1]))
-    report = []
-    for folder in map(Path, sys.argv[2:]):
-        killed = 0
-        # Lives grow longer, so that a slow machine comes to an end as well.
-        while not life(recorded, folder, moments.uniform(0.0, 0.07) * 1.2**killed):
-            killed += 1
-        report.append({"killed": killed, **json.loads((folder / "fit.json").read_text())})
-    print(json.dumps(report))
+    folder, killed = Path(sys.argv[2]), 0
+    # Lives grow longer, so that a slow machine comes to an end as well.
+    while not life(recorded, folder, moments.uniform(0.0, 0.07) * 1.2**killed):
+        killed += 1
+    print(json.dumps({"killed": killed, **json.loads((folder / "fit.json").read_text())}))
 
 
 if __name__ == "__main__":

@@ -4,18 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.recommending.test_recommend import SMALL, random_log
+from tests.support.logs import store_of
 from ucfrec import EpisodeStore
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
 
 def random_store(folder: Path) -> EpisodeStore:
     """The store of `random_log`, at `folder / "store"`, beside its log."""
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(random_log(), folder, reward="reward", session_by="gap", gap_minutes=20)
 
 
 def random_run(

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from tests.support.logs import store_of
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 
 ITEMS, USERS = 24, 30
 
@@ -36,7 +36,12 @@ def tagged_mapping(folder: Path) -> LogMapping:
 
 def tagged_store(folder: Path) -> EpisodeStore:
     """The store of `tagged_log`, at `folder / "store"`, beside its log and tables."""
-    tagged_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
-    prepare([folder / "log.parquet"], tagged_mapping(folder), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(
+        tagged_log(),
+        folder,
+        tagged_mapping(folder),
+        reward="reward",
+        session_by="gap",
+        gap_minutes=120,
+        embedding_size=6,
+    )

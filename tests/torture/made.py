@@ -55,10 +55,7 @@ class Inputs:
         environment = ("--env", "synthetic-catalog")
         return [
             Job("collect", lambda out: ["collect", *environment, "--sessions", 60, "--out", out]),
-            Job(
-                "prepare",
-                lambda out: ["prepare", self.log, "--out", out, "--reward", "is_click"],
-            ),
+            Job("prepare", lambda out: ["prepare", self.log, "--out", out, "--reward", "is_click"]),
             Job("train", lambda out: ["train", self.store, "--out", out, *SETTINGS]),
             Job(
                 "recommend",

@@ -10,10 +10,10 @@ import optuna
 import pytest
 
 from tests.recommending.test_recommend import random_log
+from tests.support.logs import store_of
 from ucfrec import EpisodeStore
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -39,9 +39,7 @@ SPACE = {
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tuning")
-    random_log().to_parquet(folder / "log.parquet")
-    options = PrepareOptions(session_by="gap", gap_minutes=20)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    store_of(random_log(), folder, session_by="gap", gap_minutes=20)
     return folder / "store"
 
 

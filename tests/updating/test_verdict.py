@@ -6,11 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import store_of
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, describe
@@ -27,9 +26,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     log["timestamp"] = 1_700_000_000_000 + np.arange(rows) * 1000
     log["reward"] = (rng.random(rows) < 0.8 - 0.06 * log.item_id) * 1.0
     log["propensity"] = 1 / ITEMS
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(split=(0.6, 0.1, 0.3))
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
+    store_of(log, folder, split=(0.6, 0.1, 0.3))
     Recommender("item-rate").fit(EpisodeStore.open(folder / "store"), folder / "run")
     return TrainedPolicy.load(folder / "run")
 

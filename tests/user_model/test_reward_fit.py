@@ -18,10 +18,7 @@ from ucfrec.user_model.calibration import UserCalibration
 from ucfrec.user_model.posterior import MEMORY
 from ucfrec.user_model.reward import LAGS
 from ucfrec.user_model.reward_effects import Effects, fit_effects
-from ucfrec.user_model.reward_fit import (
-    fit_item_reward_model,
-    refit_item_reward_model,
-)
+from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_rows import RewardRows
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6

@@ -110,15 +110,9 @@ def test_sessions_that_all_end_or_never_do_are_a_constant() -> None:
 
 
 def test_only_the_last_step_of_a_cut_session_tells_nothing() -> None:
-    columns = {
-        "item": np.zeros(9, dtype=np.int64),
-        "reward": np.arange(9, dtype=np.float32),
-    }
+    columns = {"item": np.zeros(9, dtype=np.int64), "reward": np.arange(9, dtype=np.float32)}
     states = ItemStates(torch.eye(2), torch.zeros(2, 0), 0.0, 1.0)
-    episodes = {
-        "user": np.array([0, 0, 1, 1]),
-        "terminated": np.array([True, True, False, True]),
-    }
+    episodes = {"user": np.array([0, 0, 1, 1]), "terminated": np.array([True, True, False, True])}
     lengths = np.array([2, 3, 2, 2])
     store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
     logged = LoggedEnds.of(store, 2, 100, 0)

@@ -58,10 +58,7 @@ def log_of_moods(knowing: float, told: bool = True) -> EpisodeStore:
 
 
 def store_of(
-    items: IntArray,
-    rewards: BoolArray,
-    right: Float64Array | None,
-    seen: BoolArray | None = None,
+    items: IntArray, rewards: BoolArray, right: Float64Array | None, seen: BoolArray | None = None
 ) -> EpisodeStore:
     """A store of what (USERS, LENGTH) was shown, with `right` propensities and what was `seen`."""
     columns: dict[str, Any] = {"item": items.ravel(), "reward": rewards.ravel() * 1.0}

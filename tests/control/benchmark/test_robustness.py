@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from tests.support.causes import QUICK, planted_vectors
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
@@ -15,14 +13,10 @@ from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Evaluation, opened
 from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig, screen
-from ucfrec.episodes.distractor import with_observations
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
-from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import training_views
@@ -34,7 +28,6 @@ from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
-from ucfrec_control.figures.diagnostics import store_of
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.train import train_control
@@ -211,47 +204,6 @@ def test_training_with_screening_records_and_resumes(
     assert len(screening.dimensions) == 11
     assert main(arguments) == 0
     assert RunRecord.read(Path(run)).screening == screening
-
-
-def test_screening_that_finds_no_cause_at_all_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
-    columns = hopper_like((30,) * 30)
-    columns["rewards"] = columns["actions"][:, 0]  # nothing but the action has an effect
-    store = read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", columns)).write_store(tmp_path / "store")
-    config = resolve_config("dt", None, ["train.steps=2"])
-    with pytest.raises(InputError, match="no effect of any of the 11 state dimensions"):
-        train_control(store, tmp_path / "run", config, screening="drop")
-    assert not (tmp_path / "run").exists()
-
-
-def test_what_is_dropped_might_never_have_been_logged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
-    store = planted_vectors(tmp_path / "store")
-    logged = store.step_values(schema.OBSERVATION, *store.all_steps())[:, :3]
-    never = with_observations(store, tmp_path / "never", logged, {})
-    config = resolve_config(
-        "ucf", None, ["train.steps=4", "policy.dim=8", "augment.copies=1", "crm.epochs=1"]
-    )
-    record = train_control(store, tmp_path / "dropped", config, screening="drop")
-    assert record.dropped_observations == (3, 4)
-    assert record.sizes["state"] == 3
-    train_control(never, tmp_path / "plain", config)
-    for name in ("crm/cvae/last", "overlay", "policy/last"):
-        kept, other = (
-            load_tensors(tmp_path / run / f"{name}.safetensors")[0] for run in ("dropped", "plain")
-        )
-        assert kept.keys() == other.keys()
-        for key, value in kept.items():
-            assert torch.equal(value, other[key]), (name, key)
-    again = train_control(store, tmp_path / "dropped", config, screening="drop")
-    assert (again.data, again.policy) == (record.data, record.policy)
-    with pytest.raises(InputError, match="was started with --screen drop"):
-        train_control(store, tmp_path / "dropped", config, screening="copies")
-    assert store_of(tmp_path / "dropped").state_size == 3
 
 
 def test_every_file_is_screened_plain_and_distracted_once(

@@ -57,10 +57,7 @@ class _Stops:
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
 def test_a_training_that_was_interrupted_ends_as_one_left_alone(
-    store: EpisodeStore,
-    tmp_path: Path,
-    algorithm: str,
-    monkeypatch: pytest.MonkeyPatch,
+    store: EpisodeStore, tmp_path: Path, algorithm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = rl_config(dataset_of(store), algorithm, steps=7, batch_size=16)
     monkeypatch.setattr(rl_baselines, "CHECKPOINT_EVERY", 2)

@@ -317,7 +317,7 @@ def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.realdata
-@pytest.mark.parametrize("file", ZOO)
+@pytest.mark.parametrize("file", ZOO[::4])  # every environment, and every kind of data
 def test_each_zoo_file_trains_ucf_that_its_environment_judges(tmp_path: Path, file: str) -> None:
     data, store, run = data_folder("control") / f"{file}.hdf5", tmp_path / "store", tmp_path / "run"
     assert main(["prepare", str(data), "--out", str(store)]) == 0

@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import OneUser, Plain
@@ -48,6 +48,7 @@ def environments(draw: st.DrawFn) -> tuple[np.ndarray, list[tuple[int, ...]]]:
 
 
 @pytest.mark.parametrize("rule", RULES, ids=str)
+@settings(max_examples=12)
 @given(environment=environments(), seed=st.integers(0, 999))
 def test_every_exit_agrees_with_a_plain_reading(
     rule: ExitRule, environment: tuple[np.ndarray, list[tuple[int, ...]]], seed: int

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from tests.support.logs import store_of
 from tests.support.real_data import data_folder
 from ucfrec.acting.rollout import rollout
 from ucfrec.acting.uniform import Uniform
@@ -42,10 +43,7 @@ def planted_store(folder: Path, seed: int = 0, clicks: str = "planted") -> Episo
     if clicks == "ratings":
         log["is_click"] = rng.integers(6, size=6000)
     folder.mkdir()
-    log.to_parquet(folder / "log.parquet")
-    options = PrepareOptions(reward="is_click", session_by="user", embedding_size=4)
-    prepare([folder / "log.parquet"], LogMapping(), folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    return store_of(log, folder, reward="is_click", session_by="user", embedding_size=4)
 
 
 def test_planted_clicks_are_found_and_the_environment_pays_them(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.support.tagged import tagged_store
+from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.fatigue import Fatigue
 from ucfrec.user_model.main_tags import MainTags
@@ -62,8 +63,11 @@ def test_drawn_rewards_are_logged_ones_with_the_expected_mean(kind: str) -> None
         "shop": rng.choice([0, 1, 3, 8], n, p=[0.55, 0.3, 0.1, 0.05]),
         "watch time": rng.gamma(0.5, 3, n),
         "negative": rng.normal(-3, 1, n),
-    }[kind].astype(np.float64)
-    rewards = LoggedRewards.of(Logged(logged))  # type: ignore[arg-type]
+    }[kind]
+    logged = logged.astype(np.float32)
+    items = {"item": np.zeros(n, dtype=np.int64), "reward": logged}
+    states = ItemStates(torch.ones(1, 2), torch.zeros(0, 0), 0.0, 1.0)
+    rewards = LoggedRewards.of(EpisodeStore.from_arrays(items, np.full(n // 4, 4), None, states))
     low, high = np.quantile(rewards.values, [0.05, 0.95])
     for mean in np.linspace(low, high, 7):
         drawn = rewards.drawn(np.full(100_000, mean), rng.random(100_000))
@@ -71,21 +75,6 @@ def test_drawn_rewards_are_logged_ones_with_the_expected_mean(kind: str) -> None
         assert set(drawn) <= set(rewards.values)
     same = rewards.drawn(np.full(100_000, logged.mean()), rng.random(100_000))
     assert same.std() == pytest.approx(logged.std(), rel=0.1)
-
-
-class Logged:
-    """The rewards of a store, in two batches."""
-
-    def __init__(self, rewards: np.ndarray[Any, Any]) -> None:
-        self.rewards = rewards
-
-    def step_batches(self) -> list[tuple[slice, None]]:
-        half = len(self.rewards) // 2
-        return [(slice(half), None), (slice(half, None), None)]
-
-    def step_values(self, name: str, rows: slice, _: None) -> np.ndarray[Any, Any]:
-        assert name == "reward"
-        return self.rewards[rows]
 
 
 def test_users_who_liked_one_main_tag_on_end_reward_less_for_a_while(store: EpisodeStore) -> None:

@@ -143,7 +143,7 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     train, _ = log_of_tastes()
     users = fit_training_users(train, tmp_path, seed=0)
-    (file,) = tmp_path.iterdir()
+    file = tmp_path / "training_users.safetensors"
     report = dataclasses.asdict(users.report)
     for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
         save_tensors(file, users.model.state_dict(), other)

@@ -3,9 +3,9 @@
 import dataclasses
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -111,10 +111,10 @@ def fit_item_reward_model(
     rows = RewardRows.of(train, model.lags, max_rows, seed)
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
     set_statistics(model, rows, held_out, train.item_states)
-    begin = {} if first is None else kept_by(first / FITTED)
     design = Design.of(model, rows)
+    begin = None if first is None else Beginning.of(first / FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
-    if begin and not search.of_new_users:
+    if begin is not None and not search.of_new_users:
         some = np.random.default_rng(seed).permutation(len(rows)) < WARM_ROWS
         search = EffectSearch(design.select(torch.from_numpy(some)), search.held_out, begin)
     if search.of_new_users:
@@ -127,8 +127,7 @@ def fit_item_reward_model(
         search.fit_to(design)
     model.set_effects(search.effects, search.design.of_content)
     report = _report(model, search, rows, held_out, train.item_states, start)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    save_fit(folder / FITTED, model, search.effects, dataclasses.asdict(report))
     return model.eval(), report
 
 
@@ -149,7 +148,10 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, lags, max_rows, seed)
     set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
-    effects, spreads, fixed = design.mean_effect(), dict(report.kept), Effects()
+    begin, effects = Beginning.of(first / FITTED, design), design.mean_effect()
+    if begin is not None:
+        effects |= begin.effects
+    spreads, fixed = dict(report.kept), Effects()
     if report.new_users:
         lasting: dict[str, float] = {}
         for name in LASTING:
@@ -162,9 +164,9 @@ def refit_item_reward_model(
             set_usual(model, design, alone)
             model.tastes.root.copy_(tensors["tastes.root"])
             design = replace(design, tastes=added_by_tastes(model, rows.shown, rows.items))
-    model.set_effects(fit_effects(design, effects, spreads, fixed), design.of_content)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(folder / FITTED, model.state_dict(), dataclasses.asdict(report))
+    effects = fit_effects(design, effects, spreads, fixed)
+    model.set_effects(effects, design.of_content)
+    save_fit(folder / FITTED, model, effects, dataclasses.asdict(report))
     return model.eval()
 
 
@@ -192,17 +194,52 @@ def added_by_tastes(model: ItemRewardModel, shown: Shown, items: Tensor) -> Tens
     return torch.cat(added)
 
 
-def kept_by(file: Path) -> dict[str, int]:
-    """Numbers of the spreads of the effects that a fit kept; none if it is not there."""
-    if not file.exists():
-        return {}
-    with damage_explained(file, REMEDY):
-        effects = [EffectTried(**each) for each in load_tensors(file)[1]["effects"]]
-    return {
-        each.effect: int(np.abs(np.array(_SPREADS) - each.spread).argmin())
-        for each in effects
-        if each.kept
-    }
+@dataclass(frozen=True)
+class Beginning:
+    """What a fit to older or fewer rows found, where a search or a fit begins."""
+
+    spreads: dict[str, int]
+    """Numbers of the spreads of the effects that it kept."""
+    effects: Effects
+    """Its effects; those of new users and items are 0."""
+
+    @classmethod
+    def of(cls, file: Path, design: Design) -> "Beginning | None":
+        """Read what `save_fit` wrote, in the sizes of `design`; None if it is not there.
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        if not file.exists():
+            return None
+        effects = Effects()
+        with damage_explained(file, REMEDY):
+            tried = [EffectTried(**each) for each in load_tensors(file)[1]["effects"]]
+            for name, old in load_tensors(_beside(file))[0].items():
+                new = design.zeros(name)
+                if new.shape == old.shape:
+                    effects[name] = old
+                elif name in ("item", "user", "affinity") and new.shape[1:] == old.shape[1:]:
+                    # The last row of effects of users is that of unknown ones.
+                    known = old if name == "item" else old[:-1]
+                    new[: len(known)] = known
+                    effects[name] = new
+        spreads = np.array(_SPREADS)
+        numbers = {each.effect: int(np.abs(spreads - each.spread).argmin()) for each in tried}
+        return cls({each.effect: numbers[each.effect] for each in tried if each.kept}, effects)
+
+
+def save_fit(
+    file: Path, model: ItemRewardModel, effects: Effects, report: Mapping[str, Any]
+) -> None:
+    """Write a fitted model with its report, and its effects beside it; `file` is complete last."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    save_tensors(_beside(file), effects, {})
+    save_tensors(file, model.state_dict(), dict(report))
+
+
+def _beside(file: Path) -> Path:
+    return file.with_stem(file.stem + "_effects")
 
 
 class ShownBefore(NamedTuple):
@@ -220,15 +257,13 @@ class EffectSearch:
     shown: ShownBefore | None = None
     """Where users are new; needed to learn tastes within the session."""
 
-    def __init__(
-        self, design: Design, held_out: Design, begin: Mapping[str, int] | None = None
-    ) -> None:
+    def __init__(self, design: Design, held_out: Design, begin: Beginning | None = None) -> None:
         """Args:
         design: training rows.
         held_out: rows that choose.
-        begin: of `kept_by`, of a search on older rows.
+        begin: where to begin; None for a search from nothing.
         """
-        self.design, self.held_out, self._begin = design, held_out, begin or {}
+        self.design, self.held_out, self._begin = design, held_out, begin
         self.effects = design.mean_effect()
         self.kept: dict[str, int] = {}
         self.new_users = False
@@ -246,8 +281,9 @@ class EffectSearch:
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
         near, strides = _FIRST, _STRIDES.get(name, (2,))
-        if self._begin:
-            near, strides = self._begin.get(name, _FIRST), (1,) if name in self._begin else ()
+        if self._begin is not None:
+            spreads = self._begin.spreads
+            near, strides = spreads.get(name, _FIRST), (1,) if name in spreads else ()
         at, (effects, losses) = self._best(name, near, strides)
         decrease = self.losses - losses
         gain = float(decrease.mean())
@@ -268,7 +304,7 @@ class EffectSearch:
                 search = self
             if name in effects:
                 search.add(name)
-            if name == _CHEAP[-1] and not search._begin:
+            if name == _CHEAP[-1] and search._begin is None:
                 search.adjust()
             bar.update()
 
@@ -370,8 +406,10 @@ class EffectSearch:
                     spreads = {each: spreads[each] for each in spreads if each not in LASTING}
                 spreads[name] = _SPREADS[index]
                 start = self.effects
-                if self._begin and found:
-                    start = found[min(found, key=lambda other: abs(other - index))][0]
+                if self._begin is not None:
+                    start = self._begin.effects | start
+                    if found:
+                        start = found[min(found, key=lambda other: abs(other - index))][0]
                 effects = fit_effects(self.design, start, spreads, self._fixed)
                 found[index] = effects, self._losses(effects)
             return float(found[index][1].mean())

@@ -29,15 +29,16 @@ from ucfrec import schema
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
-from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.progress import progress
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
 from ucfrec.user_model.reward_fit import (
     WARM_ROWS,
+    Beginning,
     EffectSearch,
-    kept_by,
     reward_model_sizes,
+    save_fit,
     set_statistics,
 )
 from ucfrec.user_model.reward_report import SAVED, EffectTried, fit_line
@@ -112,9 +113,9 @@ def fit_training_users(
     if weighted:
         weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
-    begin = {} if first is None else kept_by(first / _FITTED)
+    begin = None if first is None else Beginning.of(first / _FITTED, design)
     few = design
-    if begin and not weighted:
+    if begin is not None and not weighted:
         few = design.select(torch.arange(len(rows)) < WARM_ROWS)
     search = EffectSearch(few, few, begin).of_training()
     with progress(len(EFFECTS), "training users", "effects") as bar:
@@ -123,13 +124,13 @@ def fit_training_users(
             bar.update()
     tried, held_back = search.report(), search.held_out
     spreads = {each.effect: each.spread for each in tried if each.kept}
-    start = search.effects if begin else design.mean_effect()
-    model.set_effects(fit_effects(design, start, spreads), design.of_content)
+    start = design.mean_effect() if begin is None else search.effects
+    effects = fit_effects(design, start, spreads)
+    model.set_effects(effects, design.of_content)
     scores = held_back.predictor(search.effects)
     line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
     report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(path, model.state_dict(), dataclasses.asdict(report))
+    save_fit(path, model, effects, dataclasses.asdict(report))
     return TrainingUsers(model.eval(), report)
 
 

@@ -15,9 +15,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import RuleChoice
-from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.nearby import near
-from ucfrec.choosing.problem import Problem
+from ucfrec.choosing.problem import Problem, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping

@@ -10,9 +10,8 @@ from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
-from ucfrec.choosing.config import RuleConfig
 from ucfrec.choosing.logged import LoggedEvidence
-from ucfrec.choosing.problem import Problem
+from ucfrec.choosing.problem import Problem, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.diagnostics import diagnose

@@ -13,14 +13,13 @@ from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_ac
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
-from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.reward_model_fit import Read, fit_crm, sample_steps, sample_transitions
 from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,
     AugmentConfig,
     augment,
     candidates,
 )
-from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError

@@ -15,7 +15,7 @@ from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.ids import IdLookup
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import mixed
 from ucfrec.recommending.histories import Histories

@@ -112,7 +112,7 @@ class Responder:
         if engine not in ENGINES:
             raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
         if engine == ONNXRUNTIME:
-            from ucfrec.recommending.score_graph import ScoreGraph
+            from ucfrec.recommending.export_graph import ScoreGraph
 
             graph = ScoreGraph(self._scorer, trained.name)
             self._scorer = self._scorer.answering_one_with(graph)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.errors import InputError
-from ucfrec.evaluation.diversity_columns import COLUMNS
+from ucfrec.evaluation.diversity import COLUMNS
 from ucfrec.off_policy.columns import SUITE
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting import charts

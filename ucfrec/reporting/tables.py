@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ucfrec.errors import one_line
-from ucfrec.reporting.statistics import Summary, summary
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import Summary, summary
 
 NONE = "–"
 """Cell of a missing value."""

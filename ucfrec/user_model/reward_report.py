@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ucfrec.arrays import Float64Array
-from ucfrec.episodes.group_auc import group_auc, ratio_with_error
+from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_rows import RewardRows
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ucfrec.benchmark.cells import Cell, opened
-from ucfrec.benchmark.estimate import Costs
+from ucfrec.benchmark.suite import Costs
 from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.runs.start import new_policy, training_views
 from ucfrec_control.benchmark.measure import rl_config_of, targets_of

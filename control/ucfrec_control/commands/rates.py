@@ -7,9 +7,9 @@ from pathlib import Path
 from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import over_seeds
 from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
-from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.measure import RATE, RATE_MEASUREMENT

@@ -306,19 +306,19 @@ class Columns:
         """
         return self._column(name).take(np.arange(self.record.n_steps))
 
-    def step_values(self, name: str, index: IntArray) -> Array:
-        """Values of step column `name` at the step indices `index`.
+    def step_values(self, index: IntArray, *names: str) -> list[Array]:
+        """Values of step columns at the step indices `index`.
 
         Args:
             index: indices among the N steps of the store, of any shape.
 
         Returns:
-            Values of the shape of `index`, followed by the size of a vector.
+            For each name, values of the shape of `index`, followed by the size of a vector.
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._column(name).take(index)
+        return [self._column(name).take(index) for name in names]
 
     def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
         """The logged states (without edits) before the given steps.
@@ -333,7 +333,7 @@ class Columns:
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
         observations = torch.zeros(*steps.shape, 0)
         if self.observation_size:
-            observations = torch.from_numpy(self.step_values(schema.OBSERVATION, index))
+            observations = torch.from_numpy(self._column(schema.OBSERVATION).take(index))
         if not self.has_items:
             return observations
         window = self.item_states.window
@@ -342,8 +342,9 @@ class Columns:
         history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, width), the last is step end − 1
         history_index = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
         valid = history >= 0
-        items = np.where(valid, self.step_values(schema.ITEM, history_index), -1).astype(np.int64)
-        rewards = np.where(valid, self.step_values(schema.REWARD, history_index), 0)
+        items, rewards = self.step_values(history_index, schema.ITEM, schema.REWARD)
+        items = np.where(valid, items, -1).astype(np.int64)
+        rewards = np.where(valid, rewards, 0)
         return self.item_states.of_sequences(
             torch.from_numpy(items),
             torch.from_numpy(rewards.astype(np.float32)),

@@ -17,7 +17,7 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import EpisodeView
-from ucfrec.episodes.windows import Overlay, Transitions, Windows
+from ucfrec.episodes.windows import Overlay
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
 
@@ -225,63 +225,6 @@ class EpisodeStore(EpisodeView):
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
         return EpisodeStore(self._columns.with_observation_dimensions(kept), self._selected)
 
-    # Windows and transitions.
-
-    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
-        """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
-
-        Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
-        [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
-
-        Args:
-            episodes: (B,) positions in the view.
-            ends: (B,) last step of each window, from 0.
-            length: K, at least 1.
-
-        Returns:
-            B windows of K steps, padded on the left.
-
-        Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
-        """
-        self._require_steps(episodes, ends, length)
-        steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
-        places = episodes[:, None], np.maximum(steps, 0)
-
-        def gather(name: str) -> Tensor:
-            return torch.from_numpy(self.step_values(name, *places))
-
-        return Windows.of(
-            torch.from_numpy(steps),
-            self._edited_states(episodes, steps),
-            gather(schema.ITEM).long() if self.has_items else gather(schema.ACTION),
-            gather(schema.REWARD),
-            gather(schema.RETURN_TO_GO),
-        )
-
-    def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states; next states are as logged, also where augmented.
-
-        Args:
-            episodes: (M,) positions in the view.
-            steps: (M,) steps of those episodes, from 0.
-
-        Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
-        """
-        window = self.windows(episodes, steps, 1)
-        last = steps == self.lengths[episodes] - 1
-        next_steps = np.where(last, steps, steps + 1)
-        next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
-        is_last = torch.from_numpy(last)
-        return Transitions(
-            states=window.states[:, 0],
-            actions=self.action_vectors(window.actions[:, 0]),
-            rewards=window.rewards[:, 0],
-            next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
-            last=is_last,
-        )
-
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, each (S,) float32, of the states of the view.
@@ -299,15 +242,6 @@ class EpisodeStore(EpisodeView):
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0)
         return mean.float(), variance.sqrt().float()
-
-    def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
-        states = self._columns.states(self._sources[episodes], steps)
-        if self.overlay is not None:
-            copies = episodes[:, None] - len(self.episode_ids)
-            rows, columns, edits = self.overlay.edits_at(copies, steps)
-            states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
-        return states
 
 
 def _require_no_copies(store: EpisodeStore, operation: str) -> None:

@@ -17,7 +17,7 @@ from pydantic import (
     TypeAdapter,
 )
 
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import SavedRule
 from ucfrec.choosing.choice import ValueEstimate
 from ucfrec.choosing.logged import Evidence
 from ucfrec.counterfactual.screening import DimensionReport
@@ -76,17 +76,6 @@ def _config(value: object) -> Config:
     return config_from_dict(value)
 
 
-def _rule(value: object) -> DecisionRule:
-    if isinstance(value, DecisionRule):
-        return value
-    if not isinstance(value, Mapping):
-        raise InputError("its rule is no decision rule")
-    return DecisionRule.from_dict(value, "the rule")
-
-
-_Rule = Annotated[DecisionRule, PlainValidator(_rule), PlainSerializer(DecisionRule.as_dict)]
-
-
 class TrainingRecord(Record):
     """What every training records, of whatever library."""
 
@@ -133,7 +122,7 @@ class Candidate(Entry):
 
     model_config = ConfigDict(extra="allow")
 
-    rule: _Rule
+    rule: SavedRule
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
     error: Number | None = None
@@ -145,7 +134,7 @@ class RuleRecord(Entry):
 
     model_config = ConfigDict(extra="allow")
 
-    rule: _Rule
+    rule: SavedRule
     chosen_by: Text
     warning: Text = ""
     candidates: tuple[Candidate, ...] = ()

@@ -155,9 +155,11 @@ def _prepare_inputs(
         require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
-        RunRecord.read(out).reopened(out, INPUTS)
+        record = RunRecord.read(out).reopened(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
-    record = RunRecord.read(out).with_entries(config=config)
+    else:
+        record = RunRecord.read(out)
+    record = record.with_entries(config=config)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:

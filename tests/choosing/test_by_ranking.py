@@ -11,9 +11,8 @@ import torch
 from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
-from ucfrec.choosing.choice import RankedRule, RuleChoice
+from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.choosing.logged import SHOWN
-from ucfrec.choosing.problem import Problem, RuleConfig
 from ucfrec.episodes.item_counts import TrainingCounts, liked_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json

@@ -20,7 +20,7 @@ from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
     refit_item_reward_model,
 )
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows
 from ucfrec.user_model.training_users import UserCalibration
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6

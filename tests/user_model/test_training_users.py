@@ -19,7 +19,7 @@ from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.runs.run import training_views
 from ucfrec.user_model.reward import LAGS, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model, reward_model_sizes
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows
 from ucfrec.user_model.training_users import (
     TrainingUsers,
     UserCalibration,

@@ -17,11 +17,10 @@ import numpy as np
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.choosing.choice import RuleChoice, SimulatedRule, ValueEstimate
+from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import roll_out
 from ucfrec.choosing.nearby import near
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator

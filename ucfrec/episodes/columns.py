@@ -16,7 +16,7 @@ from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError, one_line
-from ucfrec.files.checksums import Sealed
+from ucfrec.files.record import Sealed
 
 _REMEDY: Final = StoreRecord.REMEDY
 _DTYPES: Final = {
@@ -25,6 +25,7 @@ _DTYPES: Final = {
     **schema.STEP_DTYPES,
     **schema.EPISODE_DTYPES,
 }
+_IN_MEMORY = Path("<memory>")
 
 
 def load_column(
@@ -93,9 +94,6 @@ class StepColumn:
             in_shard = shard == i
             values[in_shard] = part[index[in_shard] - self._bounds[i]]
         return values
-
-
-_IN_MEMORY = Path("<memory>")
 
 
 class Columns:

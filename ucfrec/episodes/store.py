@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -20,15 +20,20 @@ from ucfrec.episodes.view import EpisodeView
 from ucfrec.episodes.windows import Overlay
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
+from ucfrec.files.parquet import read_ids
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["ITEM_STATES", "EpisodeStore"]
+__all__ = ["ITEM_STATES", "LONG", "EpisodeStore", "of_people", "store_frame"]
 
-
+LONG: Final = 100
+"""Times the median from which on a session is hardly a person's."""
 _STATISTICS_STEPS = 1_000_000
+_FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
+_PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
+_LISTS: Final = (schema.OBSERVATION, schema.ACTION)
 
 
 class EpisodeStore(EpisodeView):
@@ -106,9 +111,7 @@ class EpisodeStore(EpisodeView):
     # For notebooks.
 
     def to_frame(self) -> "pd.DataFrame":
-        """One row per step, with the identifiers of the logs; see `ucfrec.episodes.frame`."""
-        from ucfrec.episodes.frame import store_frame
-
+        """One row per step, with the identifiers of the logs; see `store_frame`."""
         return store_frame(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
@@ -288,3 +291,54 @@ def _of_another_store(overlay: Overlay, fault: str) -> InputError:
 
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:
     return {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+
+
+def store_frame(store: EpisodeStore) -> "pd.DataFrame":
+    """One row per step, session by session: `user_id`, `session_id` (the number of the session in
+    the store), `item_id` or `action`, the other columns of the log that the store has, and `split`.
+
+    Raises:
+        InputError: the view has augmented episodes, or a file of the store is damaged.
+    """
+    if store.overlay is not None:
+        raise InputError(f"{store} has augmented episodes; take its without_augmentation()")
+    episodes, steps = store.all_steps()
+    columns: dict[str, Any] = {}
+    if store.has_users:
+        users = store.episode_values(schema.USER)[episodes]
+        columns[schema.USER_ID] = _named(store, schema.USER_ID, users)
+    columns[schema.SESSION_ID] = store.episode_ids[episodes]
+    if store.has_items:
+        items = store.step_values(schema.ITEM, episodes, steps)
+        columns[schema.ITEM_ID] = _named(store, schema.ITEM_ID, items)
+    for name in _PLAIN:
+        if name in store.record.columns:
+            columns[name] = store.step_values(name, episodes, steps)
+    for name in _LISTS:
+        if name in store.record.columns:
+            columns[name] = list(store.step_values(name, episodes, steps))
+    splits = store.episode_values(schema.SPLIT)[episodes]
+    columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
+    return pd.DataFrame(columns)
+
+
+def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:
+    """Identifiers of the logs; the numbers themselves in a store without their table."""
+    path = store.path / _FILES[column]
+    return read_ids(path, column)[numbers] if path.exists() else numbers
+
+
+def of_people(view: EpisodeStore) -> EpisodeStore:
+    """The view without sessions of more than `LONG` times the median number of steps.
+
+    One session of thousands of steps would otherwise set the largest target return, be a good part
+    of the rows that the user model is fitted to, and let simulated sessions go on as long.
+
+    Args:
+        view: of a store of items, without augmentation; the same is returned if it has no such
+            session.
+    """
+    if not view.n_episodes:
+        return view
+    kept = view.lengths <= LONG * np.median(view.lengths)
+    return view if kept.all() else view.select(np.flatnonzero(kept))

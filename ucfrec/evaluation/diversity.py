@@ -16,6 +16,13 @@ from ucfrec.evaluation.collect import Catalog, environment_items
 
 Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
 """Similarity (M,) of two aligned arrays of items (M,), at most 1; equal items have 1."""
+TAGS = "tags"
+"""Catalogue column with the list of each item's tags."""
+ONE_HOT = "tag_"
+"""Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
+COLUMNS = (
+    "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
+)  # fmt: skip
 
 
 @dataclass
@@ -121,15 +128,6 @@ def dominance(items: IntArray, incidence: BoolArray, dominant: BoolArray) -> flo
         dominant: (n_tags,) from `dominant_tags`.
     """
     return float(incidence[items][:, dominant].any(axis=1).mean())
-
-
-TAGS = "tags"
-"""Catalogue column with the list of each item's tags."""
-ONE_HOT = "tag_"
-"""Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
-COLUMNS = (
-    "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
-)  # fmt: skip
 
 
 def variety_columns(

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
@@ -26,6 +26,12 @@ REWARD: Final = "reward"
 _Floats = Float64Array
 Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 """Reads the item table from an environment and its number of items."""
+_Observed = tuple[tuple[str | None, spaces.Space[Any]], ...]
+"""Spaces that are observed and their keys in the dict observation; None for all of it."""
+FEATURES: Final = "features"
+"""Column of the item table with an array's numbers."""
+TAGS: Final = "tags"
+"""Column of the item table with the numbers of an array's true columns."""
 
 
 def gymnasium_simulator(
@@ -202,10 +208,6 @@ def _actions(
     )
 
 
-_Observed = tuple[tuple[str | None, spaces.Space[Any]], ...]
-"""Spaces that are observed and their keys in the dict observation; None for all of it."""
-
-
 def _observed(
     space: spaces.Space[Any], keys: tuple[str, ...], vectors: bool, env_id: str
 ) -> _Observed:
@@ -232,12 +234,6 @@ def _user(info: dict[str, Any]) -> dict[str, IntArray]:
     if user.shape != () or user.dtype.kind not in "iu":
         raise InputError(f"info[{USER_IDS!r}] is {info[USER_IDS]!r}; it must be a whole number")
     return {USER_IDS: user.astype(np.int64)}
-
-
-FEATURES: Final = "features"
-"""Column of the item table with an array's numbers."""
-TAGS: Final = "tags"
-"""Column of the item table with the numbers of an array's true columns."""
 
 
 def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Table:

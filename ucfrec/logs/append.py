@@ -22,12 +22,11 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import file_checksum
+from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
-from ucfrec.logs.ids import ID_TABLES, write_ids
+from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import PreparedLog, PrepareOptions, prepared_log
-from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.progress import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)

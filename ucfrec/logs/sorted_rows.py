@@ -18,11 +18,25 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
 from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import Digests, Hashes, digests, in_hashed_order, kept_rows
+from ucfrec.logs.kept import (
+    REASONS,
+    Digests,
+    Hashes,
+    digests,
+    faults,
+    in_hashed_order,
+    kept_rows,
+    require_rewards_in_range,
+)
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.typed import ROWS, WANTED, TypedLog
+
+CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
+"""Id column to the table of its ids and their codes, numbers in the order of the ids."""
+_SESSION_CODES: Final = "session_codes"
+UNPLACED: Final = 128
+"""Added to the fault of rows without a user or a time, which have no place in the order."""
 
 
 class RowVectors:
@@ -76,13 +90,6 @@ class RowVectors:
             column = pa.FixedSizeListArray.from_arrays(numbers, self._size)
             yield batch.append_column(schema.OBSERVATION, column)
         self._file.unlink()
-
-
-CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
-"""Id column to the table of its ids and their codes, numbers in the order of the ids."""
-_SESSION_CODES: Final = "session_codes"
-UNPLACED: Final = 128
-"""Added to the fault of rows without a user or a time, which have no place in the order."""
 
 
 @dataclass
@@ -253,7 +260,7 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
 
     Args:
         rows: relation of some of its typed rows.
-        conditions: as from `ucfrec.logs.clean.faults`.
+        conditions: as from `ucfrec.logs.kept.faults`.
     """
     cases = " ".join(
         f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()

@@ -27,8 +27,8 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
 from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import faults
 from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.kept import faults
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
 from ucfrec.logs.tables import Table
@@ -46,6 +46,20 @@ from ucfrec.logs.typed import (
 
 MEMORY: Final = "1GB"
 """Memory of DuckDB in a task."""
+_TYPES: Final = {"BIGINT": "bigint", "VARCHAR": "string"}
+_COLUMNS: Final = {
+    schema.ACTION: "array<float>",
+    schema.TIMESTAMP: "bigint",
+    schema.OBSERVATION: "array<float>",
+    schema.PROPENSITY: "float",
+    schema.IS_RANDOM: "boolean",
+}
+_COUNTS: Final = "file bigint, name string, size bigint, n bigint"
+_ROWS, _BAD = "rows", "bad"
+_TYPED: Final = "typed"
+_REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
+Files = Sequence[tuple[str, Table]]
+"""Of each file, the SQL of its typed columns and the table that it is."""
 
 
 @dataclass(frozen=True)
@@ -78,20 +92,6 @@ def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Itera
     for batch in batches:
         for number in batch.column(0).to_pylist():
             yield from tasks[number].run()
-
-
-_TYPES: Final = {"BIGINT": "bigint", "VARCHAR": "string"}
-_COLUMNS: Final = {
-    schema.ACTION: "array<float>",
-    schema.TIMESTAMP: "bigint",
-    schema.OBSERVATION: "array<float>",
-    schema.PROPENSITY: "float",
-    schema.IS_RANDOM: "boolean",
-}
-_COUNTS: Final = "file bigint, name string, size bigint, n bigint"
-_ROWS, _BAD = "rows", "bad"
-_TYPED: Final = "typed"
-_REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
 
 
 def sorted_with_spark(
@@ -183,10 +183,6 @@ class _Survey:
     """Vector column to the number of its vectors by size, missing ones excluded."""
     bad: int = 0
     """Number of observations that are missing or not finite."""
-
-
-Files = Sequence[tuple[str, Table]]
-"""Of each file, the SQL of its typed columns and the table that it is."""
 
 
 def _surveyed(spark: Any, files: Files, names: Sequence[str]) -> _Survey:

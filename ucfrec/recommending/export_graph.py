@@ -29,6 +29,11 @@ TOLERANCE: Final = 1e-5
 _OPSET: Final = 20
 _CHUNK: Final = 2**16
 """Items among which the best are looked for at once."""
+_COMPARED: Final = 16
+"""Random sessions on which the graph is compared with torch."""
+_MOST_EXCLUDED: Final = 0.5
+"""Largest share of the items that these exclude."""
+_REMEDY: Final = "use --engine torch"
 
 
 class RuleGraph(nn.Module):
@@ -241,13 +246,6 @@ def _quiet() -> Any:
             yield
     finally:
         logging.disable(before)
-
-
-_COMPARED: Final = 16
-"""Random sessions on which the graph is compared with torch."""
-_MOST_EXCLUDED: Final = 0.5
-"""Largest share of the items that these exclude."""
-_REMEDY: Final = "use --engine torch"
 
 
 class ScoreGraph:

@@ -28,8 +28,7 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
-from ucfrec.files.checksums import RUN_RECORD
-from ucfrec.files.record import Count, Entry, Number, Record, Text
+from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import Config, config_from_dict

@@ -8,8 +8,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.reward_report import calibration, fit_line, scores_of
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows, calibration, fit_line, scores_of
 
 _GROUPS: Final = 10
 _PRIOR: Final = 0.5

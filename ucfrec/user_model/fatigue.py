@@ -17,6 +17,13 @@ from ucfrec.episodes.item_counts import LIKED
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 
+LONGEST: Final = 8
+"""Largest length of a run, and largest number of steps that it lasts, that are tried."""
+_MOST: Final = 0.5
+"""Largest factor that counts as fatigue."""
+_EXPECTED: Final = 20.0
+"""Fewest rewards to be expected of users without fatigue, from which a factor is estimated."""
+
 
 @dataclass(frozen=True)
 class MainTags:
@@ -74,14 +81,6 @@ class MainTags:
         tags = self.tags[items.clamp(min=0)]
         alike = (tags == tags[:, :1]) & (items >= 0) & self.liked(rewards)
         return torch.where(alike.all(1) & (items.shape[1] >= run), tags[:, 0], -1)
-
-
-LONGEST: Final = 8
-"""Largest length of a run, and largest number of steps that it lasts, that are tried."""
-_MOST: Final = 0.5
-"""Largest factor that counts as fatigue."""
-_EXPECTED: Final = 20.0
-"""Fewest rewards to be expected of users without fatigue, from which a factor is estimated."""
 
 
 @dataclass(frozen=True)

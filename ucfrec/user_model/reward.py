@@ -16,6 +16,12 @@ MEMORY: Final = 50
 """Steps of a session that show tastes, the latest ones."""
 _LEAST: Final = 1e-6
 """Variance of tastes in every direction, relative to the mean."""
+FITTED: Final = "item_reward.safetensors"
+"""File of a fitted model in its folder."""
+LAGS: Final = 10
+"""Items shown before a step whose repetition and likeness enter its expected reward."""
+CLIP: Final = 5.0
+"""Standardised states beyond this many standard deviations are clipped."""
 
 
 class UserPosterior(nn.Module):
@@ -101,14 +107,6 @@ def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
     least = _LEAST * covariance.trace() / len(covariance) * torch.eye(len(covariance))
     root: Tensor = torch.linalg.cholesky((covariance + least) / variance)
     return root.float()
-
-
-FITTED: Final = "item_reward.safetensors"
-"""File of a fitted model in its folder."""
-LAGS: Final = 10
-"""Items shown before a step whose repetition and likeness enter its expected reward."""
-CLIP: Final = 5.0
-"""Standardised states beyond this many standard deviations are clipped."""
 
 
 class ItemRewardModel(nn.Module):

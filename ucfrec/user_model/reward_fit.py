@@ -23,12 +23,12 @@ from ucfrec.user_model.reward_effects import EFFECTS, Design, Effects, fit_effec
 from ucfrec.user_model.reward_report import (
     EffectTried,
     ItemRewardReport,
+    RewardRows,
     calibration,
     gauc_against,
     item_rates,
     scores_of,
 )
-from ucfrec.user_model.reward_rows import RewardRows
 
 _SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
 _FIRST: Final = 6

@@ -28,6 +28,25 @@ _SETTINGS: Final = {
 
 _SPLITS: Final = LEAVES - 1
 _TENSORS: Final = ("inputs", "thresholds", "leaves", "base")
+_PENALTY: Final = 1.0
+"""L2 penalty of the logistic regression on standardised inputs."""
+_LAGS: Final = 6
+"""Items shown before whose likeness counts."""
+_INPUTS: Final = 4 + _LAGS + 3 + 3
+"""Number of inputs; see `_columns`."""
+_REWARD: Final = 3
+"""Number of the input that is the step's reward."""
+_REMEMBERED: Final = 10
+"""Items shown before that are compared with the item."""
+_FEWEST: Final = 20
+"""Fewest steps that end a session, and that do not, from which more than their share is
+estimated."""
+_STEP: Final = 2.0**-10
+"""Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
+on one side of a tree's threshold."""
+_LOGISTIC: Final = ("mean", "scale", "weights", "bias")
+_MOST: Final = 20.0
+"""Largest log-odds against what happened that count, so that no single step decides."""
 
 
 @dataclass(frozen=True)
@@ -128,27 +147,6 @@ def _table(nodes: Array) -> tuple[Array, Array, Array]:
         below = np.where(left, nodes["left"][node], nodes["right"][node])
         node = np.where(nodes["is_leaf"][node] == 1, node, below).astype(np.int64)
     return inputs, thresholds, nodes["value"][node]
-
-
-_PENALTY: Final = 1.0
-"""L2 penalty of the logistic regression on standardised inputs."""
-_LAGS: Final = 6
-"""Items shown before whose likeness counts."""
-_INPUTS: Final = 4 + _LAGS + 3 + 3
-"""Number of inputs; see `_columns`."""
-_REWARD: Final = 3
-"""Number of the input that is the step's reward."""
-_REMEMBERED: Final = 10
-"""Items shown before that are compared with the item."""
-_FEWEST: Final = 20
-"""Fewest steps that end a session, and that do not, from which more than their share is
-estimated."""
-_STEP: Final = 2.0**-10
-"""Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
-on one side of a tree's threshold."""
-_LOGISTIC: Final = ("mean", "scale", "weights", "bias")
-_MOST: Final = 20.0
-"""Largest log-odds against what happened that count, so that no single step decides."""
 
 
 @dataclass(frozen=True)

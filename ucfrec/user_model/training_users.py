@@ -40,13 +40,22 @@ from ucfrec.user_model.reward_fit import (
     reward_model_sizes,
     set_statistics,
 )
-from ucfrec.user_model.reward_report import SAVED, EffectTried, fit_line, scores_of
-from ucfrec.user_model.reward_rows import RewardRows, drawn_steps
+from ucfrec.user_model.reward_report import (
+    SAVED,
+    EffectTried,
+    RewardRows,
+    drawn_steps,
+    fit_line,
+    scores_of,
+)
 
 _FITTED: Final = "training_users.safetensors"
 _MAX_STEPS: Final = 100_000
 _LARGEST_WEIGHT: Final = 10.0
 """Larger weights are cut off, so that no single row decides."""
+Line = tuple[float, float]
+_FEWEST: Final = 50
+"""Rows of a half from which on a line is fitted to it."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -159,11 +168,6 @@ def propensity_weights(
     users = np.unique(owners, return_inverse=True)[1][episodes]
     sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
     return torch.from_numpy(shares * (sums / squares)[users]).float()
-
-
-Line = tuple[float, float]
-_FEWEST: Final = 50
-"""Rows of a half from which on a line is fitted to it."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)

@@ -7,7 +7,7 @@ follow. All old rows become training rows, and the newest of the new rows valida
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -199,8 +199,7 @@ class _Grown:
         files = dict(new.files)
         for number, shard in enumerate(self._kept):
             files |= self._copy(shard, folder / f"shard-{number:05d}")
-        steps = [*_training_steps(folder, range(len(self._kept), new.n_shards))]
-        write_grown_states(self._store, folder, found, steps)
+        write_grown_states(self._store, folder, found, range(len(self._kept), new.n_shards))
         made = {"made_of": dict(made_of), "appended": report}
         self._record(new, report, made).with_entries(files=files).sealed(folder)
         return report
@@ -319,21 +318,3 @@ def _link(source: Path, target: Path) -> None:
     except OSError:
         # Another file system, or one without links.
         shutil.copyfile(source, target)
-
-
-def _training_steps(
-    folder: Path, shards: Sequence[int]
-) -> Iterator[tuple[IntArray, IntArray, Array]]:
-    """Users, items and rewards (N,) of the training steps of some shards."""
-    for number in shards:
-        path = folder / f"shard-{number:05d}"
-        offsets = np.load(path / f"{schema.OFFSETS}.npy")
-        every = np.ones(len(offsets) - 1, dtype=bool)
-        shard = _Shard(path, np.diff(offsets), every)
-        train = np.asarray(shard.load(schema.SPLIT)) == 0
-        rows = shard.of_steps(train)
-        yield (
-            _numbers(shard, schema.USER_ID, train),
-            _numbers(shard, schema.ITEM_ID, train),
-            np.asarray(shard.load(schema.REWARD)[rows], dtype=np.float64),
-        )

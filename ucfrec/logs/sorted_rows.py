@@ -29,7 +29,7 @@ from ucfrec.logs.kept import (
     kept_rows,
     require_rewards_in_range,
 )
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.spool import Spool, whole_groups
 from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
@@ -183,7 +183,9 @@ def check_sorted(
     # The connection itself answers no query before the last batch of its rows.
     with closing(log.connection.cursor()) as asked:
         hashes = _hashes(log, asked)
-        for batch in _whole_times(_columns(batch, log) for batch in batches):
+        columns = (_columns(batch, log) for batch in batches)
+        # Equal times of a user stay together.
+        for batch in whole_groups(columns, "user", schema.TIMESTAMP):
             _check_batch(rows, batch, duplicates, hashes, rewards)
     if log.key == schema.ITEM_ID:
         (rows.items,) = log.one("SELECT count(*) FROM item_codes")
@@ -348,21 +350,3 @@ def _hashes(log: TypedLog, asked: duckdb.DuckDBPyConnection) -> Hashes:
         return found
 
     return Hashes(of_users, lambda codes: of_all_items()[codes])
-
-
-def _whole_times(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end between two times of a user: equal times stay together."""
-    held: dict[str, Array] = {}
-    for batch in batches:
-        if held:
-            batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        users, times = batch["user"], batch[schema.TIMESTAMP]
-        starts = np.flatnonzero((users[1:] != users[:-1]) | (times[1:] != times[:-1]))
-        if not len(starts):
-            held = batch
-            continue
-        end = int(starts[-1]) + 1
-        yield {name: values[:end] for name, values in batch.items()}
-        held = {name: values[end:].copy() for name, values in batch.items()}
-    if held:
-        yield held

@@ -23,7 +23,7 @@ from ucfrec.counterfactual.state_augmentation import (
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 CRM: Final = "crm"

@@ -24,7 +24,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_trained, load_weights
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 
 Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
 """Reads the transitions of (view, episodes, steps)."""

@@ -17,9 +17,9 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.processes import random_state_kept
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000

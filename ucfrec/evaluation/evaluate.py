@@ -18,7 +18,7 @@ from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.session_metrics import session_metrics
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -26,7 +26,7 @@ from ucfrec.fitting.checkpoint import (
     save_training,
 )
 from ucfrec.fitting.metrics_log import MetricsLog
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 

@@ -26,9 +26,9 @@ from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy

@@ -24,11 +24,11 @@ from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.logs.mapping import Dataset, LogMapping
 from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash
 from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.user_model.model import load_session_end

@@ -1,4 +1,4 @@
-"""Processes end with one line when they are interrupted, and with their parent."""
+"""Processes end with one line when interrupted, and with their parent; random states are kept."""
 
 import os
 import random

@@ -107,4 +107,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
 def _text(value: object) -> str:
     if value is None:
         return NONE
-    return number(value) if isinstance(value, float) else one_line(str(value))
+    if isinstance(value, float):
+        return number(value)
+    text = str(value)
+    return text if text.isprintable() else one_line(text)

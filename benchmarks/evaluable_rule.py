@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.collect import simulated_store
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import held_out_sessions
 from ucfrec.runs.config import resolve_config

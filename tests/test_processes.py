@@ -21,9 +21,9 @@ from tests.support.signals import wait_until_handled
 from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import simulated_store
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept

@@ -24,8 +24,9 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
+from ucfrec.runs.later_logs import later_logs
 from ucfrec.runs.record import store_of
-from ucfrec.runs.trained_policy import TrainedPolicy, later_logs
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""

@@ -16,7 +16,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.collect import simulated_store
 from ucfrec.evaluation.diversity import (
     COLUMNS,
     Recommended,
@@ -31,6 +30,7 @@ from ucfrec.evaluation.diversity import (
 )
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views

@@ -166,9 +166,9 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
         The rows of `out/results.json`: one per environment and policy, environments in the order
         of `ENVIRONMENTS`.
     """
-    from ucfrec.evaluation.collect import simulated_store
     from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
+    from ucfrec.evaluation.simulated_store import simulated_store
     from ucfrec.reporting.page import write_report
     from ucfrec.results.rows_file import write_results
 

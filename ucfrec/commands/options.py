@@ -417,7 +417,7 @@ def logs_given(
     if options.mapping is not None:
         given = given.over(read_mapping(options.mapping))
     if trained is not None and options.dataset is None:
-        from ucfrec.runs.trained_policy import later_logs
+        from ucfrec.runs.later_logs import later_logs
 
         return later_logs(trained, options.logs, given)
     dataset: Dataset = load_plugin("datasets", options.dataset or "generic")

@@ -26,10 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["ITEM_STATES", "LONG", "EpisodeStore", "of_people", "store_frame"]
+__all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
 
-LONG: Final = 100
-"""Times the median from which on a session is hardly a person's."""
 _STATISTICS_STEPS = 1_000_000
 _FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
 _PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
@@ -302,6 +300,8 @@ def store_frame(store: EpisodeStore) -> "pd.DataFrame":
     """
     if store.overlay is not None:
         raise InputError(f"{store} has augmented episodes; take its without_augmentation()")
+    import pandas as pd  # most stores are never shown
+
     episodes, steps = store.all_steps()
     columns: dict[str, Any] = {}
     if store.has_users:
@@ -326,19 +326,3 @@ def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:
     """Identifiers of the logs; the numbers themselves in a store without their table."""
     path = store.path / _FILES[column]
     return read_ids(path, column)[numbers] if path.exists() else numbers
-
-
-def of_people(view: EpisodeStore) -> EpisodeStore:
-    """The view without sessions of more than `LONG` times the median number of steps.
-
-    One session of thousands of steps would otherwise set the largest target return, be a good part
-    of the rows that the user model is fitted to, and let simulated sessions go on as long.
-
-    Args:
-        view: of a store of items, without augmentation; the same is returned if it has no such
-            session.
-    """
-    if not view.n_episodes:
-        return view
-    kept = view.lengths <= LONG * np.median(view.lengths)
-    return view if kept.all() else view.select(np.flatnonzero(kept))

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.episodes.store import LONG
+from ucfrec.episodes.long_sessions import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.binding import bind

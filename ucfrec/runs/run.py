@@ -20,7 +20,8 @@ from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentati
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.state_augmentation import AugmentationReport, AugmentConfig
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore, of_people
+from ucfrec.episodes.long_sessions import of_people
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within

@@ -15,8 +15,9 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.augmentation import require_rewards_vary
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.store import ITEM_STATES, EpisodeStore, of_people
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.checkpoint import save_tensors

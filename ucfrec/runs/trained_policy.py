@@ -1,8 +1,8 @@
-"""A trained policy, read back from its run folder, and the later logs that it can read."""
+"""A trained policy, read back from its run folder."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,6 @@ from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
-from ucfrec.logs.mapping import Dataset, LogMapping
-from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.processes import random_state_kept
@@ -310,28 +308,3 @@ def _ids(path: Path, column: str) -> Array:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
     return read_ids(path, column)
-
-
-def later_logs(
-    trained: TrainedPolicy, paths: Sequence[str | Path], given: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
-    """Log files of the dataset that a policy was trained on, whose columns may have plain names.
-
-    Args:
-        paths: files, folders and globs.
-        given: what the caller says of the columns.
-
-    Raises:
-        InputError: a path is missing, or holds no log of the dataset.
-    """
-    source = trained.record.data
-    # A record may also name a dataset that is not read by an adapter.
-    known = source.dataset in plugin_names("datasets")
-    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
-    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
-    try:
-        files, found = dataset.resolve(paths, given)
-    except InputError:
-        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
-    return files, replace(given, remembered=LogMapping(columns))

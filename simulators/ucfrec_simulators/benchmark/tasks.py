@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from ucfrec.benchmark.cells import Task
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.collect import simulated_store
 from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulated_store import simulated_store
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin

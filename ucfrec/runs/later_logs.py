@@ -1,0 +1,35 @@
+"""Which files and columns later logs of a trained policy are, by the dataset of its training."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import Dataset, LogMapping
+from ucfrec.plugins import load_plugin, plugin_names
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+
+def later_logs(
+    trained: TrainedPolicy, paths: Sequence[str | Path], given: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
+    """Log files of the dataset that a policy was trained on, whose columns may have plain names.
+
+    Args:
+        paths: files, folders and globs.
+        given: what the caller says of the columns.
+
+    Raises:
+        InputError: a path is missing, or holds no log of the dataset.
+    """
+    source = trained.record.data
+    # A record may also name a dataset that is not read by an adapter.
+    known = source.dataset in plugin_names("datasets")
+    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
+    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
+    try:
+        files, found = dataset.resolve(paths, given)
+    except InputError:
+        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
+    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
+    return files, replace(given, remembered=LogMapping(columns))

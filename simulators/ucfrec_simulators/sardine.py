@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actions, Uniform
+from ucfrec.acting.uniform import Actions, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import GymnasiumCatalog

@@ -14,14 +14,20 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import torch
 
+from ucfrec import schema
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.evaluation.liked import LikedByRange
+from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
+from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.files.locks import claimed
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.processes import pool_of_processes, without_ctrl_c
 from ucfrec.progress import labelled
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -30,12 +36,6 @@ from ucfrec.tuning.space import POLICY, Search
 if TYPE_CHECKING:
     from optuna import Study, Trial
     from optuna.trial import FrozenTrial
-from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.evaluation.liked import LikedByRange
-from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.runs.record import RunRecord
 
 VALUE: Final = "value"
 METRICS: Final = {

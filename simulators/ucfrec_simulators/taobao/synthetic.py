@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Uniform
+from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture

@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from ucfrec.acting.rollout import Uniform
+from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator

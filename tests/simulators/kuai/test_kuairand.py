@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from tests.support.real_data import data_folder
-from ucfrec.acting.rollout import Uniform, rollout
+from ucfrec.acting.rollout import rollout
+from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping

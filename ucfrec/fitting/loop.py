@@ -161,12 +161,13 @@ def fit(
     step = int(training.counters["step"])
     clock, log = _Clock(step, training.counters["seconds"]), _log(folder, step)
     joint, rank = rows if distributed.processes() > 1 else None, distributed.rank()
+    module.train()
     for step, bar in _steps(training.counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
         torch.manual_seed(int(generator.integers(2**62)) + rank)
-        if not module.training:
+        if not module.training:  # a validation or a callback has ended it
             module.train()
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)

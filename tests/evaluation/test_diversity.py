@@ -124,12 +124,12 @@ def test_a_rollout_is_recorded_in_order() -> None:
     np.testing.assert_array_equal(items[episodes == 8], shown)
 
 
-TAGS = [(0,), (0, 1), (2,), (), (1, 2), (3,)]
+TAGS_OF_ITEMS = [(0,), (0, 1), (2,), (), (1, 2), (3,)]
 
 
 def test_columns_are_those_of_plain_loops() -> None:
     rewards = np.random.default_rng(0).random((5, 6)).astype(np.float32)
-    env = KuaiEnv(4, rewards, TAGS, EXITS["dorl"], item_ids=np.arange(6) + 10)
+    env = KuaiEnv(4, rewards, TAGS_OF_ITEMS, EXITS["dorl"], item_ids=np.arange(6) + 10)
     seen = Recommended()
     rollout(env, Uniform(env, 0), 7, 0, seen.record)
     shown, liked = torch.tensor([5, 0, 3, 2, 9, 4]), torch.tensor([9, 0, 1, 1, 0, 1])
@@ -137,7 +137,7 @@ def test_columns_are_those_of_plain_loops() -> None:
     row = variety_columns(env, seen, TrainingCounts(shown, liked, 20), numbers)
 
     episodes, items = seen.sessions()
-    tags = [set(own) or {-1} for own in TAGS]
+    tags = [set(own) or {-1} for own in TAGS_OF_ITEMS]
     popular, positive = [0.0] * 6, Counter[int]()
     for log, number in enumerate(numbers.tolist()):
         if number >= 0:

@@ -34,8 +34,7 @@ from ucfrec import Recommender, schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_history
 from ucfrec.choosing.by_simulation import RuleSearch
-from ucfrec.choosing.config import RuleConfig
-from ucfrec.choosing.problem import Problem
+from ucfrec.choosing.choice import Problem, RuleConfig
 from ucfrec.commands.options import rule_given, rule_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping

@@ -23,10 +23,10 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.provenance import provenance
-from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.reporting.tables import markdown_table, signed_difference
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.start import new_policy, training_views

@@ -19,10 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import latest, read_rows
+from ucfrec.results.statistics import Summary, grouped, summary
 from ucfrec_control.benchmark.spread import spreads
 
 ROOT = Path(__file__).parents[1]

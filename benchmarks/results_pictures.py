@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ucfrec.reporting.plot_style import OURS, PAGE, PLAIN, save, styled
-from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped, summary
 from ucfrec_control.benchmark.spread import AVERAGING, BACK
 
 

@@ -17,8 +17,8 @@ from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.clean import note_dropped
 from ucfrec.logs.histories import log_table
+from ucfrec.logs.kept import note_dropped
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions

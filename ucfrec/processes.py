@@ -1,8 +1,9 @@
-"""How a process ends: by Ctrl-C or TERM at any moment, and with its parent."""
+"""The process: how it ends, by Ctrl-C or TERM at any moment and with its parent; random state."""
 
 import io
 import mmap
 import os
+import random
 import signal
 import sys
 import threading
@@ -179,3 +180,23 @@ def require_blas_memory() -> None:
         mmap.mmap(-1, _BLAS).close()
     except OSError as error:
         raise MemoryError(f"no {_BLAS / 2**20:.0f} MB for linear algebra") from error
+
+
+@contextmanager
+def random_state_kept() -> Iterator[None]:
+    """Restore the global generators of torch (every device), numpy and `random` on exit.
+
+    The code inside may seed them and draw from them. Usable in a `with` statement and as the
+    decorator `@random_state_kept()`.
+    """
+    import numpy as np  # commands that compute nothing need neither
+    import torch
+
+    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
+    devices = range(torch.cuda.device_count())
+    try:
+        with torch.random.fork_rng(devices=devices):
+            yield
+    finally:
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)  # noqa: NPY002

@@ -35,8 +35,7 @@ from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.posterior import MEMORY
-from ucfrec.user_model.reward import LAGS, ItemRewardModel
+from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 SETTINGS = {

@@ -12,10 +12,8 @@ from tests.support.logs import store_of
 from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
-from ucfrec.choosing.choice import RankedRule, RuleChoice
-from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.choosing.logged import SHOWN
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json

@@ -14,10 +14,8 @@ from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
-from ucfrec.choosing.choice import RuleChoice
-from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
 from ucfrec.choosing.nearby import near
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -355,7 +353,7 @@ def test_a_finished_run_that_is_trained_again_keeps_its_rule(
     def never(*_: object) -> None:
         raise AssertionError("the rule is chosen again")
 
-    monkeypatch.setattr("ucfrec.runs.run.choose_rule", never)
+    monkeypatch.setattr("ucfrec.runs.run.choose_by_simulation", never)
     store = EpisodeStore.open(folder / "store")
     before = read_json(folder / "run" / "run.json")
     train_run(store, folder / "run", config_from_dict(before["config"]))

@@ -11,14 +11,14 @@ from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
-from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.choice import Problem, RuleConfig
 from ucfrec.choosing.logged import LoggedEvidence
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.reporting.rule import frontier, user_model_table
+from ucfrec.reporting.model_card import user_model_table
+from ucfrec.reporting.page_results import frontier
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run

@@ -8,13 +8,16 @@ from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
+from tests.recommending.test_recommend import random_log
 from tests.support.episodes import (
     Logged,
     episode_columns,
@@ -35,6 +38,8 @@ from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, read_json, write_json
+from ucfrec.logs import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 
 LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
 SHARDS = (2**24, 6, 1)
@@ -872,3 +877,33 @@ def test_user_rows_are_those_of_the_source(folder: Path) -> None:
     seen = every_window(store, 1).states[:, 0, -2:]
     assert torch.equal(seen[0], states.user_features[3])
     assert not seen[1].any()
+
+
+def test_the_frame_has_the_rows_of_the_log(tmp_path: Path) -> None:
+    log = random_log(rows=300).assign(propensity=0.25)
+    log["user_id"] = "u" + log.user_id.astype(str)
+    log.to_parquet(tmp_path / "log.parquet")
+    options = PrepareOptions(session_by="gap", gap_minutes=60)
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", options)
+    store = EpisodeStore.open(tmp_path / "store")
+    frame = store.to_frame()
+    keys = ["user_id", "timestamp", "item_id", "reward", "propensity"]
+    found = frame[keys].sort_values(keys, ignore_index=True)
+    expected = log[keys].sort_values(keys, ignore_index=True)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False)
+    assert frame.session_id.nunique() == len(store)
+    assert frame.groupby("session_id").timestamp.apply(lambda t: t.is_monotonic_increasing).all()
+    test = store.split("test").to_frame()
+    assert set(test.split) == {"test"}
+    assert len(test) == (frame.split == "test").sum()
+
+
+def test_a_notebook_shows_the_store(tmp_path: Path) -> None:
+    mpl.use("Agg")
+    random_log().to_parquet(tmp_path / "log.parquet")
+    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store")
+    store = EpisodeStore.open(tmp_path / "store")
+    html = store._repr_html_()
+    assert all(f"<td>{name}</td>" in html for name in ("all", "train", "validation", "test"))
+    axes = store.plot()
+    assert sum(bar.get_height() for bar in axes.patches) == len(store)

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.evaluation.gymnasium_items import item_table
+from ucfrec.evaluation.gymnasium_environment import item_table
 from ucfrec.files.parquet import read_ids, require_plausible_rows
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.reporting.samples import read_features

@@ -1,6 +1,8 @@
 """Records: read and written in one place, and damage is one line."""
 
 import json
+import random
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import pytest
 from tests.support.records import Example
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
+from ucfrec.files.record import Sealed
 
 
 @pytest.fixture
@@ -68,3 +71,69 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "record.json").write_text("{}")
     with pytest.raises(InputError, match=r"record\.json has no files; make it again"):
         Example.read(tmp_path)
+
+
+@pytest.fixture
+def three_files(tmp_path: Path) -> Path:
+    """A folder with three files and their record."""
+    folder = tmp_path / "sealed"
+    (folder / "inner").mkdir(parents=True)
+    for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(3_000_000))):
+        (folder / name).write_bytes(content)
+    Example(files={}, version=1, numbers=(0.1, float("nan"))).sealed(folder)
+    return folder
+
+
+def read(folder: Path) -> Sealed:
+    return Example.read(folder).checksums(folder)
+
+
+def test_what_was_sealed_comes_back_and_holds(three_files: Path) -> None:
+    record, files = Example.read(three_files), read(three_files)
+    assert record.version == 1
+    assert set(record.files) == {"a", "b", "inner/c"}
+    assert list(files.faults()) == []
+    files.require_small()
+
+
+def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_path: Path) -> None:
+    generator, before = random.Random(0), Example.read(three_files)
+    found = 0
+    for number in range(300):
+        copy = tmp_path / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(three_files, copy)
+        path = copy / ("record.json", "b", "inner/c")[number % 3]
+        content = bytearray(path.read_bytes())
+        content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
+        path.write_bytes(content)
+        try:
+            record = Example.read(copy)
+        except InputError:
+            found += 1
+            continue
+        if any(record.checksums(copy).faults()):
+            found += 1
+            continue
+        # The flip was in the layout of the record, or in the name of its entry "checksum".
+        assert path.name == "record.json"
+        assert repr(record) == repr(before)
+    assert found > 270
+
+
+def test_each_kind_of_fault_is_named(three_files: Path) -> None:
+    (three_files / "a").unlink()
+    (three_files / "a").mkdir()
+    (three_files / "b").write_bytes(b"word")
+    (three_files / "inner" / "c").write_bytes(bytes(3_000_001))
+    (three_files / "foreign").write_bytes(b"")
+    files = read(three_files)
+    faults = dict(files.faults())
+    assert faults["b"] == "is truncated: 4 of 5 bytes"
+    assert faults["inner/c"] == "is grown: 3,000,001 of 3,000,000 bytes"
+    assert "a" in faults
+    assert files.strangers() == ["foreign", "record.json"]
+    with pytest.raises(InputError, match="restore the file, or make it again"):
+        files.require_sizes()
+    (three_files / "b").unlink()
+    assert dict(files.faults())["b"] == "is missing"

@@ -10,7 +10,7 @@ import pytest
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.files.checksums import CARD
+from ucfrec.files.record import CARD
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import evaluate_off_policy
 from ucfrec.off_policy.score import logged_sessions

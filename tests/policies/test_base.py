@@ -17,9 +17,8 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW, clip_gradients
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.heads import ItemHead
+from ucfrec.policies.heads import ItemHead, advantage_weights
 from ucfrec.policies.registry import policy_class
-from ucfrec.policies.values import advantage_weights
 
 TAGGED = {**CATALOG, "tags": 2}
 POLICIES = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")

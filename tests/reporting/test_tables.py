@@ -2,7 +2,6 @@
 
 import pytest
 
-from ucfrec.reporting.statistics import summary
 from ucfrec.reporting.tables import (
     format_rows,
     markdown_table,
@@ -12,6 +11,7 @@ from ucfrec.reporting.tables import (
     signed_difference,
     text_table,
 )
+from ucfrec.results.statistics import summary
 
 
 def test_columns_are_aligned_names_left_and_numbers_right() -> None:

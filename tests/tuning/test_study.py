@@ -17,9 +17,8 @@ from ucfrec.errors import InputError
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.tuning.objective import measured
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import BEST, STUDY, Plan, finished, tune
+from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measured, tune
 
 FIXED = {
     "train.validate_every": 2,

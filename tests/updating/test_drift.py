@@ -1,9 +1,22 @@
 """Stability indices: the formula, and that they rise with the change."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from ucfrec.updating.drift import describe, popularity_index, reward_index, stability_index
+from tests.support.later import later_log, later_mapping
+from tests.support.served import trained_run
+from tests.support.tagged import ITEMS
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.logs.append import append_logs
+from ucfrec.updating.drift import (
+    as_known,
+    describe,
+    popularity_index,
+    reward_index,
+    stability_index,
+)
 
 
 def test_the_index_is_that_of_the_formula() -> None:
@@ -37,3 +50,19 @@ def test_drift_is_described_with_and_without_a_reward_model() -> None:
     assert "10.0% of the new rows have new items, 50.0% new users" in describe(found)
     model = {"predicted": 0.2, "observed": 0.3, "calibration_error": 0.1, "slope": 0.9}
     assert "predicts 0.2, observed 0.3" in describe(found | model)
+
+
+def test_unknown_items_and_users_have_no_number(tmp_path: Path) -> None:
+    trained = trained_run(tmp_path)
+    later_log().to_parquet(tmp_path / "later.parquet")
+    logs, mapping = [tmp_path / "later.parquet"], later_mapping(tmp_path)
+    append_logs(tmp_path / "store", logs, tmp_path / "grown", mapping)
+    newest = EpisodeStore.open(tmp_path / "grown").split("test")
+    known = as_known(newest, trained)
+    items = newest.step_values("item", *newest.all_steps())
+    expected = np.where(items < ITEMS, items, -1)
+    assert (expected < 0).any()
+    np.testing.assert_array_equal(known.step_values("item", *known.all_steps()), expected)
+    np.testing.assert_array_equal(known.lengths, newest.lengths)
+    assert known.state_size == trained.record.sizes["state"]
+    assert known.episode_values("user").max() < len(trained.user_ids)

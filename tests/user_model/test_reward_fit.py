@@ -14,12 +14,14 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.user_model.calibration import UserCalibration
-from ucfrec.user_model.posterior import MEMORY
-from ucfrec.user_model.reward import LAGS
+from ucfrec.user_model.reward import LAGS, MEMORY
 from ucfrec.user_model.reward_effects import Effects, fit_effects
-from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_fit import (
+    fit_item_reward_model,
+    refit_item_reward_model,
+)
+from ucfrec.user_model.reward_report import RewardRows
+from ucfrec.user_model.training_users import UserCalibration
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
 

@@ -9,8 +9,7 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.fatigue import Fatigue
-from ucfrec.user_model.main_tags import MainTags
+from ucfrec.user_model.fatigue import Fatigue, MainTags
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Annotated, Any, Final, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, PlainSerializer, PlainValidator
 from torch import Tensor
 
 from ucfrec.episodes.item_table import WINDOW
@@ -69,15 +69,13 @@ class DecisionRule:
     explore_top: _Items | None = None
     """Such requests draw from the so many best items only; None for all."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float):
-                # Equal rules have the same hash: 0 is not −0.
-                object.__setattr__(self, name, float(value) + 0.0)
-
     def as_dict(self) -> dict[str, Any]:
         """The fields, as a JSON object."""
-        return asdict(self)
+        # Equal rules have the same hash: 0 is not −0.
+        return {
+            name: value + 0.0 if isinstance(value, float) else value
+            for name, value in asdict(self).items()
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], source: str) -> Self:
@@ -222,6 +220,18 @@ class DecisionRule:
         # Relative to the best, so that no temperature makes every score −∞.
         relative = scores - scores.amax(-1, keepdim=True)
         return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+
+
+def _saved(value: object) -> DecisionRule:
+    if isinstance(value, DecisionRule):
+        return value
+    if not isinstance(value, Mapping):
+        raise InputError("its rule is no decision rule")
+    return DecisionRule.from_dict(value, "the rule")
+
+
+SavedRule = Annotated[DecisionRule, PlainValidator(_saved), PlainSerializer(DecisionRule.as_dict)]
+"""A rule as an entry of a record."""
 
 
 def _only_best(scores: Tensor, count: int | None) -> Tensor:

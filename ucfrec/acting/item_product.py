@@ -20,7 +20,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
-from ucfrec.user_model.main_tags import MainTags
+from ucfrec.user_model.fatigue import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
 
 

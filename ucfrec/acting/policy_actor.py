@@ -11,7 +11,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import History
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.ids import IdLookup
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.states import ItemStates, SessionStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError

@@ -8,8 +8,8 @@ import numpy as np
 
 from ucfrec.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
 from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
-from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped, summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

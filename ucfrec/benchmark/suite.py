@@ -1,4 +1,7 @@
-"""A suite of tables: what a package declares as a benchmark, measured and shown in one way."""
+"""A suite of tables: what a package declares as a benchmark, measured and shown in one way.
+
+How long it takes is estimated from what the suite says of the cost of its parts.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,11 +10,50 @@ from pathlib import Path
 from typing import Protocol
 
 from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.benchmark.estimate import Costs, announcement
 from ucfrec.benchmark.grid import Measurement, run_grid
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
+from ucfrec.files.atomic import read_json
 from ucfrec.results.row import ResultRow
+from ucfrec.runs.trained_policy import RUN
+
+
+@dataclass(frozen=True)
+class Costs:
+    """CPU seconds of the parts of a cell."""
+
+    training: Callable[[Cell], float]
+    """Of the updates of the cell's policy."""
+    evaluation: Callable[[Cell], float]
+    note: str
+    """Where these numbers come from, and what they exclude."""
+    stages: Callable[[Cell], Mapping[object, float]] = lambda cell: {}
+    """Of the stages before and after the updates, by a key that cells with a common one share."""
+
+
+def announcement(costs: Costs, workers: int) -> Callable[[Sequence[Cell]], str]:
+    """What a benchmark of so many processes says of the cells that are left, before it starts."""
+
+    def text(cells: Sequence[Cell]) -> str:
+        hours = estimated_hours(cells, costs) / workers
+        return f"about {hours:.1f} hours with --workers {workers}, {costs.note}"
+
+    return text
+
+
+def estimated_hours(cells: Sequence[Cell], costs: Costs) -> float:
+    """CPU hours of `cells`; what several share is counted once, finished trainings are not."""
+    seconds: dict[object, float] = {}
+    for cell in cells:
+        if cell.run is not None and not _finished(cell.run):
+            seconds[cell.run] = costs.training(cell)
+            seconds |= costs.stages(cell)
+    return (sum(map(costs.evaluation, cells)) + sum(seconds.values())) / 3600
+
+
+def _finished(run: Path) -> bool:
+    return (run / RUN).exists() and "policy" in read_json(run / RUN)
+
 
 Rows = Sequence[ResultRow]
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from ucfrec.reporting.statistics import Summary, grouped, summary
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import Summary, grouped, summary
 
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
 """Probability that the distractor is on in an evaluation; None: an environment without a

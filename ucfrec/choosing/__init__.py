@@ -1,1 +1,1 @@
-"""Which decision rule is best for what users would do: `choose_rule` returns a `RuleChoice`."""
+"""Which decision rule is best for what users would do; each choice is a `RuleChoice`."""

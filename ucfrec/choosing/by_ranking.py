@@ -17,9 +17,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import RankedRule, RuleChoice
+from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice
 from ucfrec.choosing.logged import SHOWN, LoggedScores
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 

@@ -17,16 +17,14 @@ import numpy as np
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.choosing.choice import RuleChoice, SimulatedRule, ValueEstimate
+from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import roll_out
 from ucfrec.choosing.nearby import near
-from ucfrec.choosing.problem import Problem
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.calibration import half_of
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator
-from ucfrec.user_model.training_users import sessions_of
+from ucfrec.user_model.training_users import half_of, sessions_of
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""

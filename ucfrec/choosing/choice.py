@@ -1,11 +1,96 @@
-"""The decision rule that was chosen, and why."""
+"""The choice of a decision rule: its settings, what is chosen by, and what was chosen, and why."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.logged import Evidence
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.settings import Count, Share, Weight, settings_table
+from ucfrec.user_model.model import UserModel
+
+_Temperature = Annotated[float, Field(ge=0, le=100)]
+_RewardWeight = Annotated[float, Field(ge=0, le=1000)]
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+_Runs = Annotated[int, Field(ge=0, le=10)]
+_SOME = Field(strict=False, min_length=1)
+"""Not strict, because TOML and JSON have lists instead of tuples."""
+
+
+@settings_table("rule")
+class RuleConfig:
+    """How the decision rule of a run is chosen.
+
+    Only policies of items with a reward model choose; the rule of others takes the target quantile
+    `default_quantile` and the best item.
+    """
+
+    choose: bool = True
+    """Whether the rule is chosen on validation sessions; otherwise it is the default one."""
+    default_quantile: Share = 1.0
+    """Quantile of the training returns that is the default rule's target."""
+    default_tag_window: _Steps = 0
+    """Number of steps whose tags the default rule excludes."""
+    quantiles: Annotated[tuple[Share, ...], _SOME] = (0.9, 1.0)
+    """Candidates for the target, as quantiles of the training returns; each with and without a
+    minimum target at the same value."""
+    temperatures: Annotated[tuple[_Temperature, ...], _SOME] = (0.0, 0.5, 1.0)
+    """Candidates for the temperature."""
+    reward_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+    """Candidates for β, the weight of the reward model."""
+    lookaheads: Annotated[tuple[Weight, ...], _SOME] = (0.0, 4.0, 16.0)
+    """Candidates for the lookahead, in mean rewards, where the log shows what ends sessions."""
+    lookahead_weights: Annotated[tuple[_RewardWeight, ...], _SOME] = (8.0, 32.0)
+    """Candidates for β with a lookahead, where it is the weight of rewards scaled to [0, 1]."""
+    policy_weights: Annotated[tuple[Weight, ...], _SOME] = (0.0, 0.5, 1.0)
+    """Candidates for the policy's weight with a lookahead."""
+    tag_windows: Annotated[tuple[_Steps, ...], _SOME] = (0, 3, 10)
+    """Candidates for the number of steps whose tags are excluded, where items have tags."""
+    tag_runs: Annotated[tuple[_Runs, ...], _SOME] = (0, 2, 3, 4, 6, 8)
+    """Candidates for how often in a row one main tag may be liked, where the log shows that more
+    causes fatigue."""
+    sessions: Count = 100
+    """Sessions simulated of each candidate."""
+    least_impressions: Count = 10
+    """Training impressions from which on the log supports an item."""
+    least_support: Share = 0.9
+    """Smallest share of a rule's decisions that the log must support."""
+    least_items: Annotated[float, Field(ge=1, le=10**9)] = 10.0
+    """Smallest effective number of items that a rule must show, the exponential of their entropy: a
+    page of them; at most a quarter of the items that the log supports."""
+    evidence: Annotated[int, Field(ge=0, le=10**9)] = 200
+    """Effective users of the validation sessions that a rule must leave where the log has
+    propensities, so that its value can be estimated from logs; 0 for any."""
+    tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """Share of the best estimate by which that of a rule at a higher temperature, or with less
+    reward weight, may fall short: the standard error of the sessions, which is allowed in any
+    case, does not count what the user model gets wrong."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A policy whose decision rule is to be chosen, and all that it is chosen by."""
+
+    scorer: Scorer
+    """The policy under its default rule, with the reward model of `users`."""
+    users: UserModel
+    """The user model."""
+    targets: Mapping[float, float]
+    """Return (reward units) of each quantile in `config.quantiles`."""
+    train: EpisodeStore
+    """Training episodes."""
+    validation: EpisodeStore
+    """Validation episodes."""
+    config: RuleConfig
+    """Candidates and conditions."""
+    seed: int
+    """Of everything random."""
+    start: DecisionRule | None = None
+    """A rule near which to look for a better one; None to try all candidates."""
 
 
 @dataclass(frozen=True)

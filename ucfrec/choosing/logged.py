@@ -15,9 +15,9 @@ from ucfrec.acting.sessions import History, seen_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.weights import effective_number
 from ucfrec.episodes.windows import Windows
 from ucfrec.progress import progress
+from ucfrec.results.statistics import effective_number
 
 SHOWN = 10
 """Items that a rule shows at a step."""

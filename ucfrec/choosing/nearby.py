@@ -6,7 +6,7 @@ from itertools import product
 from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.choosing.problem import Problem
+from ucfrec.choosing.choice import Problem
 
 
 def near(

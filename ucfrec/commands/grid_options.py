@@ -13,8 +13,8 @@ from ucfrec.results.rows_file import benchmarking, latest, read_rows
 
 if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell
-    from ucfrec.benchmark.estimate import Costs
     from ucfrec.benchmark.grid import Measurement
+    from ucfrec.benchmark.suite import Costs
 
 
 BUDGETS: Final = {
@@ -170,7 +170,7 @@ def rows_of(
     Raises:
         InputError: as `rows_given`, as `cells`, or as `run_grid`.
     """
-    from ucfrec.benchmark.estimate import announcement
+    from ucfrec.benchmark.suite import announcement
 
     if options.show_only:
         return rows_given(options, suite, tables)

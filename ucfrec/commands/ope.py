@@ -14,6 +14,7 @@ from ucfrec.commands.options import (
     memory_option,
     rule_given,
     rule_options,
+    runs_given,
 )
 from ucfrec.errors import InputError
 
@@ -128,17 +129,16 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.off_policy.selection import choose, names_of
     from ucfrec.reporting.tables import text_table
-    from ucfrec.runs.trained_policy import RUN
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
-    named = dict.fromkeys(map(Path, options.logs))
-    runs = [path for path in named if (path / RUN).is_file()]
-    options.logs = [path for path in options.logs if Path(path) not in runs]
-    if not runs:
-        raise InputError("name a run folder of `ucfrec train` first, then the logs")
+    runs = dict.fromkeys(runs_given(options))
     if options.scored and not options.logs:
         raise InputError("--scored needs what ucfrec score wrote; name it after the run")
+    # On the test split, the weights that have not learned from it.
+    split = not options.logs
+    policies = [TrainedPolicy.load(run, options.checkpoint, split=split) for run in runs]
     candidates = [
-        _Candidate(run, rule) for run in runs for rule in _rules(options, _loaded(options, run))
+        _Candidate(trained, rule) for trained in policies for rule in _rules(options, trained)
     ]
     reports = {}
     names = names_of([one.parts for one in candidates])
@@ -165,25 +165,18 @@ def run(options: argparse.Namespace) -> None:
     _write(options, reports, {name: choice.columns(name) for name in reports})
 
 
-def _loaded(options: argparse.Namespace, run: Path) -> "TrainedPolicy":
-    """The policy; on the test split, the weights that have not learned from it."""
-    from ucfrec.runs.trained_policy import TrainedPolicy
-
-    return TrainedPolicy.load(run, options.checkpoint, split=not options.logs)
-
-
 @dataclass(frozen=True)
 class _Candidate:
     """One run under one decision rule."""
 
-    run: Path
+    trained: "TrainedPolicy"
     rule: "DecisionRule"
 
     @property
     def parts(self) -> dict[str, object]:
         """What may differ from other candidates, by name."""
         return {
-            "run": str(self.run),
+            "run": str(self.trained.folder),
             "target return": self.rule.target,
             "temperature": self.rule.temperature,
         }
@@ -196,8 +189,7 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
     from ucfrec.reporting.cards import card_of_estimates
     from ucfrec.reporting.tables import format_rows
 
-    run = candidate.run
-    trained = _loaded(options, run)
+    trained, run = candidate.trained, candidate.trained.folder
     asked = {"rule": candidate.rule, "seed": options.seed, "options": estimates_asked(options)}
     if options.scored:
         found = evaluate_scored(trained, options.logs, **asked)

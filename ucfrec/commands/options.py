@@ -117,6 +117,21 @@ def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
     return logs
 
 
+def runs_given(options: argparse.Namespace) -> list[Path]:
+    """The run folders among LOGS, which are no longer among them.
+
+    Raises:
+        InputError: there is none.
+    """
+    from ucfrec.runs.trained_policy import RUN
+
+    runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
+    options.logs = [path for path in options.logs if Path(path) not in runs]
+    if not runs:
+        raise InputError("name a run folder of `ucfrec train` first, then the logs")
+    return runs
+
+
 def memory_option(parser: argparse.ArgumentParser) -> None:
     """Add --memory-limit, of reading logs."""
     parser.add_argument(

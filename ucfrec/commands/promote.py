@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: the run cannot be promoted, or there is none to return to.
     """
-    from ucfrec.files.checksums import RUN_RECORD
+    from ucfrec.files.record import RUN_RECORD
     from ucfrec.runs.promoted import POINTER, promote, promote_back
 
     if options.back:

@@ -11,6 +11,7 @@ from ucfrec.commands.options import (
     logs_given,
     rule_given,
     rule_options,
+    runs_given,
 )
 from ucfrec.errors import InputError
 
@@ -70,12 +71,9 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
-    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+    from ucfrec.runs.trained_policy import TrainedPolicy
 
-    runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
-    options.logs = [path for path in options.logs if Path(path) not in runs]
-    if not runs:
-        raise InputError("name a run folder of `ucfrec train` first, then the logs")
+    runs = runs_given(options)
     if options.k < 1:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
     if options.stream:
         _answer_stream(options)
         return
-    from ucfrec.files.frames import write_frames
+    from ucfrec.files.parquet import write_frames
     from ucfrec.recommending.exposures import exposures_written
     from ucfrec.recommending.histories import histories_of_files
     from ucfrec.recommending.recommend import recommend

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: the run or the logs cannot be used.
     """
-    from ucfrec.files.frames import write_frames
+    from ucfrec.files.parquet import write_frames
     from ucfrec.logs.summary import format_report
     from ucfrec.off_policy.score import about_scores, logged_sessions, score
     from ucfrec.runs.trained_policy import TrainedPolicy

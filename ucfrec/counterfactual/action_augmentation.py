@@ -11,7 +11,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.clusters import ActionSupport, StateClusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel
-from ucfrec.counterfactual.transitions import Read
+from ucfrec.counterfactual.reward_model_fit import Read
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.record import Undefinable

@@ -13,18 +13,17 @@ from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_ac
 from ucfrec.counterfactual.clusters import ActionSupport
 from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
 from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
-from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.reward_model_fit import Read, fit_crm, sample_steps, sample_transitions
 from ucfrec.counterfactual.state_augmentation import (
     AugmentationReport,
     AugmentConfig,
     augment,
     candidates,
 )
-from ucfrec.counterfactual.transitions import Read, sample_steps, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 CRM: Final = "crm"

@@ -13,7 +13,7 @@ from ucfrec.counterfactual.clusters import StateClusters
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.settings import (
     BatchSize,
     LearningRate,

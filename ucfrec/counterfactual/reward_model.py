@@ -21,7 +21,7 @@ from ucfrec.settings import (
     settings_table,
 )
 from ucfrec.user_model.reward import CLIP, ItemRewardModel
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows
 
 _LOG_2PI = math.log(2 * math.pi)
 

@@ -11,20 +11,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.arrays import Float32Array
+from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
     EffectsMean,
     kl_to_prior,
 )
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_trained, load_weights
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 
+Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
+"""Reads the transitions of (view, episodes, steps)."""
 INITIAL: Final = "initial.safetensors"
 """Weights of an older reward model, in the folder of the new one."""
 _ACTIVE_NATS = 0.01
@@ -336,3 +339,17 @@ def _rows(generator: np.random.Generator, most: int, rows: int, device: torch.de
 def _noise(generator: np.random.Generator, rows: int, size: int) -> Tensor:
     values: Float32Array = generator.standard_normal((rows, size), dtype=np.float32)
     return torch.from_numpy(values)
+
+
+def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
+    """(episodes, steps) of a view: all, or `limit` drawn with replacement if there are more."""
+    if view.n_steps <= limit:
+        return view.all_steps()
+    return view.draw_steps(np.random.default_rng(seed), limit)
+
+
+def sample_transitions(
+    view: EpisodeStore, limit: int, seed: int, read: Read = EpisodeStore.transitions
+) -> Transitions:
+    """The transitions of `sample_steps`."""
+    return read(view, *sample_steps(view, limit, seed))

@@ -47,7 +47,7 @@ from ucfrec.counterfactual.missing_dimensions import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, Share, Width, settings_table
 
 _HELPED = 3

@@ -20,8 +20,7 @@ from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.action_augmentation import ActionReport
 from ucfrec.counterfactual.generators import Generator
 from ucfrec.counterfactual.reward_model import CausalRewardModel
-from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_warning
-from ucfrec.counterfactual.transitions import Read
+from ucfrec.counterfactual.reward_model_fit import CRMReport, Read, fit_warning
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.files.record import Undefinable

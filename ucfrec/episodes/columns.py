@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -10,14 +11,100 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.column_files import StepColumn, load_column
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, one_line
+from ucfrec.files.record import Sealed
 
+_REMEDY: Final = StoreRecord.REMEDY
+_DTYPES: Final = {
+    schema.OFFSETS: "<i8",
+    schema.RETURN_TO_GO: "<f4",
+    **schema.STEP_DTYPES,
+    **schema.EPISODE_DTYPES,
+}
 _IN_MEMORY = Path("<memory>")
+
+
+def load_column(
+    store: Path, file: str, shape: tuple[int, ...], mmap: bool, sealed: Sealed
+) -> Array:
+    """A column of one shard.
+
+    Args:
+        file: of the column, named `SHARD/COLUMN.npy`.
+        shape: of each row.
+        mmap: whether the file stays mapped instead of being read.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds something else.
+    """
+    sealed.require(file)
+    path = store / file
+    try:
+        # Mapping compares the header with the size of the file before it takes memory.
+        values: Array = np.load(path, mmap_mode="r")
+    except Exception as error:  # numpy parses headers as Python and raises what that raises
+        message = one_line(str(error)) or type(error).__name__
+        raise InputError(f"{path} is missing or damaged ({message}); {_REMEDY}") from None
+    if values.dtype != _DTYPES[path.stem] or values.shape[1:] != shape or values.ndim == 0:
+        raise InputError(
+            f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; {_REMEDY}"
+        )
+    return values if mmap else np.array(values)
+
+
+class StepColumn:
+    """A step column, indexed across its shards."""
+
+    def __init__(self, parts: list[Array], kept: IntArray | None = None) -> None:
+        """
+        Args:
+            parts: one a shard, (M,) or (M, size).
+            kept: dimensions that values have; None for all.
+        """
+        self._parts, self._kept = parts, kept
+        self._bounds = np.cumsum([0] + [len(part) for part in self._parts])
+
+    def __len__(self) -> int:
+        return int(self._bounds[-1])
+
+    def of_dimensions(self, kept: IntArray) -> "StepColumn":
+        """The same column with some dimensions of those that it has, (K,) indices."""
+        return StepColumn(self._parts, kept if self._kept is None else self._kept[kept])
+
+    def range(self) -> tuple[Any, Any]:
+        """The lowest and the highest value."""
+        return min(part.min() for part in self._parts), max(part.max() for part in self._parts)
+
+    def take(self, index: IntArray) -> Array:
+        """A copy of the values at the indices `index`, of any shape."""
+        values = self._taken(index)
+        return values if self._kept is None else values[..., self._kept]
+
+    def between(self, begin: int, end: int) -> Array:
+        """The values from index `begin` to before `end`; of one shard, without a copy."""
+        first = int(np.searchsorted(self._bounds, begin, side="right")) - 1
+        last = int(np.searchsorted(self._bounds, end, side="left"))
+        parts = [
+            np.asarray(part[max(begin - low, 0) : end - low])
+            for part, low in zip(self._parts[first:last], self._bounds[first:last], strict=True)
+        ]
+        values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return values if self._kept is None else values[..., self._kept]
+
+    def _taken(self, index: IntArray) -> Array:
+        if len(self._parts) == 1:
+            return np.asarray(self._parts[0][index])
+        shard = np.searchsorted(self._bounds[1:-1], index, side="right")
+        first = self._parts[0]
+        values = np.empty((*index.shape, *first.shape[1:]), dtype=first.dtype)
+        for i, part in enumerate(self._parts):
+            in_shard = shard == i
+            values[in_shard] = part[index[in_shard] - self._bounds[i]]
+        return values
 
 
 class Columns:
@@ -228,19 +315,19 @@ class Columns:
         """
         return self._column(name).take(np.arange(self.record.n_steps))
 
-    def step_values(self, name: str, index: IntArray) -> Array:
-        """Values of step column `name` at the step indices `index`.
+    def step_values(self, index: IntArray, *names: str) -> list[Array]:
+        """Values of step columns at the step indices `index`.
 
         Args:
             index: indices among the N steps of the store, of any shape.
 
         Returns:
-            Values of the shape of `index`, followed by the size of a vector.
+            For each name, values of the shape of `index`, followed by the size of a vector.
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._column(name).take(index)
+        return [self._column(name).take(index) for name in names]
 
     def step_range(self, name: str, begin: int, end: int) -> Array:
         """Values of step column `name` from step `begin` of the store to before step `end`.
@@ -263,7 +350,7 @@ class Columns:
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
         observations = torch.zeros(*steps.shape, 0)
         if self.observation_size:
-            observations = torch.from_numpy(self.step_values(schema.OBSERVATION, index))
+            observations = torch.from_numpy(self._column(schema.OBSERVATION).take(index))
         if not self.has_items:
             return observations
         window = self.item_states.window
@@ -272,8 +359,9 @@ class Columns:
         history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, width), the last is step end − 1
         history_index = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
         valid = history >= 0
-        items = np.where(valid, self.step_values(schema.ITEM, history_index), -1).astype(np.int64)
-        rewards = np.where(valid, self.step_values(schema.REWARD, history_index), 0)
+        items, rewards = self.step_values(history_index, schema.ITEM, schema.REWARD)
+        items = np.where(valid, items, -1).astype(np.int64)
+        rewards = np.where(valid, rewards, 0)
         return self.item_states.of_sequences(
             torch.from_numpy(items),
             torch.from_numpy(rewards.astype(np.float32)),

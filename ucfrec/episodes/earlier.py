@@ -7,8 +7,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.episodes.column_files import StepColumn
-from ucfrec.episodes.columns import Columns
+from ucfrec.episodes.columns import Columns, StepColumn
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.store import EpisodeStore
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -17,18 +17,21 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import EpisodeView
-from ucfrec.episodes.windows import Overlay, Transitions, Windows
+from ucfrec.episodes.windows import Overlay
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
+from ucfrec.files.parquet import read_ids
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["ITEM_STATES", "EpisodeStore"]
-
+__all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
 
 _STATISTICS_STEPS = 1_000_000
+_FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
+_PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
+_LISTS: Final = (schema.OBSERVATION, schema.ACTION)
 
 
 class EpisodeStore(EpisodeView):
@@ -106,9 +109,7 @@ class EpisodeStore(EpisodeView):
     # For notebooks.
 
     def to_frame(self) -> "pd.DataFrame":
-        """One row per step, with the identifiers of the logs; see `ucfrec.episodes.frame`."""
-        from ucfrec.episodes.frame import store_frame
-
+        """One row per step, with the identifiers of the logs; see `store_frame`."""
         return store_frame(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
@@ -225,63 +226,6 @@ class EpisodeStore(EpisodeView):
         kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
         return EpisodeStore(self._columns.with_observation_dimensions(kept), self._selected)
 
-    # Windows and transitions.
-
-    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
-        """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
-
-        Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
-        [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
-
-        Args:
-            episodes: (B,) positions in the view.
-            ends: (B,) last step of each window, from 0.
-            length: K, at least 1.
-
-        Returns:
-            B windows of K steps, padded on the left.
-
-        Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
-        """
-        self._require_steps(episodes, ends, length)
-        steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
-        places = episodes[:, None], np.maximum(steps, 0)
-
-        def gather(name: str) -> Tensor:
-            return torch.from_numpy(self.step_values(name, *places))
-
-        return Windows.of(
-            torch.from_numpy(steps),
-            self._edited_states(episodes, steps),
-            gather(schema.ITEM).long() if self.has_items else gather(schema.ACTION),
-            gather(schema.REWARD),
-            gather(schema.RETURN_TO_GO),
-        )
-
-    def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states; next states are as logged, also where augmented.
-
-        Args:
-            episodes: (M,) positions in the view.
-            steps: (M,) steps of those episodes, from 0.
-
-        Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
-        """
-        window = self.windows(episodes, steps, 1)
-        last = steps == self.lengths[episodes] - 1
-        next_steps = np.where(last, steps, steps + 1)
-        next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
-        is_last = torch.from_numpy(last)
-        return Transitions(
-            states=window.states[:, 0],
-            actions=self.action_vectors(window.actions[:, 0]),
-            rewards=window.rewards[:, 0],
-            next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
-            last=is_last,
-        )
-
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, each (S,) float32, of the states of the view.
@@ -299,15 +243,6 @@ class EpisodeStore(EpisodeView):
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0)
         return mean.float(), variance.sqrt().float()
-
-    def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
-        states = self._columns.states(self._sources[episodes], steps)
-        if self.overlay is not None:
-            copies = episodes[:, None] - len(self.episode_ids)
-            rows, columns, edits = self.overlay.edits_at(copies, steps)
-            states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
-        return states
 
 
 def _require_no_copies(store: EpisodeStore, operation: str) -> None:
@@ -354,3 +289,40 @@ def _of_another_store(overlay: Overlay, fault: str) -> InputError:
 
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:
     return {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+
+
+def store_frame(store: EpisodeStore) -> "pd.DataFrame":
+    """One row per step, session by session: `user_id`, `session_id` (the number of the session in
+    the store), `item_id` or `action`, the other columns of the log that the store has, and `split`.
+
+    Raises:
+        InputError: the view has augmented episodes, or a file of the store is damaged.
+    """
+    if store.overlay is not None:
+        raise InputError(f"{store} has augmented episodes; take its without_augmentation()")
+    import pandas as pd  # most stores are never shown
+
+    episodes, steps = store.all_steps()
+    columns: dict[str, Any] = {}
+    if store.has_users:
+        users = store.episode_values(schema.USER)[episodes]
+        columns[schema.USER_ID] = _named(store, schema.USER_ID, users)
+    columns[schema.SESSION_ID] = store.episode_ids[episodes]
+    if store.has_items:
+        items = store.step_values(schema.ITEM, episodes, steps)
+        columns[schema.ITEM_ID] = _named(store, schema.ITEM_ID, items)
+    for name in _PLAIN:
+        if name in store.record.columns:
+            columns[name] = store.step_values(name, episodes, steps)
+    for name in _LISTS:
+        if name in store.record.columns:
+            columns[name] = list(store.step_values(name, episodes, steps))
+    splits = store.episode_values(schema.SPLIT)[episodes]
+    columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
+    return pd.DataFrame(columns)
+
+
+def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:
+    """Identifiers of the logs; the numbers themselves in a store without their table."""
+    path = store.path / _FILES[column]
+    return read_ids(path, column)[numbers] if path.exists() else numbers

@@ -5,6 +5,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ucfrec import schema
@@ -12,7 +13,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import Overlay, Transitions, Windows
 from ucfrec.errors import InputError
 
 _OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
@@ -114,7 +115,7 @@ class EpisodeView:
         counts[self._first_action_copy :] = 1
         return counts
 
-    @property
+    @cached_property
     def has_items(self) -> bool:
         """Whether actions are items of a catalogue; otherwise they are vectors."""
         return self._columns.has_items
@@ -133,7 +134,7 @@ class EpisodeView:
         """
         return self._columns.item_states
 
-    @property
+    @cached_property
     def observation_size(self) -> int:
         """O, size of the logged observation; 0 if none was logged."""
         return self._columns.observation_size
@@ -186,13 +187,18 @@ class EpisodeView:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        values = self._columns.step_values(
-            name, self._columns.starts[self._sources[episodes]] + steps
-        )
-        if self._first_action_copy < self.n_episodes and name in _OF_ACTIONS:
-            copies = episodes - self._first_action_copy
-            self._change_actions(name, values, *np.broadcast_arrays(copies, steps))
-        return values
+        return self._step_values(episodes, steps, name)[0]
+
+    def _step_values(self, episodes: IntArray, steps: IntArray, *names: str) -> list[Array]:
+        """`step_values` of several columns."""
+        index = self._columns.starts[self._sources[episodes]] + steps
+        found = self._columns.step_values(index, *names)
+        if self._first_action_copy < self.n_episodes:
+            copies = np.broadcast_arrays(episodes - self._first_action_copy, steps)
+            for name, values in zip(names, found, strict=True):
+                if name in _OF_ACTIONS:
+                    self._change_actions(name, values, *copies)
+        return found
 
     def _change_actions(self, name: str, values: Array, copies: IntArray, steps: IntArray) -> None:
         """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
@@ -218,7 +224,7 @@ class EpisodeView:
         """(N,) reward of each action copy less that of its source, in reward units."""
         assert self.overlay is not None
         index = self._columns.starts[self.overlay.action_source] + self.overlay.action_step
-        logged = self._columns.step_values(schema.REWARD, index)
+        (logged,) = self._columns.step_values(index, schema.REWARD)
         return self.overlay.action_reward.astype(np.float64) - logged
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
@@ -317,6 +323,69 @@ class EpisodeView:
     def action_vectors(self, actions: Tensor) -> Tensor:
         """Actions as vectors (..., A): the embeddings of items (...); vectors are unchanged."""
         return self.item_states.embeddings[actions] if self.has_items else actions
+
+    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
+        """Windows of `length` steps that end with step `ends[b]` (inclusive) of `episodes[b]`.
+
+        Example: for an episode with rewards [5, 6, 7, 8], end 1 and length 3 give rewards
+        [0, 5, 6], mask [false, true, true] and timesteps [0, 0, 1].
+
+        Args:
+            episodes: (B,) positions in the view.
+            ends: (B,) last step of each window, from 0.
+            length: K, at least 1.
+
+        Returns:
+            B windows of K steps, padded on the left.
+
+        Raises:
+            InputError: an episode or step does not exist, or the arguments have other shapes.
+        """
+        self._require_steps(episodes, ends, length)
+        steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
+        action = schema.ITEM if self.has_items else schema.ACTION
+        names = action, schema.REWARD, schema.RETURN_TO_GO
+        found = self._step_values(episodes[:, None], np.maximum(steps, 0), *names)
+        actions, rewards, returns_to_go = map(torch.from_numpy, found)
+        return Windows.of(
+            torch.from_numpy(steps),
+            self._edited_states(episodes, steps),
+            actions.long() if self.has_items else actions,
+            rewards,
+            returns_to_go,
+        )
+
+    def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
+        """Single steps with their next states; next states are as logged, also where augmented.
+
+        Args:
+            episodes: (M,) positions in the view.
+            steps: (M,) steps of those episodes, from 0.
+
+        Raises:
+            InputError: an episode or step does not exist, or the arguments have other shapes.
+        """
+        window = self.windows(episodes, steps, 1)
+        last = steps == self.lengths[episodes] - 1
+        next_steps = np.where(last, steps, steps + 1)
+        next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
+        is_last = torch.from_numpy(last)
+        return Transitions(
+            states=window.states[:, 0],
+            actions=self.action_vectors(window.actions[:, 0]),
+            rewards=window.rewards[:, 0],
+            next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
+            last=is_last,
+        )
+
+    def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
+        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
+        states = self._columns.states(self._sources[episodes], steps)
+        if self.overlay is not None:
+            copies = episodes[:, None] - len(self.episode_ids)
+            rows, columns, edits = self.overlay.edits_at(copies, steps)
+            states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
+        return states
 
     def _require_steps(self, episodes: IntArray, ends: IntArray, length: int) -> None:
         if episodes.ndim != 1 or episodes.shape != ends.shape or length < 1:

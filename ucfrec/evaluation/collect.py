@@ -16,7 +16,7 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000

@@ -15,11 +15,10 @@ from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
-from ucfrec.evaluation.diversity import Recommended
-from ucfrec.evaluation.diversity_columns import variety_columns
+from ucfrec.evaluation.diversity import Recommended, variety_columns
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.session_metrics import session_metrics
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy

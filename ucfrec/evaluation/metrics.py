@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from ucfrec.episodes.group_auc import group_auc
 from ucfrec.errors import InputError
+from ucfrec.results.statistics import group_auc
 from ucfrec.schema import ITEM_ID, USER_ID
 
 _RANK: Final = "rank"

@@ -19,12 +19,12 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.group_auc import group_auc
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.session_metrics import resampled_ratios
+from ucfrec.results.statistics import group_auc
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024

@@ -82,6 +82,11 @@ class Random:
         return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
 
 
+def _sizes(train: EpisodeStore) -> dict[str, int]:
+    items, size = train.item_states.embeddings.shape
+    return {"state": train.state_size, "action": size, "items": items}
+
+
 class ItemNeighbours:
     """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
 
@@ -91,13 +96,7 @@ class ItemNeighbours:
     name = "item-knn"
 
     def __init__(self, train: EpisodeStore, popularity: Tensor) -> None:
-        embeddings = train.item_states.embeddings
-        sizes = {
-            "state": train.state_size,
-            "action": embeddings.shape[1],
-            "items": len(embeddings),
-        }
-        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), sizes)
+        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), _sizes(train))
         self._knn.start_from(train)
         self._tie_break = 1e-6 * popularity / popularity.max()
 
@@ -113,13 +112,8 @@ class BoostedClicks:
     name = "boosted clicks"
 
     def __init__(self, train: EpisodeStore, seed: int) -> None:
-        states = train.item_states
-        sizes = {
-            "state": train.state_size,
-            "action": states.embeddings.shape[1],
-            "items": len(states.embeddings),
-        }
-        self._policy = BoostedPolicy(BoostedConfig(context=_KNN_HISTORY + 1, dim=1), sizes)
+        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
+        self._policy = BoostedPolicy(config, _sizes(train))
         self._policy.start_from(train)
         self._policy.closed_form(train, None, Path(), seed)()
 

@@ -15,7 +15,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
-from ucfrec.files.checksums import CARD
+from ucfrec.files.record import CARD
 from ucfrec.given_data import histories_given
 from ucfrec.reporting import charts
 from ucfrec.reporting.charts import LineChart

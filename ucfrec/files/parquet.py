@@ -1,12 +1,17 @@
-"""Untrusted Parquet files: how many rows a small file may claim, and columns of ids."""
+"""Parquet files: what an untrusted one may claim, columns of ids, and writing frames."""
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError, explain_os_error, one_line
+from ucfrec.files.atomic import atomic_file
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _FEW_ROWS: Final = 1_000_000
 _ROWS_PER_BYTE: Final = 10
@@ -75,3 +80,37 @@ def read_ids(path: Path, column: str) -> Array:
             "restore it, or make the store or run again"
         )
     return np.asarray(ids, dtype=np.int64 if integers else None)
+
+
+def write_frames(
+    out: Path, frames: "Iterable[pd.DataFrame]", about: Mapping[str, str] | None = None
+) -> int:
+    """Write `frames` one after the other as a single Parquet file, atomically.
+
+    Args:
+        about: added to the metadata of the schema.
+
+    Returns:
+        The number of rows.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows, writer = 0, None
+    with atomic_file(out) as scratch:
+        for frame in frames:
+            table = pa.Table.from_pandas(frame, preserve_index=False)
+            table = table.replace_schema_metadata(
+                {**(table.schema.metadata or {}), **(about or {})}
+            )
+            writer = writer or pq.ParquetWriter(scratch, table.schema)
+            writer.write_table(table)
+            rows += len(frame)
+        if writer is not None:
+            writer.close()
+    return rows
+
+
+def part_name(part: int) -> str:
+    """Name of a part of a folder of Parquet files, whose names are in the order of the parts."""
+    return f"part-{part:06}.parquet"

@@ -26,7 +26,7 @@ from ucfrec.fitting.checkpoint import (
     save_training,
 )
 from ucfrec.fitting.metrics_log import MetricsLog
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import Progress, no_progress, progress
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
@@ -160,13 +160,15 @@ def fit(
     training = _Training(module, config, folder, describe)
     step = int(training.counters["step"])
     clock, log = _Clock(step, training.counters["seconds"]), _log(folder, step)
-    joint = rows if distributed.processes() > 1 else None
+    joint, rank = rows if distributed.processes() > 1 else None, distributed.rank()
+    module.train()
     for step, bar in _steps(training.counters, config, describe):
         generator = step_generator(seed, step)
         with clock.waiting():
             batch = draw(generator)
-        torch.manual_seed(int(generator.integers(2**62)) + distributed.rank())
-        module.train()
+        torch.manual_seed(int(generator.integers(2**62)) + rank)
+        if not module.training:  # a validation or a callback has ended it
+            module.train()
         value, scalars = loss(batch)
         count = None if joint is None else joint(batch)
         norm = training.descend(value, step, count)

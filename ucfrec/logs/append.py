@@ -7,7 +7,7 @@ follow. All old rows become training rows, and the newest of the new rows valida
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,12 +22,11 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.checksums import file_checksum
+from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
-from ucfrec.logs.ids import ID_TABLES, write_ids
+from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import PreparedLog, PrepareOptions, prepared_log
-from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.progress import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
@@ -200,8 +199,7 @@ class _Grown:
         files = dict(new.files)
         for number, shard in enumerate(self._kept):
             files |= self._copy(shard, folder / f"shard-{number:05d}")
-        steps = [*_training_steps(folder, range(len(self._kept), new.n_shards))]
-        write_grown_states(self._store, folder, found, steps)
+        write_grown_states(self._store, folder, found, range(len(self._kept), new.n_shards))
         made = {"made_of": dict(made_of), "appended": report}
         self._record(new, report, made).with_entries(files=files).sealed(folder)
         return report
@@ -320,21 +318,3 @@ def _link(source: Path, target: Path) -> None:
     except OSError:
         # Another file system, or one without links.
         shutil.copyfile(source, target)
-
-
-def _training_steps(
-    folder: Path, shards: Sequence[int]
-) -> Iterator[tuple[IntArray, IntArray, Array]]:
-    """Users, items and rewards (N,) of the training steps of some shards."""
-    for number in shards:
-        path = folder / f"shard-{number:05d}"
-        offsets = np.load(path / f"{schema.OFFSETS}.npy")
-        every = np.ones(len(offsets) - 1, dtype=bool)
-        shard = _Shard(path, np.diff(offsets), every)
-        train = np.asarray(shard.load(schema.SPLIT)) == 0
-        rows = shard.of_steps(train)
-        yield (
-            _numbers(shard, schema.USER_ID, train),
-            _numbers(shard, schema.ITEM_ID, train),
-            np.asarray(shard.load(schema.REWARD)[rows], dtype=np.float64),
-        )

@@ -4,7 +4,7 @@ A policy that was trained on the old vectors goes on with the new ones, so these
 space.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,23 @@ from ucfrec.episodes.item_table import DISTINCT_TAGS, ITEM_STATES, write_item_ta
 from ucfrec.episodes.states import ItemStates
 from ucfrec.logs.features import encode_features, item_tags
 from ucfrec.logs.ids import ID_TABLES
-from ucfrec.logs.items import EXPOSURE, PRIOR_COUNT, predicted_from_features
+from ucfrec.logs.items import (
+    EXPOSURE,
+    PRIOR_COUNT,
+    TrainingSteps,
+    joined_steps,
+    predicted_from_features,
+    steps_of_shards,
+)
 from ucfrec.logs.prepare import PreparedLog
 
 _ALIKE = 0.5
 """Share of items that two tags must have in common (Jaccard) to be the same tag."""
-Triples = Sequence[tuple[IntArray, IntArray, Array]]
 
 
-def write_grown_states(store: Path, folder: Path, found: PreparedLog, steps: Triples) -> None:
+def write_grown_states(
+    store: Path, folder: Path, found: PreparedLog, new_shards: Iterable[int]
+) -> None:
     """Write the item states of the store at `folder`, grown from `store`.
 
     With feature tables, new items and users have the vectors that a ridge regression of the old
@@ -34,8 +42,9 @@ def write_grown_states(store: Path, folder: Path, found: PreparedLog, steps: Tri
 
     Args:
         found: the new log, with the tables `users` and `items` of all ids.
-        steps: users, items and rewards of the new training steps.
+        new_shards: those of the new log's steps.
     """
+    steps = [*steps_of_shards(folder, new_shards)]
     old, log = ItemStates.load(store / ITEM_STATES), found.rows.log
     encoded, counts = {}, {}
     for name, table, _ in ID_TABLES:
@@ -44,8 +53,8 @@ def write_grown_states(store: Path, folder: Path, found: PreparedLog, steps: Tri
         counts[name] = rows["train_count"].astype(np.int64)
     items, users = schema.ITEM_ID, schema.USER_ID
     shown = np.zeros(len(counts[items]), dtype=np.int64)
-    for _, numbers, _ in steps:
-        shown += np.bincount(numbers, minlength=len(shown))
+    for batch in steps:
+        shown += np.bincount(batch.items, minlength=len(shown))
     before = np.maximum(counts[items] - shown, 0)
     vectors = _extended(old.embeddings.numpy(), encoded[items], before)
     if encoded[items] is None:
@@ -76,7 +85,11 @@ def _extended(old: Float32Array, features: sparse.csr_matrix | None, counts: Int
 
 
 def _moved(
-    vectors: Float64Array, steps: Triples, before: IntArray, shown: IntArray, old: ItemStates
+    vectors: Float64Array,
+    steps: Sequence[TrainingSteps],
+    before: IntArray,
+    shown: IntArray,
+    old: ItemStates,
 ) -> Float64Array:
     """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD).
 
@@ -85,11 +98,11 @@ def _moved(
     """
     if not shown.any():
         return vectors
-    users, items, rewards = (np.concatenate(each) for each in zip(*steps, strict=True))
-    _, rows = np.unique(users, return_inverse=True)
-    liking = np.clip((rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
+    new = joined_steps(steps)
+    _, rows = np.unique(new.users, return_inverse=True)
+    liking = np.clip((new.rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
     weights = sparse.csr_matrix(
-        (EXPOSURE + liking, (rows, items)), shape=(int(rows.max()) + 1, len(vectors))
+        (EXPOSURE + liking, (rows, new.items)), shape=(int(rows.max()) + 1, len(vectors))
     )
     of_users = (weights @ vectors) / np.asarray(weights.sum(axis=1))
     folded = weights.T @ (of_users - of_users.mean(axis=0))

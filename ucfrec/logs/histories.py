@@ -14,11 +14,10 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import note_dropped, require_rows
+from ucfrec.logs.binding import explained, settled
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
+from ucfrec.logs.kept import note_dropped, require_rows
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.remembered import settled
 from ucfrec.logs.sessions import end_of_user
 from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
 from ucfrec.logs.tables import Table, open_tables, quoted

@@ -1,8 +1,10 @@
-"""Users and items of a store: which ids there are, their numbers, and the files that list them."""
+"""Users and items of a store: which ids there are, their numbers in its steps, and their files."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -10,14 +12,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
+from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
+from ucfrec.logs.sessions import Episodes
 from ucfrec.logs.sorted_rows import CODES, has_codes
 from ucfrec.logs.spool import Spool
 from ucfrec.logs.tables import glob_pattern, text
 from ucfrec.logs.typed import TypedLog
+from ucfrec.progress import Progress
 
 ITEMS_FILE: Final = "items.parquet"
 USERS_FILE: Final = "users.parquet"
@@ -27,6 +32,8 @@ ID_TABLES: Final = (
     (schema.ITEM_ID, "items", ITEMS_FILE),
 )
 """Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
+_SCHEMA: Final = pa.schema([("code", pa.int64()), ("train_count", pa.int64())])
+_PLACED: Final = pa.schema([("place", pa.int64()), ("code", pa.int64())])
 
 
 def number_ids(
@@ -119,9 +126,6 @@ def _keep(log: TypedLog, measures: Measures, name: str, table: str) -> None:
     log.connection.unregister("counted")
 
 
-_SCHEMA: Final = pa.schema([("code", pa.int64()), ("train_count", pa.int64())])
-
-
 def _batch(codes: IntArray, counts: IntArray) -> pa.RecordBatch:
     return pa.record_batch([as_arrow(codes), as_arrow(counts)], schema=_SCHEMA)
 
@@ -185,9 +189,6 @@ def write_episode_users(log: TypedLog, file: Path, codes: Iterator[IntArray]) ->
     log.connection.unregister("placed")
 
 
-_PLACED: Final = pa.schema([("place", pa.int64()), ("code", pa.int64())])
-
-
 def _placed(codes: Iterator[IntArray]) -> Iterator[pa.RecordBatch]:
     begin = 0
     for batch in codes:
@@ -202,3 +203,73 @@ def _copy(log: TypedLog, query: str, file: Path) -> None:
     with pq.ParquetWriter(file, reader.schema) as writer:
         for batch in reader:
             writer.write_batch(batch)
+
+
+@dataclass(frozen=True)
+class StepNumbers:
+    """The numbers that a store gives to the users and items of a log."""
+
+    users: Spool
+    """`number` of each user in the steps, in order; −1 for users that the store does not know."""
+    items: IntArray
+    """(items,) number of each item by code; −1 likewise, and for items in no step."""
+
+    @classmethod
+    def of(cls, log: TypedLog, measures: Measures, folder: Path) -> "StepNumbers":
+        """The numbers in the tables of `ucfrec.logs.ids.number_ids`.
+
+        Args:
+            measures: of the log's episodes.
+        """
+        users = Spool(folder / "numbers")
+        for batch in numbers(log, schema.USER_ID, "users"):
+            users.append({"number": batch})
+        items = np.full(len(measures.item_steps), -1, dtype=np.int64)
+        if log.key == schema.ITEM_ID:
+            found = numbers(log, schema.ITEM_ID, "items")
+            items[np.flatnonzero(measures.item_steps)] = np.concatenate(list(found))
+        return cls(users, items)
+
+
+def write_steps(
+    folder: Path,
+    episodes: Iterable[Episodes],
+    spool: Spool,
+    numbered: StepNumbers,
+    display: Progress,
+    first_shard: int = 0,
+    fill: Mapping[str, float] = MappingProxyType({}),
+) -> StoreWriter:
+    """Write all episodes to the store at `folder`.
+
+    Args:
+        fill: the step columns of the store, with what steps without a value have; others are left
+            out. Empty for those of the log.
+    """
+    writer = StoreWriter(folder, first_shard=first_shard)
+    names = [name for name in schema.STEP_DTYPES if name in spool.names]
+    names = [name for name in names if name in fill or not fill]
+    users_before, last_user = 0, None
+    for found in episodes:
+        if not len(found.lengths):
+            continue
+        steps: dict[str, Array] = {n: found.column(spool, n) for n in names}
+        rows = int(found.lengths.sum())
+        steps |= {n: np.full(rows, value) for n, value in fill.items() if n not in steps}
+        if schema.ITEM in steps:
+            steps[schema.ITEM] = numbered.items[steps[schema.ITEM]]
+        new = np.append(found.users[0] != last_user, found.users[1:] != found.users[:-1])
+        places = np.cumsum(new) - 1 + users_before
+        first_place = int(places[0])
+        values = numbered.users.read("number", first_place, int(places[-1]) + 1)
+        users_before, last_user = int(places[-1]) + 1, found.users[-1]
+        first = np.zeros(rows, dtype=bool)
+        first[np.cumsum(found.lengths) - found.lengths] = True
+        each = {
+            schema.USER: values[places - first_place],
+            schema.SPLIT: found.splits,
+            schema.TERMINATED: found.terminated,
+        }
+        writer.append(steps, first, {n: np.repeat(v, found.lengths) for n, v in each.items()})
+        display.update(len(first))
+    return writer

@@ -1,6 +1,6 @@
 """Item embeddings and user features, learnt from the training split only."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -50,11 +50,11 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         folder: store of a log of items, as `prepare` writes it: in order of the users.
     """
     held: list[TrainingSteps] = []
-    for batch in _in_order(folder):
+    for batch in steps_of_shards(folder, range(StoreRecord.read(folder).n_shards)):
         held.append(batch)
         if sum(len(each.users) for each in held) < BLOCK_STEPS:
             continue
-        joined = _joined(held)
+        joined = joined_steps(held)
         changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
         if not len(changes):
             held = [joined]
@@ -63,11 +63,12 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         yield _part(joined, slice(end))
         held = [_part(joined, slice(end, None))]
     if held:
-        yield _joined(held)
+        yield joined_steps(held)
 
 
-def _in_order(folder: Path) -> Iterator[TrainingSteps]:
-    for number in range(StoreRecord.read(folder).n_shards):
+def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSteps]:
+    """The training steps of some shards of a store, in batches, in order."""
+    for number in shards:
         shard = folder / f"shard-{number:05d}"
         columns = {
             name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, "reward")
@@ -90,7 +91,8 @@ def _in_order(folder: Path) -> Iterator[TrainingSteps]:
             begin = end
 
 
-def _joined(batches: list[TrainingSteps]) -> TrainingSteps:
+def joined_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
+    """The steps of all batches as one."""
     return TrainingSteps(
         np.concatenate([batch.users for batch in batches]),
         np.concatenate([batch.items for batch in batches]),

@@ -21,8 +21,7 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import require_rows
+from ucfrec.logs.binding import explained, settled
 from ucfrec.logs.engine import engine
 from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
 from ucfrec.logs.ids import (
@@ -30,12 +29,14 @@ from ucfrec.logs.ids import (
     ID_TABLES,
     ITEMS_FILE,
     USERS_FILE,
+    StepNumbers,
     number_ids,
     popularity,
     write_episode_users,
     write_ids,
+    write_steps,
 )
-from ucfrec.logs.kept import DUPLICATES
+from ucfrec.logs.kept import DUPLICATES, require_rows
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
 from ucfrec.logs.measures import (
     Measures,
@@ -45,11 +46,9 @@ from ucfrec.logs.measures import (
     measure,
     sampled_rewards,
 )
-from ucfrec.logs.remembered import settled
 from ucfrec.logs.sessions import Cut, Episodes, by_sessions, count_unsorted, episodes, split_bounds
 from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
 from ucfrec.logs.spool import Spool
-from ucfrec.logs.steps import StepNumbers, write_steps
 from ucfrec.logs.summary import (
     build_report,
     note_bots,

@@ -4,24 +4,32 @@ The engine sorts, out of core; the pass over the sorted rows, in batches, drops 
 duplicates and writes the others to a spool with numbers in place of ids.
 """
 
+import mmap
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import duckdb
 import numpy as np
 import pyarrow as pa
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray
-from ucfrec.logs.clean import REASONS, faults, require_rewards_in_range
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import Digests, Hashes, digests, in_hashed_order, kept_rows
-from ucfrec.logs.row_vectors import RowVectors
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.kept import (
+    REASONS,
+    Digests,
+    Hashes,
+    digests,
+    faults,
+    in_hashed_order,
+    kept_rows,
+    require_rewards_in_range,
+)
+from ucfrec.logs.spool import Spool, whole_groups
 from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
 CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
@@ -29,6 +37,59 @@ CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
 _SESSION_CODES: Final = "session_codes"
 UNPLACED: Final = 128
 """Added to the fault of rows without a user or a time, which have no place in the order."""
+
+
+class RowVectors:
+    """The observation of every row of a log, in a file."""
+
+    def __init__(self, log: TypedLog, file: Path) -> None:
+        """
+        Args:
+            log: with observations, all of them finite.
+            file: to write.
+        """
+        self._file, self._size = file, log.vector_size[schema.OBSERVATION]
+        rows, query = 0, f"SELECT row, {schema.OBSERVATION} FROM {ROWS}"
+        with file.open("xb") as out:
+            for batch in log.connection.sql(query).to_arrow_reader(log.batch_rows):
+                # What is at the place of a row must be its own: the engine keeps their order.
+                places = as_numpy(batch.column(0))
+                assert np.array_equal(places, np.arange(rows + 1, rows + 1 + len(places)))
+                out.write(np.ascontiguousarray(as_numpy(batch.column(1).flatten())).data)
+                rows += len(places)
+        self._values: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
+            file, np.float32, "r", shape=(rows, self._size)
+        )
+        # Neighbours of a row in the file are hardly ever its neighbours in the order.
+        self._advise("MADV_RANDOM")
+
+    def _advise(self, advice: str) -> None:
+        """Advise the system how the file is read; Windows takes no advice."""
+        if hasattr(mmap, advice):
+            self._map.madvise(getattr(mmap, advice))
+
+    @property
+    def _map(self) -> mmap.mmap:
+        found = self._values._mmap  # type: ignore[attr-defined]
+        assert isinstance(found, mmap.mmap)
+        return found
+
+    def of(self, rows: IntArray) -> Float32Array:
+        """(M, O) observations of the rows at the positions (M,), from 1."""
+        values = np.asarray(self._values[rows - 1])
+        # Pages of a mapped file count as the memory of a process that must keep to a limit.
+        self._advise("MADV_DONTNEED")
+        return values
+
+    def joined(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        """Batches with the column `row`, each with the observations of its rows; then the file is
+        removed."""
+        for batch in batches:
+            values = self.of(as_numpy(batch.column("row")))
+            numbers = pa.Array.from_buffers(pa.float32(), values.size, [None, pa.py_buffer(values)])
+            column = pa.FixedSizeListArray.from_arrays(numbers, self._size)
+            yield batch.append_column(schema.OBSERVATION, column)
+        self._file.unlink()
 
 
 @dataclass
@@ -122,7 +183,9 @@ def check_sorted(
     # The connection itself answers no query before the last batch of its rows.
     with closing(log.connection.cursor()) as asked:
         hashes = _hashes(log, asked)
-        for batch in _whole_times(_columns(batch, log) for batch in batches):
+        columns = (_columns(batch, log) for batch in batches)
+        # Equal times of a user stay together.
+        for batch in whole_groups(columns, "user", schema.TIMESTAMP):
             _check_batch(rows, batch, duplicates, hashes, rewards)
     if log.key == schema.ITEM_ID:
         (rows.items,) = log.one("SELECT count(*) FROM item_codes")
@@ -199,7 +262,7 @@ def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
 
     Args:
         rows: relation of some of its typed rows.
-        conditions: as from `ucfrec.logs.clean.faults`.
+        conditions: as from `ucfrec.logs.kept.faults`.
     """
     cases = " ".join(
         f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
@@ -287,21 +350,3 @@ def _hashes(log: TypedLog, asked: duckdb.DuckDBPyConnection) -> Hashes:
         return found
 
     return Hashes(of_users, lambda codes: of_all_items()[codes])
-
-
-def _whole_times(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end between two times of a user: equal times stay together."""
-    held: dict[str, Array] = {}
-    for batch in batches:
-        if held:
-            batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        users, times = batch["user"], batch[schema.TIMESTAMP]
-        starts = np.flatnonzero((users[1:] != users[:-1]) | (times[1:] != times[:-1]))
-        if not len(starts):
-            held = batch
-            continue
-        end = int(starts[-1]) + 1
-        yield {name: values[:end] for name, values in batch.items()}
-        held = {name: values[end:].copy() for name, values in batch.items()}
-    if held:
-        yield held

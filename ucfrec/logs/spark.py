@@ -1,8 +1,9 @@
 """Sort the rows of a log with Apache Spark, for logs that outgrow one machine.
 
-Spark's workers read the files, evaluate the columns and the reward (`ucfrec.logs.spark_tasks`),
-number the ids and sort: in the scratch folder the rows are what DuckDB's sort would give, and what
-follows is the same. Workers need ucfrec and the same paths to the logs and the scratch folder.
+Spark's workers read the files, evaluate the columns and the reward with DuckDB (`Task`), so that an
+expression means the same whatever sorts the rows, number the ids and sort: in the scratch folder
+the rows are what DuckDB's sort would give, and what follows is the same. Workers need ucfrec and
+the same paths to the logs and the scratch folder.
 """
 
 import os
@@ -16,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, Final
 
 import duckdb
@@ -25,11 +27,10 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError, one_line
 from ucfrec.logs.binding import explained
-from ucfrec.logs.clean import faults
-from ucfrec.logs.engine import BATCH_ROWS
+from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.kept import faults
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
-from ucfrec.logs.spark_tasks import Task, run_tasks
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
@@ -43,6 +44,8 @@ from ucfrec.logs.typed import (
     vectors,
 )
 
+MEMORY: Final = "1GB"
+"""Memory of DuckDB in a task."""
 _TYPES: Final = {"BIGINT": "bigint", "VARCHAR": "string"}
 _COLUMNS: Final = {
     schema.ACTION: "array<float>",
@@ -55,6 +58,40 @@ _COUNTS: Final = "file bigint, name string, size bigint, n bigint"
 _ROWS, _BAD = "rows", "bad"
 _TYPED: Final = "typed"
 _REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
+Files = Sequence[tuple[str, Table]]
+"""Of each file, the SQL of its typed columns and the table that it is."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A query over one file of a log."""
+
+    table: Table
+    """Of the file."""
+    query: str
+    """SQL."""
+    others: tuple[Path, ...] = ()
+    """Other files that the query reads."""
+
+    def run(self) -> Iterator[pa.RecordBatch]:
+        """The result, in order.
+
+        Raises:
+            InputError: the file, or a value in it, cannot be read.
+        """
+        folder = Path(gettempdir())
+        with (
+            engine((*self.table.files, *self.others), folder, MEMORY, threads=1) as connection,
+            explained(connection, (self.table,), folder),
+        ):
+            yield from connection.sql(self.query).to_arrow_reader(BATCH_ROWS)
+
+
+def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    """Results of the tasks whose places are in the only column of `batches`."""
+    for batch in batches:
+        for number in batch.column(0).to_pylist():
+            yield from tasks[number].run()
 
 
 def sorted_with_spark(
@@ -146,10 +183,6 @@ class _Survey:
     """Vector column to the number of its vectors by size, missing ones excluded."""
     bad: int = 0
     """Number of observations that are missing or not finite."""
-
-
-Files = Sequence[tuple[str, Table]]
-"""Of each file, the SQL of its typed columns and the table that it is."""
 
 
 def _surveyed(spark: Any, files: Files, names: Sequence[str]) -> _Survey:

@@ -19,10 +19,10 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.clean import REASONS, NoRowsError, note_dropped, require_rows
+from ucfrec.logs.binding import settled
 from ucfrec.logs.engine import engine
+from ucfrec.logs.kept import REASONS, NoRowsError, note_dropped, require_rows
 from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
-from ucfrec.logs.remembered import settled
 from ucfrec.logs.sorted_rows import UNPLACED
 from ucfrec.logs.spark import spark_failures, spark_session, typed_with_spark
 from ucfrec.logs.tables import open_tables

@@ -1,6 +1,6 @@
 """Rows on disk, column by column: written once in order, then read in slices of bounded size."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, Final
@@ -80,3 +80,21 @@ class Spool:
         """Close the files."""
         for file in self._files.values():
             file.close()
+
+
+def whole_groups(batches: Iterable[dict[str, Array]], *keys: str) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two groups of rows with equal `keys`."""
+    held: dict[str, Array] = {}
+    for batch in batches:
+        if held:
+            batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
+        differ = [batch[key][1:] != batch[key][:-1] for key in keys]
+        ends = np.flatnonzero(np.logical_or.reduce(differ))
+        if not len(ends):
+            held = batch
+            continue
+        end = int(ends[-1]) + 1
+        yield {name: values[:end] for name, values in batch.items()}
+        held = {name: values[end:].copy() for name, values in batch.items()}
+    if held and len(held[keys[0]]):
+        yield held

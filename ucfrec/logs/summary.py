@@ -14,8 +14,7 @@ from ucfrec.episodes.long_sessions import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.binding import bind
-from ucfrec.logs.clean import CLOCK_HINT, REASONS
-from ucfrec.logs.kept import DUPLICATES
+from ucfrec.logs.kept import CLOCK_HINT, DUPLICATES, REASONS
 from ucfrec.logs.measures import Distribution, Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import CODES, SortedRows, has_codes

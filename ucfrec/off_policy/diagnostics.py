@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.weights import effective_number
 from ucfrec.off_policy.estimators import step_totals
 from ucfrec.off_policy.intervals import cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.results.statistics import effective_number
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""

@@ -31,11 +31,11 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.weights import effective_number
 from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_means
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
+from ucfrec.results.statistics import effective_number
 
 LOGGED = "logged"
 

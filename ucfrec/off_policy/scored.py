@@ -19,14 +19,20 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.parquet import require_regular
-from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
+from ucfrec.logs.spool import whole_groups
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import StepSums, estimate, normalised_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, conditions, of_sessions
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import PROBABILITY, SESSION, about_scores
 from ucfrec.off_policy.training_rows import row_keys, seen_too_often, share_of_rows_seen
-from ucfrec.off_policy.verdict import cautions, conclude
+from ucfrec.off_policy.verdict import (
+    Subject,
+    cautions,
+    conclude,
+    diagnosis_columns,
+    verdict_columns,
+)
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18
@@ -158,7 +164,7 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
         InputError: they are not in the order in which `score` writes them.
     """
     session, user, users = -1, None, 0
-    for rows in _whole_sessions(_batches(files, _WEIGHED)):
+    for rows in whole_groups(_batches(files, _WEIGHED), SESSION):
         rises = np.diff(rows[SESSION], prepend=session)
         if rises[0] != 1 or not np.isin(rises, (0, 1)).all():
             raise InputError(
@@ -182,21 +188,6 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
 def _at_most_1(probabilities: Float64Array) -> Float64Array:
     """The probabilities without rounding errors above 1."""
     return np.where(probabilities < 1 + _ROUNDING, np.minimum(probabilities, 1.0), probabilities)
-
-
-def _whole_sessions(batches: Iterator[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end with a session."""
-    held: dict[str, Array] = {}
-    for batch in batches:
-        if held:
-            batch = {name: np.concatenate([held[name], batch[name]]) for name in batch}
-        starts = np.flatnonzero(np.diff(batch[SESSION]))
-        end = int(starts[-1]) + 1 if len(starts) else 0
-        if end:
-            yield {name: values[:end] for name, values in batch.items()}
-        held = {name: values[end:] for name, values in batch.items()}
-    if held and len(held[SESSION]):
-        yield held
 
 
 def _summed(files: Sequence[Path], options: EstimateOptions) -> LoggedSteps:

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file
-from ucfrec.files.frames import part_name, write_frames
+from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog
 from ucfrec.off_policy.score import (

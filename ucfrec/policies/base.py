@@ -16,9 +16,8 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.heads import Head, ItemHead, head_from
+from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
 from ucfrec.policies.layers import some_padding
-from ucfrec.policies.values import ValueHead, advantage_weights
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0

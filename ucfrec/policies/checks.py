@@ -9,9 +9,9 @@ from torch import Tensor
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
+from ucfrec.processes import random_state_kept
 
 _WINDOWS = 8
 _TOLERANCE = 1e-6

@@ -16,7 +16,7 @@ from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, settings_table
 
 _CHUNK = 4096

@@ -17,8 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import VectorHead
-from ucfrec.user_model.posterior import MEMORY
-from ucfrec.user_model.reward import ItemRewardModel
+from ucfrec.user_model.reward import MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 _CANDIDATES: Final = 512

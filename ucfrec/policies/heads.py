@@ -1,6 +1,7 @@
-"""Action heads, which embed and predict actions: vectors, or items of a catalogue."""
+"""Action heads, which embed and predict actions (vectors or items), and a head of state values."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
@@ -8,12 +9,58 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, columns_of
-from ucfrec.policies.item_sampling import Candidates, Proposal
+from ucfrec.episodes.windows import Windows
+from ucfrec.fitting.distributed import joint_moments
 
 EXPOSURE_KNOTS = 6
 """Returns-to-go at which an exposure term has weights of its own."""
 _AT_ONCE = 2**24
 """Largest number of logits that a loss over all items of a large catalogue keeps at once."""
+BEST: float = 0.99
+"""τ of the expectile that stands for the best return within the logs (Reinformer)."""
+_CLIP = (-5.0, 3.0)
+"""Range of the standardised advantage in the exponent of a weight."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Items that were drawn, and how much each stands for."""
+
+    items: Tensor
+    """(L,) int64, ascending, each once."""
+    log_weights: Tensor
+    """(L,) log of an item's draws over their expected number.
+
+    Σ exp(log_weight + x) over the candidates has the expectation Σ exp(x) over all items."""
+
+
+class Proposal:
+    """Draws items with probability Q: half in proportion to training counts, half evenly.
+
+    By counts alone, items that the logs hardly show but the policy likes would be drawn too rarely
+    for their weight; evenly alone, popular items would (`benchmarks/LOG.md` has all three). The
+    unit interval is cut into as many equal parts as there are draws, and every part has one: the
+    draws of an item then deviate from their expectation by less than two.
+    """
+
+    def __init__(self, counts: Tensor) -> None:
+        """
+        Args:
+            counts: (n_items,) training counts, above 0.
+        """
+        share = counts.double() / counts.double().sum()
+        self.share = (share + 1 / len(counts)) / 2
+        self._cumulative = self.share.cumsum(0)
+
+    def draw(self, count: int) -> Candidates:
+        """Draw `count` times, by torch's global generator."""
+        cumulative, device = self._cumulative, self.share.device
+        parts = torch.arange(count, device=device)
+        points = (parts + torch.rand(count, device=device, dtype=torch.float64)) / count
+        drawn = torch.searchsorted(cumulative, points * cumulative[-1], right=True)
+        drawn = drawn.clamp(max=len(cumulative) - 1)
+        items, copies = torch.unique_consecutive(drawn, return_counts=True)
+        return Candidates(items, torch.log(copies / (count * self.share[items])).float())
 
 
 class VectorHead(nn.Module):
@@ -255,3 +302,68 @@ def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 
         likeness = Likeness(sizes["items"], sizes["action"], sizes.get("tags", 0))
         exposure = ExposureTerm(lags, EXPOSURE_KNOTS, likeness)
     return ItemHead(dim, sizes["items"], sizes["action"], exposure, samples)
+
+
+class ValueHead(nn.Module):
+    """V(h_t), the mean of the return-to-go Ĝ_t, and V_τ(h_t), its expectile at τ = `BEST`.
+
+    The history h_t is what the policy sees but the returns-to-go: states and step numbers up to t
+    and actions before t, within the context. The expectile minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²]
+    (Zhuang et al., ICML 2024). Values are in units of the policy's return scale.
+    """
+
+    def __init__(self, state_size: int, dim: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(state_size + 1 + dim, dim)
+        self.history = nn.GRU(dim, dim, batch_first=True)
+        self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
+
+    def forward(self, windows: Windows, actions: Tensor) -> Tensor:
+        """Mean and expectile (B, K, 2).
+
+        Args:
+            windows: normalised.
+            actions: (B, K, d) the embedded actions of the windows; no gradient goes into them.
+        """
+        mask = windows.mask
+        time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
+        taken = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
+        before = F.pad(taken, (0, 0, 1, 0))[:, :-1]
+        tokens = F.relu(self.embed(torch.cat([windows.states, time, before], dim=-1)))
+        # Padding is moved from the left to the right, where it follows every step.
+        padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)
+        found, _ = self.history(_taken(tokens, (steps + padding).clamp(max=mask.shape[1] - 1)))
+        return self.out(_taken(found, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
+
+    @staticmethod
+    def loss(values: Tensor, returns: Tensor) -> Tensor:
+        """Squared error of the mean plus the expectile's, over M steps.
+
+        Args:
+            values: (M, 2).
+            returns: (M,) returns-to-go.
+        """
+        error = returns - values[:, 1]
+        slope = torch.where(error < 0, 1 - BEST, BEST)
+        return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
+
+
+def _taken(values: Tensor, steps: Tensor) -> Tensor:
+    """The rows (B, K) `steps` of `values` (B, K, d)."""
+    return values.gather(1, steps.unsqueeze(-1).expand_as(values))
+
+
+def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
+    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation.
+
+    Args:
+        values: (M, 2) from `ValueHead`.
+        returns: (M,) returns-to-go.
+
+    Returns:
+        Weights without gradient, with mean 1 over the steps of all processes.
+    """
+    advantage = (returns - values[:, 0]).detach()
+    deviation = joint_moments(advantage)[1]
+    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_CLIP).exp()
+    return weights / joint_moments(weights)[0]

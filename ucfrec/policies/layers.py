@@ -1,5 +1,6 @@
 """Layers that cost less than PyTorch's on a CPU: dropout, attention, a depthwise convolution."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -120,6 +121,39 @@ class _ShiftedProducts(torch.autograd.Function):
             of_steps[:, :-back].addcmul_(later, taps[2 - back])
             of_taps[2 - back] = (later * earlier).sum((0, 1))
         return of_steps, of_taps, gradient.sum((0, 1))
+
+
+class ConvStream(nn.Module):
+    """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
+
+    def __init__(self, dim: int, blocks: int, dropout: float) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_ConvBlock(dim, dropout) for _ in range(blocks))
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
+        for block in self.blocks:
+            tokens = block(tokens, mask)
+        return tokens
+
+
+class _ConvBlock(nn.Module):
+    def __init__(self, dim: int, dropout: float) -> None:
+        super().__init__()
+        self.depthwise = CausalDepthwise(dim)
+        self.pointwise = nn.Linear(dim, dim)
+        self.dropout = Dropout(dropout)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        local = self.depthwise(tokens, mask)
+        return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
+
+
+def convolved(streams: Iterable[nn.Module], tokens: Iterable[Tensor], mask: Tensor) -> list[Tensor]:
+    """The tokens (B, K, d) of each modality through its stream; steps outside `mask` count as 0."""
+    padded = some_padding(mask)
+    return [stream(each, padded) for stream, each in zip(streams, tokens, strict=True)]
 
 
 def visible_tokens(valid: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from ucfrec.policies.base import (
     require_heads,
 )
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.layers import CausalDepthwise, Dropout, some_padding
+from ucfrec.policies.layers import ConvStream, Dropout, convolved, some_padding
 from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
 from ucfrec.settings import Share, Weight, settings_table
 
@@ -84,9 +84,10 @@ class UCFPolicy(SequencePolicy):
         super().__init__(config, sizes)
         dim = config.dim
         self.embed = TokenEmbedding(config, sizes["state"])
-        self.return_stream = ConvStream(config)
-        self.state_stream = ConvStream(config)
-        self.action_stream = ConvStream(config)
+        blocks = dim, config.conv_blocks, config.dropout
+        self.return_stream = ConvStream(*blocks)
+        self.state_stream = ConvStream(*blocks)
+        self.action_stream = ConvStream(*blocks)
         self.fuse = nn.Linear(3 * dim, dim)
         self.fuse_norm = nn.LayerNorm(dim)
         self.attention = SupervisedAttention(config)
@@ -117,10 +118,7 @@ class UCFPolicy(SequencePolicy):
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
         tokens = self.embed(windows, self.head.embed(windows.actions))
         streams = (self.return_stream, self.state_stream, self.action_stream)
-        padded = some_padding(windows.mask)
-        returns, states, actions = (
-            stream(token, padded) for stream, token in zip(streams, tokens, strict=True)
-        )
+        returns, states, actions = convolved(streams, tokens, windows.mask)
         # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
         # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
         of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
@@ -184,34 +182,6 @@ class UCFPaperPolicy(UCFPolicy):
         "csg.kind": "faithful",
         "rule.choose": False,
     }
-
-
-class ConvStream(nn.Module):
-    """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
-
-    def __init__(self, config: UCFConfig) -> None:
-        super().__init__()
-        self.blocks = nn.ModuleList(_ConvBlock(config) for _ in range(config.conv_blocks))
-
-    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
-        """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
-        for block in self.blocks:
-            tokens = block(tokens, mask)
-        return tokens
-
-
-class _ConvBlock(nn.Module):
-    def __init__(self, config: UCFConfig) -> None:
-        super().__init__()
-        dim = config.dim
-        self.depthwise = CausalDepthwise(dim)
-        self.pointwise = nn.Linear(dim, dim)
-        self.dropout = Dropout(config.dropout)
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
-        local = self.depthwise(tokens, mask)
-        return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
 
 
 class SupervisedAttention(nn.Module):

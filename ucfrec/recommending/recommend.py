@@ -15,7 +15,7 @@ from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.ids import IdLookup
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import mixed
 from ucfrec.recommending.histories import Histories
@@ -221,7 +221,7 @@ def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
         unknown = ids[numbers < 0].tolist()
         raise InputError(
             f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
-            f"({_some(unknown)}); leave them out"
+            f"({some_of(unknown)}); leave them out"
         )
     excluded = torch.ones(len(index), dtype=torch.bool)
     excluded[torch.from_numpy(numbers)] = False
@@ -236,12 +236,13 @@ def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
         items |= set(unknown.tolist())
     return InputError(
         f"{rows} rows have an item_id that the policy does not know ({len(items)} items: "
-        f"{_some(sorted(items))}); prepare and train on logs with them, or leave those rows out "
+        f"{some_of(sorted(items))}); prepare and train on logs with them, or leave those rows out "
         "with --skip-unknown (skip_unknown=True in Python)"
     )
 
 
-def _some(values: Sequence[Any]) -> str:
+def some_of(values: Sequence[Any]) -> str:
+    """The first of the values, for a message."""
     return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
 
 

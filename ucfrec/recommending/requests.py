@@ -26,8 +26,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
-from ucfrec.logs.clean import DAY_MS
-from ucfrec.logs.kept import kept_in_order
+from ucfrec.logs.kept import DAY_MS, kept_in_order
 from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table

@@ -13,7 +13,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.recommend import best_of, sessions_of, uniforms, users_at_once
+from ucfrec.recommending.recommend import best_of, sessions_of, some_of, uniforms, users_at_once
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -112,7 +112,7 @@ class Responder:
         if engine not in ENGINES:
             raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
         if engine == ONNXRUNTIME:
-            from ucfrec.recommending.score_graph import ScoreGraph
+            from ucfrec.recommending.export_graph import ScoreGraph
 
             graph = ScoreGraph(self._scorer, trained.name)
             self._scorer = self._scorer.answering_one_with(graph)
@@ -186,10 +186,9 @@ class Responder:
         self._rows[1] += len(known)
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))
-            shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
             raise InputError(
                 f"{int((known < 0).sum())} rows of the history have an item_id that the policy "
-                f"does not know ({shown}); leave them out"
+                f"does not know ({some_of(unknown)}); leave them out"
             )
         seen = self._items.numbers(history.seen) if self._filter_seen else np.empty(0, np.int64)
         allowed = None if request.candidates is None else self._candidates(request.candidates)
@@ -203,10 +202,9 @@ class Responder:
         numbers = self._items.numbers(_array(candidates))
         if (numbers < 0).any():
             unknown = [candidates[n] for n in np.flatnonzero(numbers < 0).tolist()]
-            shown = ", ".join(map(str, unknown[:3])) + (", …" if len(unknown) > 3 else "")
             raise InputError(
                 f"{len(unknown)} of {len(candidates)} candidates are items that the policy does "
-                f"not know ({shown}); leave them out"
+                f"not know ({some_of(unknown)}); leave them out"
             )
         return numbers
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.earlier import LONGEST_HISTORY
-from ucfrec.files.frames import part_name, write_frames
+from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog

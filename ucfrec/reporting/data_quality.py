@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ucfrec.episodes.record import Distribution, Source
-from ucfrec.logs.clean import REASONS
+from ucfrec.logs.kept import REASONS
 from ucfrec.reporting import charts
 from ucfrec.reporting.tables import Table, shown
 

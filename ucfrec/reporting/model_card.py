@@ -13,12 +13,11 @@ from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
-from ucfrec.files.checksums import CARD, MEASURED
 from ucfrec.files.locks import claim
+from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.rule import user_model_table
-from ucfrec.reporting.tables import markdown_table, shown
+from ucfrec.reporting.tables import Table, markdown_table, shown
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE
 
@@ -201,3 +200,32 @@ def _measured(measured: Sequence[Mapping[str, Any]]) -> str:
 def _listed(rows: Mapping[str, object]) -> str:
     body = [[name, shown(value)] for name, value in rows.items() if value is not None]
     return markdown_table(["what", "value"], body)
+
+
+def user_model_table(record: RunRecord) -> Table | None:
+    """The held-out loss of every part of the user model beside simpler parts; None without one."""
+    reward, rule = record.reward_model, record.rule
+    if reward is None or rule is None:
+        return None
+    rows: dict[str, Any] = {
+        "reward: loss of the mean": reward.base_loss,
+        "reward: loss of item effects": reward.item_loss,
+        "reward: loss of the model": reward.loss,
+    }
+    for tried in reward.effects:
+        kept = "" if tried.kept else ", excluded"
+        rows[f"gain by {tried.effect}"] = f"{tried.gain:.5f} ± {tried.gain_error:.5f}{kept}"
+    if (end := rule.session_end) is not None:
+        rows |= {f"session end: loss, {kind}": loss for kind, loss in end.loss.items()}
+        rows["session end: kept"] = end.kept
+    if (estimate := rule.estimate) is not None:
+        rows["estimated value"] = f"{estimate.value:.4g} ± {estimate.error:.2g}"
+        rows["in either half of the users"] = " and ".join(f"{v:.4g}" for v in estimate.halves)
+        if estimate.optimism is not None:
+            off, error = estimate.optimism
+            rows["rewards expected too high by"] = f"{off:+.1%} ± {error:.1%}"
+        rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
+    if rule.halves_agree is not None:
+        rows["halves that choose this rule"] = sum(rule.halves_agree)
+    body = [(name, [each if isinstance(each, str) else shown(each)]) for name, each in rows.items()]
+    return Table("User model, on held-out rows", "", ["value"], body)

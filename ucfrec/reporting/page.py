@@ -20,8 +20,8 @@ from ucfrec.reporting.augmentation import augmentation_table, moves_chart
 from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
 from ucfrec.reporting.data_quality import data_quality
 from ucfrec.reporting.forest import forest
-from ucfrec.reporting.page_results import environments, estimates, results_of
-from ucfrec.reporting.rule import frontier, user_model_table
+from ucfrec.reporting.model_card import user_model_table
+from ucfrec.reporting.page_results import environments, estimates, frontier, results_of
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict

@@ -1,4 +1,4 @@
-"""Results of `ucfrec evaluate` and `ucfrec ope` in the report."""
+"""Results of `ucfrec evaluate` and `ucfrec ope` in the report, and rules by their evidence."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.errors import InputError
-from ucfrec.evaluation.diversity_columns import COLUMNS
-from ucfrec.off_policy.columns import SUITE
+from ucfrec.evaluation.diversity import COLUMNS
 from ucfrec.off_policy.estimators import LOGGED
+from ucfrec.off_policy.verdict import SUITE
 from ucfrec.reporting import charts
+from ucfrec.reporting.charts import LineChart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, shown
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
+from ucfrec.runs.record import Candidate, RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
@@ -156,3 +158,41 @@ def _row_names(rows: Sequence[ResultRow]) -> list[str]:
 def _cell(line: Mapping[str, Any], column: str) -> str:
     value = line.get(column)
     return str(value) if column in _SEEDS and value is not None else shown(value)
+
+
+def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
+    """The highest estimated value of the rules that leave so many effective users of the log.
+
+    None where the log has no propensities.
+    """
+    best = list[Candidate]()
+    known = [each for each in _candidates(record) if _users(each) is not None]
+    for each in sorted(known, key=lambda one: (-(_users(one) or 0.0), -(one.value or 0.0))):
+        if not best or (each.value or 0.0) > (best[-1].value or 0.0):
+            best.append(each)
+    if not best or record.rule is None:
+        return None
+    curve: Mapping[float, float] = {_users(each) or 0.0: each.value or 0.0 for each in best}
+    chosen = next((each for each in known if each.rule == record.rule.rule), None)
+    curves = [("best rule", 0, curve)]
+    if chosen is not None:
+        curves.append(("chosen rule", 1, {_users(chosen) or 0.0: chosen.value or 0.0}))
+    title = "Estimated value against evidence"
+    chart = line_chart(title, "effective users of the log", curves)
+    head = ["estimated value", "effective users", "off-policy interval"]
+    return chart, Table(title, "rule", head, [(str(each.rule), _numbers(each)) for each in best])
+
+
+def _candidates(record: RunRecord) -> tuple[Candidate, ...]:
+    return () if record.rule is None else record.rule.candidates
+
+
+def _users(candidate: Candidate) -> float | None:
+    evidence = candidate.evidence
+    return None if evidence is None or candidate.value is None else evidence.effective_users
+
+
+def _numbers(candidate: Candidate) -> list[str]:
+    interval = None if candidate.evidence is None else candidate.evidence.interval
+    ends = "-" if interval is None else f"{interval[0]:.4g} to {interval[1]:.4g}"
+    return [shown(candidate.value), f"{_users(candidate) or 0.0:.0f}", ends]

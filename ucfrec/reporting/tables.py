@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ucfrec.errors import one_line
-from ucfrec.reporting.statistics import Summary, summary
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import Summary, summary
 
 NONE = "–"
 """Cell of a missing value."""
@@ -107,4 +107,7 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
 def _text(value: object) -> str:
     if value is None:
         return NONE
-    return number(value) if isinstance(value, float) else one_line(str(value))
+    if isinstance(value, float):
+        return number(value)
+    text = str(value)
+    return text if text.isprintable() else one_line(text)

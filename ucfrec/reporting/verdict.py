@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ucfrec.reporting.page_results import Estimates, Results
-from ucfrec.reporting.statistics import grouped
 from ucfrec.reporting.tables import shown
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped
 
 NO_RESULTS = (
     "No results are given, so the returns of these policies are unknown. A validation loss "

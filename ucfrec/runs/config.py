@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ucfrec.choosing.config import RuleConfig
+from ucfrec.choosing.choice import RuleConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.counterfactual.state_augmentation import AugmentConfig

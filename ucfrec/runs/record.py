@@ -17,7 +17,7 @@ from pydantic import (
     TypeAdapter,
 )
 
-from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.decision import SavedRule
 from ucfrec.choosing.choice import ValueEstimate
 from ucfrec.choosing.logged import Evidence
 from ucfrec.counterfactual.screening import DimensionReport
@@ -28,8 +28,7 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
-from ucfrec.files.checksums import RUN_RECORD
-from ucfrec.files.record import Count, Entry, Number, Record, Text
+from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import Config, config_from_dict
@@ -74,17 +73,6 @@ def _config(value: object) -> Config:
     if isinstance(value, Config):
         return value
     return config_from_dict(value)
-
-
-def _rule(value: object) -> DecisionRule:
-    if isinstance(value, DecisionRule):
-        return value
-    if not isinstance(value, Mapping):
-        raise InputError("its rule is no decision rule")
-    return DecisionRule.from_dict(value, "the rule")
-
-
-_Rule = Annotated[DecisionRule, PlainValidator(_rule), PlainSerializer(DecisionRule.as_dict)]
 
 
 class TrainingRecord(Record):
@@ -133,7 +121,7 @@ class Candidate(Entry):
 
     model_config = ConfigDict(extra="allow")
 
-    rule: _Rule
+    rule: SavedRule
     value: Number | None = None
     """Mean return of a session in the user model; None for a rule that was not simulated."""
     error: Number | None = None
@@ -145,7 +133,7 @@ class RuleRecord(Entry):
 
     model_config = ConfigDict(extra="allow")
 
-    rule: _Rule
+    rule: SavedRule
     chosen_by: Text
     warning: Text = ""
     candidates: tuple[Candidate, ...] = ()

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ucfrec.acting.scorer import Scorer
+from ucfrec import schema
+from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.arrays import IntArray
-from ucfrec.choosing.choose import choose_rule
-from ucfrec.choosing.problem import Problem
+from ucfrec.choosing.by_ranking import choose_by_ranking
+from ucfrec.choosing.by_simulation import choose_by_simulation
+from ucfrec.choosing.choice import Problem
 from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -26,14 +28,13 @@ from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation, read_record
-from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
@@ -43,6 +44,8 @@ from ucfrec.user_model.model import UserModel
 _OVERLAY = "overlay.safetensors"
 PHASES = 4
 """Phases of a training that have progress of their own."""
+SAMPLES = "samples.json"
+_SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 
 @dataclass(frozen=True)
@@ -157,9 +160,11 @@ def _prepare_inputs(
         require_sound(policy, train, config.policy_name)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
-        RunRecord.read(out).reopened(out, INPUTS)
+        record = RunRecord.read(out).reopened(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
-    record = RunRecord.read(out).with_entries(config=config)
+    else:
+        record = RunRecord.read(out)
+    record = record.with_entries(config=config)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:
@@ -248,7 +253,7 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
 
 
 def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
-    """Choose the decision rule: by simulation in the user model, or by ranking."""
+    """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
     parts = trained.item_states, trained.returns, users.reward, users.session_end
     scorer = Scorer(run.policy, trained.rule, *parts)
@@ -257,7 +262,8 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     views = of_people(run.logged), of_people(run.held_out)
     start = None if initial is None else rule_to_start_from(initial, trained)
     given = targets, *views, config, run.config.seed, start
-    choice = choose_rule(Problem(scorer, users, *given))
+    choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking
+    choice = choose(Problem(scorer, users, *given))
     write_json(run.out / RULE, choice.rule.as_dict())
     return RuleRecord.model_validate(choice.as_dict())
 
@@ -286,3 +292,38 @@ def _dependencies(
         "device": device.type,
         "settings": [asdict(table) for table in settings],
     }
+
+
+@torch.no_grad()
+def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str, Any]:
+    """Recommendations of a policy at the last step of a few validation sessions.
+
+    Args:
+        scorer: a policy of items under its rule.
+
+    Returns:
+        A JSON object: the `rule` in words, and `sessions` with up to 5 items before the last step
+        (`history`), their `rewards`, the item `logged` at the last step and the 5 items
+        `recommended`, best first. Items are row numbers of `items.parquet`.
+    """
+    long_enough = np.flatnonzero(validation.lengths >= min(2, validation.lengths.max()))
+    places = np.linspace(0, len(long_enough) - 1, min(_SESSIONS, len(long_enough)))
+    episodes = long_enough[places.astype(np.int64)]
+    last = validation.lengths[episodes] - 1
+    scores = logged_scores(scorer, validation, episodes, last)
+    best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
+    sessions = []
+    for place, episode in enumerate(episodes):
+        steps = np.arange(validation.lengths[episode])
+        of_session = np.full(len(steps), episode)
+        items = validation.step_values(schema.ITEM, of_session, steps)
+        rewards = validation.step_values(schema.REWARD, of_session, steps)
+        sessions.append(
+            {
+                "history": items[:-1][-_HISTORY:].tolist(),
+                "rewards": rewards[:-1][-_HISTORY:].tolist(),
+                "logged": int(items[-1]),
+                "recommended": best.indices[place].tolist(),
+            }
+        )
+    return {"rule": str(scorer.rule), "sessions": sessions}

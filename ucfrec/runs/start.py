@@ -21,10 +21,10 @@ from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.checkpoint import save_tensors
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, store_from

@@ -15,8 +15,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.ids import IdLookup
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES
@@ -24,9 +24,9 @@ from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash
 from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.user_model.model import load_session_end

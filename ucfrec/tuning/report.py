@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from ucfrec.files.atomic import atomic_file
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.tuning.objective import METRICS
 from ucfrec.tuning.space import POLICY
-from ucfrec.tuning.study import BEST, Plan, config_of, finished
+from ucfrec.tuning.study import BEST, METRICS, Plan, config_of, finished
 
 if TYPE_CHECKING:
     from optuna import Study

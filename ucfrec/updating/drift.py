@@ -1,4 +1,4 @@
-"""How much new rows differ from those that a run was trained on."""
+"""New rows as a run sees them, and how much they differ from those that it was trained on."""
 
 from typing import Any, Final
 
@@ -8,9 +8,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.new_rows import as_known
-from ucfrec.user_model.reward_report import calibration, fit_line, scores_of
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows, calibration, fit_line, scores_of
 
 _GROUPS: Final = 10
 _PRIOR: Final = 0.5
@@ -135,3 +133,27 @@ def describe(found: dict[str, Any]) -> str:
             f"{found['observed']:.4g}; calibration slope {found['slope']:.3g}"
         )
     return "\n".join(lines)
+
+
+def as_known(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
+    """The episodes of a view, in memory, with the item states of a run.
+
+    Args:
+        view: of a store that was grown from the run's.
+        trained: the run; users and items that it does not know become −1.
+    """
+    assert trained.item_states is not None
+    assert trained.item_ids is not None
+    places = view.all_steps()
+    steps: dict[str, Array] = {
+        name: view.step_values(name, *places) for name in view.record.columns
+    }
+    items = steps[schema.ITEM]
+    steps[schema.ITEM] = np.where(items < len(trained.item_ids), items, -1)
+    users = view.episode_values(schema.USER)
+    episodes = {
+        schema.USER: np.where(users < len(trained.user_ids), users, -1),
+        schema.SPLIT: np.zeros(view.n_episodes, dtype=np.uint8),
+        schema.TERMINATED: view.episode_values(schema.TERMINATED),
+    }
+    return EpisodeStore.from_arrays(steps, view.lengths, episodes, trained.item_states)

@@ -10,9 +10,9 @@ import numpy as np
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import claimed
-from ucfrec.fitting.random_state import random_state_kept
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
+from ucfrec.processes import random_state_kept
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import RunRecord, Update, store_of
 from ucfrec.runs.refit import refit_within

@@ -14,7 +14,7 @@ from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.runs.record import Difference, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.new_rows import as_known
+from ucfrec.updating.drift import as_known
 
 RANKING: Final = "ndcg_liked"
 VALUE: Final = "reward per step"

@@ -14,14 +14,12 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
-from ucfrec.user_model.calibration import UserCalibration
-from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, fit_fatigue
-from ucfrec.user_model.main_tags import MainTags
+from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
-from ucfrec.user_model.training_users import TrainingUsers, fit_training_users
+from ucfrec.user_model.training_users import TrainingUsers, UserCalibration, fit_training_users
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import RewardRows
 
 EFFECTS: Final = (
     *("item", "user", "content", "affinity", "tastes", "exposure"),

@@ -18,18 +18,17 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
 from ucfrec.progress import Progress, progress
-from ucfrec.user_model.posterior import MEMORY, root_of_tastes
-from ucfrec.user_model.reward import FITTED, ItemRewardModel
+from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel, root_of_tastes
 from ucfrec.user_model.reward_effects import EFFECTS, Design, Effects, fit_effects
 from ucfrec.user_model.reward_report import (
     EffectTried,
     ItemRewardReport,
+    RewardRows,
     calibration,
     gauc_against,
     item_rates,
     scores_of,
 )
-from ucfrec.user_model.reward_rows import RewardRows
 
 _SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
 _FIRST: Final = 6

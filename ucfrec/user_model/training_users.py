@@ -11,8 +11,8 @@ therefore weighted by 1 / (p · items), cut off at 10, as if all items had been 
 propensity weighting). So that a few rows of large weight do not pass for much knowledge of a user's
 tastes, the weights of each user's rows are scaled to add up to their effective number (Pfeffermann
 et al., 1998, "Weighting for unequal selection probabilities in multilevel models"). Known users are
-calibrated on weighted validation rows instead (`ucfrec.user_model.calibration`), and their tastes
-fitted without weights, which there only cost data.
+calibrated on weighted validation rows instead (`fit_calibration`), and their tastes fitted without
+weights, which there only cost data.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
@@ -41,13 +41,22 @@ from ucfrec.user_model.reward_fit import (
     save_fit,
     set_statistics,
 )
-from ucfrec.user_model.reward_report import SAVED, EffectTried, fit_line
-from ucfrec.user_model.reward_rows import RewardRows
+from ucfrec.user_model.reward_report import (
+    SAVED,
+    EffectTried,
+    RewardRows,
+    drawn_steps,
+    fit_line,
+    scores_of,
+)
 
 _FITTED: Final = "training_users.safetensors"
 _MAX_STEPS: Final = 100_000
 _LARGEST_WEIGHT: Final = 10.0
 """Larger weights are cut off, so that no single row decides."""
+Line = tuple[float, float]
+_FEWEST: Final = 50
+"""Rows of a half from which on a line is fitted to it."""
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -160,3 +169,56 @@ def propensity_weights(
     users = np.unique(owners, return_inverse=True)[1][episodes]
     sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
     return torch.from_numpy(shares * (sums / squares)[users]).float()
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+class UserCalibration:
+    """Slope and intercept that turn scores into rewards, from validation rows."""
+
+    line: Line
+    """Of all rows."""
+    halves: tuple[Line, Line]
+    """Of the rows of either half of the users; `line` where they are too few."""
+    optimism: float
+    """Expected over observed reward, less 1, where each half is predicted by the other's line."""
+    optimism_error: float
+    """Its standard error over users."""
+    weighted: bool
+    """Whether rows are weighted by propensities."""
+
+    @classmethod
+    def fit(
+        cls, model: ItemRewardModel, view: EpisodeStore, limit: int, seed: int
+    ) -> "UserCalibration":
+        """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
+        episodes, steps = drawn_steps(view, limit, seed)
+        rows, half = RewardRows.at(view, episodes, steps, model.reach), half_of(view)[episodes]
+        weights = propensity_weights(view, episodes, steps, len(model.item))
+        counts = torch.ones(len(rows)) if weights is None else weights
+        scores, target = scores_of(model, rows)[0], model.target(rows.rewards)
+
+        def line_of(chosen: BoolArray) -> Line:
+            part = torch.from_numpy(chosen)
+            return fit_line(scores[part], target[part], bool(model.binary), counts[part])
+
+        line = line_of(np.ones(len(rows), dtype=bool))
+        parts = [half == number for number in (0, 1)]
+        halves = [line_of(part) if part.sum() >= _FEWEST else line for part in parts]
+        slope, intercept = (
+            torch.tensor([other[n] for other in reversed(halves)])[torch.from_numpy(half)]
+            for n in (0, 1)
+        )
+        expected = (counts * model.expected(slope * scores + intercept)).double().numpy()
+        observed = (counts * rows.rewards).double().numpy()
+        off = expected.sum() / observed.sum() - 1 if observed.sum() > 0 else 0.0
+        by_user = np.bincount(episodes, expected - (1 + off) * observed)
+        error = float(np.sqrt(np.square(by_user).sum()) / abs(observed.sum() or 1.0))
+        return cls(line, (halves[0], halves[1]), float(off), error, weights is not None)
+
+
+def half_of(view: EpisodeStore) -> IntArray:
+    """Half (E,) of the users, 0 or 1, to which the episodes of a view belong; of the episodes,
+    where users are not named."""
+    if not view.has_users:
+        return np.arange(view.n_episodes) % 2
+    return view.episode_values(schema.USER).astype(np.int64) % 2

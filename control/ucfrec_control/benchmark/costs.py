@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ucfrec.benchmark.cells import Cell, opened
-from ucfrec.benchmark.estimate import Costs
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.benchmark.suite import Costs
+from ucfrec.processes import random_state_kept
 from ucfrec.runs.start import new_policy, training_views
 from ucfrec_control.benchmark.measure import rl_config_of, targets_of
 from ucfrec_control.environments.environments import SIDE_BY_SIDE, environment_of_data, make_env

@@ -12,8 +12,8 @@ import numpy as np
 from ucfrec.benchmark.cells import Budget, Method
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, read_toml
-from ucfrec.reporting.statistics import grouped
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped
 from ucfrec_control.benchmark.budgets import TRIED_RATES
 from ucfrec_control.benchmark.measure import RATE
 from ucfrec_control.benchmark.methods import METHODS, METHODS_WO_TIME, Methods

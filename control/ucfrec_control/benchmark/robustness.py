@@ -17,9 +17,9 @@ from ucfrec.benchmark.cells import Cell, Evaluation, measured_by, opened
 from ucfrec.counterfactual.screening import DimensionReport, ScreeningConfig, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
-from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.start import training_views
 from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
 from ucfrec_control.data.trajectories import PACKAGES

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, Final
 
-from ucfrec.reporting.statistics import grouped, summary
 from ucfrec.results.row import ResultRow
+from ucfrec.results.statistics import grouped, summary
 
 BACK: Final = "checkpoints_before_last"
 """Condition of rows of single checkpoints."""

@@ -1,24 +1,20 @@
 """`ucfrec-control contexts`: which context each method scores best with; resumes."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import over_seeds
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
-from ucfrec.reporting.statistics import grouped, summary
+from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
+from ucfrec.results.statistics import grouped, summary
 from ucfrec_control.benchmark.measure import CONTEXT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import CONTEXTS
 from ucfrec_control.benchmark.plan import context_cells
 from ucfrec_control.commands.options import (
     control_grid_options,
-    data_given,
     data_option,
-    narrowed,
+    rows_of_suite,
 )
 
 
@@ -31,12 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control contexts`."""
-    budget = narrowed(budget_of(CONTEXTS, options.budget), options)
-
-    def cells() -> Iterator[Cell]:
-        return context_cells(data_given(options), options.out, budget, options.methods)
-
-    rows = rows_of(options, CONTEXTS, (), cells, SCORE_MEASUREMENT, costs)
+    rows = rows_of_suite(options, CONTEXTS, SCORE_MEASUREMENT, context_cells)
     with rows_explained(options):
         last = [row for row in rows if row.checkpoint == "last"]
         by, values = ("task", "method", CONTEXT), ("score", "validation_loss")

@@ -2,13 +2,17 @@
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from ucfrec.benchmark.cells import Budget
-from ucfrec.commands.grid_options import budget_options, grid_options
+from ucfrec.benchmark.cells import Budget, Cell
+from ucfrec.benchmark.grid import Measurement
+from ucfrec.commands.grid_options import budget_options, grid_options, rows_of
 from ucfrec.errors import InputError, one_line
+from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import with_contexts
 from ucfrec_control.benchmark.rates import read_rates
@@ -94,6 +98,26 @@ def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -
     if budget:
         budget_options(parser, "--file", "--seeds", BUDGETS)
     grid_options(parser, "runs/control", 1)
+
+
+def rows_of_suite(
+    options: argparse.Namespace,
+    suite: str,
+    how: Measurement[Cell],
+    cells: Callable[..., Iterable[Cell]],
+    *more: object,
+) -> list[ResultRow]:
+    """The rows that a command shows, as `ucfrec.commands.grid_options.rows_of`.
+
+    Args:
+        cells: makes the cells of data, folder, budget and methods, and of `more`.
+    """
+    budget = narrowed(budget_of(suite, options.budget), options)
+
+    def listed() -> Iterable[Cell]:
+        return cells(data_given(options), options.out, budget, options.methods, *more)
+
+    return rows_of(options, suite, (), listed, how, costs)
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:

@@ -1,26 +1,22 @@
 """`ucfrec-control rates`: learning rates of all policies, by validation loss; resumes."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import over_seeds
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
-from ucfrec.reporting.statistics import grouped
+from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
+from ucfrec.results.statistics import grouped
 from ucfrec_control.benchmark.measure import RATE, RATE_MEASUREMENT
 from ucfrec_control.benchmark.methods import RATES
 from ucfrec_control.benchmark.plan import rate_cells
 from ucfrec_control.benchmark.rates import best_rates, format_rates, write_rates
 from ucfrec_control.commands.options import (
     control_grid_options,
-    data_given,
     data_option,
-    narrowed,
+    rows_of_suite,
 )
 
 
@@ -35,13 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control rates`."""
-    budget = narrowed(budget_of(RATES, options.budget), options)
-
-    def cells() -> Iterator[Cell]:
-        given = data_given(options), options.out, budget
-        return rate_cells(*given, options.methods, options.steps)
-
-    rows = rows_of(options, RATES, (), cells, RATE_MEASUREMENT, costs)
+    rows = rows_of_suite(options, RATES, RATE_MEASUREMENT, rate_cells, options.steps)
     if options.show_only:
         with rows_explained(options):
             rows = _longest(rows, options.budget)

@@ -1,15 +1,12 @@
 """`ucfrec-control robustness`: scores lost to distractors; resumes."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import over_seeds
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.plan import robustness_cells
@@ -26,9 +23,8 @@ from ucfrec_control.benchmark.robustness import (
 from ucfrec_control.commands.options import (
     choices_options,
     control_grid_options,
-    data_given,
     data_option,
-    narrowed,
+    rows_of_suite,
 )
 
 
@@ -41,12 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control robustness`."""
-    budget = narrowed(budget_of(ROBUSTNESS, options.budget), options)
-
-    def cells() -> Iterator[Cell]:
-        return robustness_cells(data_given(options), options.out, budget, options.methods)
-
-    rows = rows_of(options, ROBUSTNESS, (), cells, ROBUSTNESS_MEASUREMENT, costs)
+    rows = rows_of_suite(options, ROBUSTNESS, ROBUSTNESS_MEASUREMENT, robustness_cells)
     with rows_explained(options):
         print_robustness(rows)
     print(f"\nrows: {results_given(options)}")

@@ -1,13 +1,9 @@
 """`ucfrec-control spread`: scores of single checkpoints, with raw and averaged weights; resumes."""
 
 import argparse
-from collections.abc import Iterator
 
-from ucfrec.benchmark.cells import Cell
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.measure import SPREAD_MEASUREMENT
 from ucfrec_control.benchmark.methods import SPREAD
 from ucfrec_control.benchmark.plan import spread_cells
@@ -15,9 +11,8 @@ from ucfrec_control.benchmark.spread import SHOWN, spreads
 from ucfrec_control.commands.options import (
     choices_options,
     control_grid_options,
-    data_given,
     data_option,
-    narrowed,
+    rows_of_suite,
 )
 from ucfrec_control.training.kept import KEPT
 
@@ -39,13 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control spread`."""
-    budget = narrowed(budget_of(SPREAD, options.budget), options)
-
-    def cells() -> Iterator[Cell]:
-        given = data_given(options), options.out, budget
-        return spread_cells(*given, options.methods, options.checkpoints)
-
-    rows = rows_of(options, SPREAD, (), cells, SPREAD_MEASUREMENT, costs)
+    rows = rows_of_suite(options, SPREAD, SPREAD_MEASUREMENT, spread_cells, options.checkpoints)
     with rows_explained(options):
         print(format_rows(spreads(rows), SHOWN))
     print(f"\nrows: {results_given(options)}")

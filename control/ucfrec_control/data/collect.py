@@ -18,7 +18,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.files.locks import claimed, remove_leftovers_within
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
 from ucfrec.settings import Count, require, settings_table

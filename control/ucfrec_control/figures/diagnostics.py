@@ -15,8 +15,8 @@ from ucfrec.counterfactual.generators import (
     make_generator,
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
+from ucfrec.counterfactual.reward_model_fit import sample_transitions
 from ucfrec.counterfactual.state_augmentation import AugmentationReport, accept
-from ucfrec.counterfactual.transitions import sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Overlay, Transitions
 from ucfrec.errors import InputError

@@ -14,9 +14,9 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.plot_style import label, save
-from ucfrec.reporting.statistics import grouped
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
+from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN, RunRecord
 from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises

@@ -23,7 +23,7 @@ from ucfrec.reporting.plot_style import (
     label,
     styled,
 )
-from ucfrec.reporting.statistics import summary
+from ucfrec.results.statistics import summary
 
 Row = Mapping[str, Any]
 _PANELS = 3

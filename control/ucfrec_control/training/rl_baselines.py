@@ -25,7 +25,7 @@ from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.metrics_log import MetricsLog
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.record import RUN, RunRecord, TrainingRecord

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Cell, Evaluation
-from ucfrec.benchmark.estimate import Costs
+from ucfrec.benchmark.suite import Costs
 from ucfrec.runs.screened import SCREENING
 
 MAIN: Final = ("kuairand", "kuairec", "virtual-taobao", "synthetic-catalog", "sardine-boredinf")

@@ -20,7 +20,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 
 USERS_FILE, ITEMS_FILE, REPORT_FILE = "users.parquet", "items.parquet", "completion.json"
 BINS: Final = 10

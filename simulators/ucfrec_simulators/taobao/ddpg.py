@@ -24,7 +24,7 @@ from ucfrec.acting.uniform import Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import Actions, SessionMixture, truncated_normal
 from ucfrec_simulators.taobao.environment import (

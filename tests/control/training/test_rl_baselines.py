@@ -15,7 +15,7 @@ from ucfrec.benchmark.grid import run_grid
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.fitting.random_state import random_state_kept
+from ucfrec.processes import random_state_kept
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
 from ucfrec_control.benchmark.budgets import TRIED_RATES

@@ -13,8 +13,7 @@ from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
-from ucfrec.benchmark.estimate import announcement, estimated_hours
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, announcement, estimated_hours, show
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore

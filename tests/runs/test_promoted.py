@@ -33,7 +33,12 @@ def updated(run: Path, of: TrainedPolicy, result: str) -> Path:
         {"result": result, "decided_by": "x", "differences": [difference], "steps": 9, "users": 3}
     )
     update = Update(
-        of="a", run=of.fingerprint, settings_from_nothing={}, appended={}, verdict=verdict
+        of="a",
+        run=of.fingerprint,
+        settings_from_nothing={},
+        episodes=1,
+        appended={},
+        verdict=verdict,
     )
     RunRecord.read(run).with_entries(update=update).written(run)
     return run

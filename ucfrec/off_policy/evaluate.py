@@ -35,16 +35,8 @@ from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-from ucfrec.off_policy.verdict import (
-    FAR_OFF,
-    Subject,
-    Verdict,
-    cautions,
-    conclude,
-    diagnosis_columns,
-    influences,
-    verdict_columns,
-)
+from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
+from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable

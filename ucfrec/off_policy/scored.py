@@ -26,13 +26,8 @@ from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, conditi
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import PROBABILITY, SESSION, about_scores
 from ucfrec.off_policy.training_rows import row_keys, seen_too_often, share_of_rows_seen
-from ucfrec.off_policy.verdict import (
-    Subject,
-    cautions,
-    conclude,
-    diagnosis_columns,
-    verdict_columns,
-)
+from ucfrec.off_policy.verdict import cautions, conclude
+from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18

@@ -21,6 +21,7 @@ from ucfrec.off_policy.behavior_model import (
     fit_behavior,
     group_items,
 )
+from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import Diagnosis, diagnose, implied_items
 from ucfrec.off_policy.estimators import StepValue, estimate, session_terms, step_value
 from ucfrec.off_policy.features import (
@@ -36,7 +37,6 @@ from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
-from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable

@@ -20,6 +20,7 @@ from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.parquet import require_regular
 from ucfrec.logs.spool import whole_groups
+from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import StepSums, estimate, normalised_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, conditions, of_sessions
@@ -27,7 +28,6 @@ from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import PROBABILITY, SESSION, about_scores
 from ucfrec.off_policy.training_rows import row_keys, seen_too_often, share_of_rows_seen
 from ucfrec.off_policy.verdict import cautions, conclude
-from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18

@@ -7,8 +7,8 @@ from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity import COLUMNS
-from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.off_policy.columns import SUITE
+from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting import charts
 from ucfrec.reporting.charts import LineChart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, shown

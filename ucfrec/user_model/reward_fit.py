@@ -378,7 +378,9 @@ class EffectSearch:
         """Fit the effects that were kept to other rows."""
         spreads = {name: _SPREADS[number] for name, number in self.kept.items()}
         self.design = design
-        self.effects = fit_effects(design, self.effects, spreads)
+        # Effects of the earlier state rest on about as many rows; those of the search on few.
+        start = self.effects | ({} if self._begin is None else self._begin.effects)
+        self.effects = fit_effects(design, start, spreads)
         self.losses = self._losses(self.effects)
 
     def report(self) -> tuple[EffectTried, ...]:

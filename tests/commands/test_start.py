@@ -12,7 +12,6 @@ from ucfrec.commands.cli import UCFREC
 
 START = 1_700_000_000_000
 SLOW_TO_IMPORT = {"torch", "sklearn", "scipy", "pandas", "duckdb", "pyarrow", "gymnasium"}
-SLOW_TO_IMPORT |= {"pydantic"}
 TRAINING = {f"ucfrec.{room}" for room in ("policies", "counterfactual", "runs", "fitting.loop")}
 ACTING = {"gymnasium", "ucfrec.acting", "ucfrec.evaluation"}
 

@@ -26,13 +26,17 @@ def planted_ends(rows: int = 6000) -> tuple[Likeness, LoggedEnds]:
     steps = rng.integers(8, size=rows)
     ended = rng.random(rows) < np.where(again, 0.8, 0.1)
     rewards = rng.random(rows).round()
-    return Likeness.of(states), LoggedEnds(before, torch.from_numpy(items), rewards, steps, ended)
+    followed = np.ones(rows, dtype=bool)
+    return Likeness.of(states), LoggedEnds(
+        before, torch.from_numpy(items), rewards, steps, ended, followed
+    )
 
 
 def part_of(logged: LoggedEnds, rows: slice) -> LoggedEnds:
     """Some of the steps."""
-    shown, items = logged.shown.at(rows), logged.items[rows]
-    return LoggedEnds(shown, items, logged.rewards[rows], logged.steps[rows], logged.ended[rows])
+    chosen = np.zeros(len(logged.ended), dtype=bool)
+    chosen[rows] = True
+    return logged.select(chosen)
 
 
 @pytest.mark.parametrize("last", [4000, 4010])
@@ -135,6 +139,36 @@ def test_the_share_of_steps_that_end_sessions_is_the_logged_one(sessions: int) -
     end, _ = SessionEnd.fit(Likeness.of(states), logged, logged, 0)
     found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
     assert found.mean() == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_ends_of_the_rows_of_users_are_no_ends_of_sessions(cut: bool) -> None:
+    """Sessions end with an item that repeats the one before; rows of users `cut` anywhere."""
+    generator = np.random.default_rng(0)
+    items, lengths, users = list[int](), list[int](), list[int]()
+    for user in range(600):
+        rows = int(generator.integers(1, 12)) if cut else 10_000
+        for _ in range(3):
+            session = [int(generator.integers(6))]
+            while len(session) < rows and session[-1:] != session[-2:-1]:
+                session.append(int(generator.integers(6)))
+            rows -= len(session)
+            items, lengths, users = items + session, [*lengths, len(session)], [*users, user]
+            if rows <= 0:
+                break
+    columns = {"item": np.array(items), "reward": np.zeros(len(items), dtype=np.float32)}
+    states = ItemStates(torch.eye(6), torch.zeros(0, 0), 0.0, 1.0)
+    episodes = {"user": np.array(users), "terminated": np.ones(len(users), dtype=bool)}
+    store = EpisodeStore.from_arrays(columns, np.array(lengths), episodes, states)
+    halves = [store.select(np.flatnonzero(np.array(users) % 2 == half)) for half in (0, 1)]
+    logged, held_out = (LoggedEnds.of(half, 4, len(items), 0) for half in halves)
+    end, report = SessionEnd.fit(Likeness.of(states), logged, held_out, 0)
+    again = (held_out.items == held_out.shown.items[:, 0]).numpy()
+    given = held_out.shown, held_out.items, held_out.rewards, held_out.steps
+    found = end.probabilities(*given)
+    assert report.last_sessions is not cut
+    assert found[again].mean() > 0.9
+    assert found[~again].mean() < 0.02
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from torch import Tensor
 
+from ucfrec import schema
 from ucfrec.arrays import Float64Array
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -151,11 +152,12 @@ def _sessions_that_end(
     """Sessions to fit models of their ends to, and held-out ones to choose a model by.
 
     Where the split by time cut most of the validation sessions, their earlier steps are missing,
-    which say when they end: a fifth of the training sessions is held out instead.
+    which say when they end: the training sessions of a fifth of the users are held out instead.
     """
     if 2 * np.count_nonzero(~train.terminated) < validation.n_episodes:
         return train, validation
-    held_out = np.arange(train.n_episodes) % 5 == 4
+    owners = train.episode_values(schema.USER) if train.has_users else np.arange(len(train))
+    held_out = owners.astype(np.int64) % 5 == 4
     return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 

@@ -1,7 +1,7 @@
 """When users leave: the probability that a session ends with a step, fitted to logged steps."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Self
 
 import numpy as np
@@ -163,6 +163,8 @@ class LoggedEnds:
     """(N,) number of the step in its session."""
     ended: BoolArray
     """(N,)."""
+    followed: BoolArray
+    """(N,) whether another session of the same user follows; true where users are not named."""
 
     @classmethod
     def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
@@ -183,7 +185,17 @@ class LoggedEnds:
         shown = Shown.before(store, episodes, steps, lags)
         items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
         rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
-        return cls(shown, items, rewards, steps, ended)
+        not_last = np.ones(len(store), dtype=bool)
+        if store.has_users:
+            users = store.episode_values(schema.USER)
+            not_last[len(users) - 1 - np.unique(users[::-1], return_index=True)[1]] = False
+        return cls(shown, items, rewards, steps, ended, not_last[episodes])
+
+    def select(self, rows: BoolArray) -> "LoggedEnds":
+        """Some of the steps."""
+        shown, items = self.shown.at(torch.from_numpy(rows)), self.items[torch.from_numpy(rows)]
+        others = self.steps[rows], self.ended[rows], self.followed[rows]
+        return LoggedEnds(shown, items, self.rewards[rows], *others)
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -201,6 +213,8 @@ class SessionEndReport:
     error."""
     kept: str
     """The kind that is kept: each must lower the loss of simpler ones by more than the error."""
+    last_sessions: bool = True
+    """Whether ends of users' last sessions count; see `SessionEnd.fit`."""
 
 
 @dataclass(frozen=True)
@@ -224,30 +238,49 @@ class SessionEnd:
     def fit(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
-        """Fit every kind to logged steps, and keep the best on held-out ones."""
+        """Fit every kind to logged steps, and keep the best on held-out ones.
+
+        What looks like the end of a user's last session may only be the end of the user's rows. So
+        everything is fitted without these ends, too, and that is kept if it predicts held-out
+        sessions that another one follows better by more than a standard error.
+        """
+        every = cls._best(likeness, logged, held_out, seed)
+        certain = held_out.select(held_out.followed)
+        if logged.followed.all() or certain.ended.sum() < _FEWEST:
+            return every
+        sure, held_out = (each.select(each.followed | ~each.ended) for each in (logged, held_out))
+        without, report = cls._best(likeness, sure, held_out, seed)
+        gain, error = _gain(every[0]._losses(certain), without._losses(certain))
+        if gain <= error:
+            return every
+        return without, replace(report, last_sessions=False)
+
+    @classmethod
+    def _best(
+        cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
+    ) -> tuple["SessionEnd", SessionEndReport]:
+        """The best kind, fitted to all of `logged`."""
         inputs, ended = _inputs(likeness, logged), logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
         if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
             kinds["logistic"] = _logistic(inputs, ended)
             kinds["boosted"] = BoostedTrees.fit(inputs.numpy(), ended, seed).tensors()
-        target, models = torch.from_numpy(held_out.ended), {}
-        given, losses = _inputs(likeness, held_out), dict[str, Tensor]()
+        models = {kind: cls(likeness, tensors) for kind, tensors in kinds.items()}
+        losses = {kind: model._losses(held_out) for kind, model in models.items()}
         gains, kept = dict[str, tuple[float, float]](), "constant"
-        for kind, tensors in kinds.items():
-            models[kind] = cls(likeness, tensors)
-            scores = models[kind]._log_odds(given)
-            losses[kind] = F.softplus(torch.where(target, -scores, scores).clamp(max=_MOST))
-            decrease = losses[kept] - losses[kind]
-            gain, error = 0.0, 0.0
-            if len(decrease):
-                gain = float(decrease.mean())
-                error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
-            gains[kind] = gain, error
+        for kind in kinds:
+            gain, error = gains[kind] = _gain(losses[kept], losses[kind])
             if gain > error:
                 kept = kind
         means = {kind: float(each.mean()) if len(each) else 0.0 for kind, each in losses.items()}
-        report = SessionEndReport(len(ended), len(target), means, gains, kept)
+        report = SessionEndReport(len(ended), len(held_out.ended), means, gains, kept)
         return models[kept], report
+
+    def _losses(self, logged: LoggedEnds) -> Tensor:
+        """Log losses (N,) of logged steps."""
+        scores = self._log_odds(_inputs(self.likeness, logged))
+        signed = torch.where(torch.from_numpy(logged.ended), -scores, scores)
+        return F.softplus(signed.clamp(max=_MOST))
 
     @classmethod
     def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
@@ -279,7 +312,7 @@ class SessionEnd:
     ) -> Float64Array:
         """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
         nothing = np.zeros(len(steps), dtype=bool)
-        inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing))
+        inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing, nothing))
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
     def of_items(
@@ -334,6 +367,14 @@ def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:
     """(M, F) of the item that was shown `lag` steps before the last one, as `Likeness.profile`."""
     items = shown.items[:, lag : lag + 1]
     return likeness.profile(items, torch.ones(items.shape))
+
+
+def _gain(losses: Tensor, others: Tensor) -> tuple[float, float]:
+    """By how much the mean of `others` is lower, and the standard error; 0 without rows."""
+    decrease = losses - others
+    if not len(decrease):
+        return 0.0, 0.0
+    return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
 
 
 def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:

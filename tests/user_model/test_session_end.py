@@ -9,7 +9,7 @@ import torch
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, whole_sessions
 
 ITEMS = 12
 
@@ -139,6 +139,25 @@ def test_the_share_of_steps_that_end_sessions_is_the_logged_one(sessions: int) -
     end, _ = SessionEnd.fit(Likeness.of(states), logged, logged, 0)
     found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
     assert found.mean() == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.parametrize("cut", [0, 6, 9])
+def test_training_sessions_are_held_out_where_the_split_cut_those_of_validation(cut: int) -> None:
+    states = ItemStates(torch.eye(2), torch.zeros(0, 0), 0.0, 1.0)
+    columns = {"item": np.zeros(30, dtype=np.int64), "reward": np.zeros(30, dtype=np.float32)}
+    # Two training sessions of ten users each, then a validation session, which may go on.
+    users = np.repeat(np.arange(10), 3)
+    split = np.tile([0, 0, 1], 10)
+    terminated = ~((np.arange(30) % 3 == 1) & (users < cut))
+    episodes = {"user": users, "split": split.astype(np.uint8), "terminated": terminated}
+    store = EpisodeStore.from_arrays(columns, np.ones(30, dtype=np.int64), episodes, states)
+    fitted, held_out = whole_sessions(store.split("train"), store.split("validation"))
+    if cut:
+        assert set(held_out.episode_values("user")) == {4, 9}
+        assert set(held_out.episode_values("split")) == {0}
+        assert fitted.n_episodes == 16
+    else:
+        assert (fitted.n_episodes, held_out.n_episodes) == (20, 10)
 
 
 @pytest.mark.parametrize("cut", [False, True])

@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 from torch import Tensor
 
-from ucfrec import schema
 from ucfrec.arrays import Float64Array
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
@@ -19,7 +18,7 @@ from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 from ucfrec.user_model.reward_report import ItemRewardReport
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport, whole_sessions
 from ucfrec.user_model.training_users import TrainingUsers, UserCalibration, fit_training_users
 
 SESSIONS: Final = "sessions.safetensors"
@@ -84,7 +83,7 @@ class UserModel:
             tired = fit_fatigue(*runs) if reward.binary else None
             logged, held_out = (
                 LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed)
-                for view in _sessions_that_end(train, validation)
+                for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
             line, checked = users.report.calibration if users else (1.0, 0.0), None
@@ -144,21 +143,6 @@ class UserModel:
             "session_end": dataclasses.asdict(self.session_end_report),
             "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),
         }
-
-
-def _sessions_that_end(
-    train: EpisodeStore, validation: EpisodeStore
-) -> tuple[EpisodeStore, EpisodeStore]:
-    """Sessions to fit models of their ends to, and held-out ones to choose a model by.
-
-    Where the split by time cut most of the validation sessions, their earlier steps are missing,
-    which say when they end: the training sessions of a fifth of the users are held out instead.
-    """
-    if 2 * np.count_nonzero(~train.terminated) < validation.n_episodes:
-        return train, validation
-    owners = train.episode_values(schema.USER) if train.has_users else np.arange(len(train))
-    held_out = owners.astype(np.int64) % 5 == 4
-    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 
 def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:

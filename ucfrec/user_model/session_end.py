@@ -185,17 +185,40 @@ class LoggedEnds:
         shown = Shown.before(store, episodes, steps, lags)
         items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
         rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
-        not_last = np.ones(len(store), dtype=bool)
-        if store.has_users:
-            users = store.episode_values(schema.USER)
-            not_last[len(users) - 1 - np.unique(users[::-1], return_index=True)[1]] = False
-        return cls(shown, items, rewards, steps, ended, not_last[episodes])
+        followed = ~last_sessions(store) if store.has_users else np.ones(len(store), dtype=bool)
+        return cls(shown, items, rewards, steps, ended, followed[episodes])
 
     def select(self, rows: BoolArray) -> "LoggedEnds":
         """Some of the steps."""
         shown, items = self.shown.at(torch.from_numpy(rows)), self.items[torch.from_numpy(rows)]
         others = self.steps[rows], self.ended[rows], self.followed[rows]
         return LoggedEnds(shown, items, self.rewards[rows], *others)
+
+
+def last_sessions(store: EpisodeStore) -> BoolArray:
+    """Whether each episode (E,) of a view is the last of its user."""
+    users = store.episode_values(schema.USER)
+    last = np.zeros(len(users), dtype=bool)
+    last[len(users) - 1 - np.unique(users[::-1], return_index=True)[1]] = True
+    return last
+
+
+def whole_sessions(
+    train: EpisodeStore, validation: EpisodeStore
+) -> tuple[EpisodeStore, EpisodeStore]:
+    """Sessions to fit models of their ends to, and held-out ones to choose a model by.
+
+    These are training and validation sessions. But where most validation sessions go on from
+    training sessions that the split by time cut, they lack the steps that say when they end: the
+    training sessions of a fifth of the users are held out instead.
+    """
+    if not (train.has_users and validation.has_users):
+        return train, validation
+    users, cut = train.episode_values(schema.USER), ~train.terminated & last_sessions(train)
+    if np.isin(validation.episode_values(schema.USER), users[cut]).mean() < 0.5:
+        return train, validation
+    held_out = users.astype(np.int64) % 5 == 4
+    return train.select(np.flatnonzero(~held_out)), train.select(np.flatnonzero(held_out))
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -241,8 +264,8 @@ class SessionEnd:
         """Fit every kind to logged steps, and keep the best on held-out ones.
 
         What looks like the end of a user's last session may only be the end of the user's rows. So
-        everything is fitted without these ends, too, and that is kept if it predicts held-out
-        sessions that another one follows better by more than a standard error.
+        everything is fitted without these ends, too, and that is kept if it clearly (by three
+        standard errors) predicts held-out sessions better that another one follows.
         """
         every = cls._best(likeness, logged, held_out, seed)
         certain = held_out.select(held_out.followed)
@@ -251,7 +274,7 @@ class SessionEnd:
         sure, held_out = (each.select(each.followed | ~each.ended) for each in (logged, held_out))
         without, report = cls._best(likeness, sure, held_out, seed)
         gain, error = _gain(every[0]._losses(certain), without._losses(certain))
-        if gain <= error:
+        if gain <= 3 * error:
             return every
         return without, replace(report, last_sessions=False)
 

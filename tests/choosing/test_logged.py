@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.logs import store_of
-from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
@@ -35,17 +33,8 @@ ITEMS = 24
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on a log that shows any item alike, and says so."""
     folder = tmp_path_factory.mktemp("evidence")
-    log = tagged_log().assign(propensity=1 / ITEMS)
-    store_of(
-        log,
-        folder,
-        tagged_mapping(folder),
-        reward="reward",
-        session_by="gap",
-        gap_minutes=120,
-        embedding_size=6,
-    )
-    store, settings = EpisodeStore.open(folder / "store"), [*SETTINGS, *RULE, "rule.evidence=3"]
+    store = tagged_store(folder, propensity=1 / ITEMS)
+    settings = [*SETTINGS, *RULE, "rule.evidence=3"]
     train_run(store, folder / "run", resolve_config("dt", None, settings))
     return folder
 

@@ -34,10 +34,14 @@ def tagged_mapping(folder: Path) -> LogMapping:
     )
 
 
-def tagged_store(folder: Path) -> EpisodeStore:
-    """The store of `tagged_log`, at `folder / "store"`, beside its log and tables."""
+def tagged_store(folder: Path, **columns: float) -> EpisodeStore:
+    """The store of `tagged_log`, at `folder / "store"`, beside its log and tables.
+
+    Args:
+        columns: more columns of the log, each of one value.
+    """
     return store_of(
-        tagged_log(),
+        tagged_log().assign(**columns),
         folder,
         tagged_mapping(folder),
         reward="reward",

@@ -184,7 +184,7 @@ def test_a_search_begins_and_ends_near_an_earlier_one(
         counted.append(arguments[2])
         return fit_effects(*arguments)
 
-    monkeypatch.setattr("ucfrec.user_model.reward_fit.fit_effects", counting)
+    monkeypatch.setattr("ucfrec.user_model.effect_search.fit_effects", counting)
     store = store_of(planted, clicks(planted, 1))
     half = views(store_of(log(0, users=100), clicks(log(0, users=100))))
     old = fit_item_reward_model(*half, tmp_path / "old", seed=0)[1]

@@ -58,8 +58,7 @@ class RuleGraph(nn.Module):
         if not 1 <= k <= most:
             raise InputError(f"--k is {k}; give a whole number from 1 to {most:,}")
         self.scorer, self.k = scorer, k
-        models = (scorer.policy, scorer.reward_model)
-        self._parts = nn.ModuleList(each for each in models if each is not None)
+        self._parts = _modules(scorer)
 
     def forward(
         self,
@@ -299,14 +298,17 @@ def _example(scorer: Scorer, seed: int) -> tuple[Sessions, Tensor]:
     return random_sessions(scorer, 1, seed), torch.from_numpy(excluded)
 
 
+def _modules(scorer: Scorer) -> nn.ModuleList:
+    models = (scorer.policy, scorer.reward_model)
+    return nn.ModuleList(each for each in models if each is not None)
+
+
 class _Network(nn.Module):
     """The scores of one session as a module."""
 
     def __init__(self, scorer: Scorer) -> None:
         super().__init__()
-        models = (scorer.policy, scorer.reward_model)
-        self._parts = nn.ModuleList(each for each in models if each is not None)
-        self._scorer = scorer
+        self._scorer, self._parts = scorer, _modules(scorer)
 
     def forward(
         self,

@@ -31,16 +31,10 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.progress import progress
+from ucfrec.user_model.effect_search import Beginning, EffectSearch, save_fit
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
-from ucfrec.user_model.reward_fit import (
-    WARM_ROWS,
-    Beginning,
-    EffectSearch,
-    reward_model_sizes,
-    save_fit,
-    set_statistics,
-)
+from ucfrec.user_model.reward_fit import WARM_ROWS, reward_model_sizes, set_statistics
 from ucfrec.user_model.reward_report import (
     SAVED,
     EffectTried,
@@ -93,7 +87,7 @@ def fit_training_users(
 ) -> TrainingUsers:
     """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
-    Effects are chosen as in `ucfrec.user_model.reward_fit`, on a fifth of the rows.
+    Effects are chosen as in `ucfrec.user_model.effect_search`, on a fifth of the rows.
 
     Args:
         train: view of a store of items whose episodes name their users.

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation

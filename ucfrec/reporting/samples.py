@@ -14,7 +14,7 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import require_regular
 from ucfrec.reporting.tables import Table, shown
-from ucfrec.runs.run import SAMPLES
+from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
 _CHARACTERS = 120

@@ -68,6 +68,7 @@ def boredom(likeness: Likeness) -> SessionEnd:
     logged = LoggedEnds(
         *(before, torch.from_numpy(item), rewards, rng.integers(9, size=4000)),
         ended=np.zeros(4000, dtype=bool),
+        followed=np.ones(4000, dtype=bool),
     )
     alike = likeness.to_candidates(
         likeness.profile(before.items[:, :1], torch.ones(4000, 1)), logged.items.unsqueeze(1)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
 
-_STATISTICS_STEPS = 1_000_000
+_STATISTICS_STEPS = 100_000
 _FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
 _PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
 _LISTS: Final = (schema.OBSERVATION, schema.ACTION)
@@ -230,7 +230,7 @@ class EpisodeStore(EpisodeView):
     def state_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation, each (S,) float32, of the states of the view.
 
-        Computed in float64 from at most a million steps, evenly spaced over the view.
+        Computed in float64 from at most 100,000 steps, evenly spaced over the view.
         """
         stride = -(-self.n_steps // _STATISTICS_STEPS)
         total = torch.zeros(self.state_size, dtype=torch.float64)

@@ -67,7 +67,7 @@ class Month:
     users: int = 2000
     policy: str = "dt"
     settings: tuple[str, ...] = (
-        "train.steps=1500",
+        "train.steps=3000",
         "train.learning_rate=1e-3",
         "policy.dim=32",
         "policy.context=10",

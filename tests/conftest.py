@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -46,6 +47,8 @@ def spark() -> Iterator[Any]:
         pytest.skip("Java is missing")
     os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     builder = sql.SparkSession.builder.master("local[2]").config("spark.ui.enabled", "false")
+    interrupted = signal.getsignal(signal.SIGINT)
     session = builder.config("spark.sql.shuffle.partitions", "3").getOrCreate()
+    signal.signal(signal.SIGINT, interrupted)  # other tests interrupt themselves
     yield session
     session.stop()

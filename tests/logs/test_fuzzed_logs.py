@@ -150,7 +150,7 @@ def check(given: list[Part], folder: Path) -> None:
     assert found == expected
 
 
-@pytest.mark.parametrize("examples", [12, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [12, pytest.param(200, marks=pytest.mark.slow)])
 def test_fuzzed_logs_agree_with_pandas_or_are_refused(
     tmp_path_factory: pytest.TempPathFactory, examples: int
 ) -> None:

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,33 +139,24 @@ def run(options: argparse.Namespace) -> None:
 def _recommend_with_spark(
     options: argparse.Namespace, trained: "TrainedPolicy", master: str
 ) -> None:
-    from ucfrec.files.atomic import atomic_folder
-    from ucfrec.logs.spark_users import by_users
-    from ucfrec.recommending.recommend import require_whole
-    from ucfrec.recommending.spark import RecommendPart, log_of_histories
-    from ucfrec.runs.on_workers import RunOnWorkers
+    from ucfrec.recommending.spark import recommend_with_spark
 
     if options.approximate:
         raise InputError("--engine spark finds items exactly; leave --approximate out")
-    rule = rule_given(options, trained)
-    trained.item_scorer(rule)
-    require_whole(options.k)
-    given = log_of_histories(trained, *logs_given(options, trained))
-    with ExitStack() as stack:
-        folders = [options.out] + ([] if options.exposures is None else [options.exposures])
-        out, *exposures = [stack.enter_context(atomic_folder(each)).absolute() for each in folders]
-        part = RecommendPart(
-            RunOnWorkers.of(trained, options.checkpoint),
-            out,
-            exposures[0] if exposures else None,
-            options.memory_limit,
-            rule,
-            options.k,
-            filter_seen=not options.keep_seen,
-            skip_unknown=options.skip_unknown,
-            seed=options.seed,
-        )
-        rows = sum(by_users(given, out.parent, master, part))
+    rows = recommend_with_spark(
+        trained,
+        *logs_given(options, trained),
+        options.out,
+        master,
+        options.k,
+        exposures=options.exposures,
+        checkpoint=options.checkpoint,
+        rule=rule_given(options, trained),
+        filter_seen=not options.keep_seen,
+        skip_unknown=options.skip_unknown,
+        seed=options.seed,
+        memory_limit=options.memory_limit,
+    )
     print(f"{origin(options.out)}: {rows:,} rows")
 
 

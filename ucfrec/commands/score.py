@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ucfrec.commands.options import (
     log_options,
@@ -14,9 +13,6 @@ from ucfrec.commands.options import (
     spark_option,
 )
 from ucfrec.files.remote import Output, origin, uri_or_path
-
-if TYPE_CHECKING:
-    from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +50,18 @@ def run(options: argparse.Namespace) -> None:
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     if (master := spark_given(options)) is not None:
-        _score_with_spark(options, trained, master)
+        from ucfrec.off_policy.spark import score_with_spark
+
+        sessions = score_with_spark(
+            trained,
+            *logs_given(options, trained),
+            options.out,
+            master,
+            checkpoint=options.checkpoint,
+            rule=rule_given(options, trained),
+            memory_limit=options.memory_limit,
+        )
+        print(f"{origin(options.out)}: {sessions:,} sessions")
         return
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
@@ -64,18 +71,3 @@ def run(options: argparse.Namespace) -> None:
         frames = score(trained, logged, rule)
         rows = write_frames(options.out, frames, about_scores(trained, rule))
     print(f"\n{origin(options.out)}: {rows:,} rows")
-
-
-def _score_with_spark(options: argparse.Namespace, trained: "TrainedPolicy", master: str) -> None:
-    from ucfrec.files.atomic import atomic_folder
-    from ucfrec.logs.spark_users import by_users
-    from ucfrec.off_policy.spark import ScorePart, log_to_score, number_sessions
-    from ucfrec.runs.on_workers import RunOnWorkers
-
-    run, limit = RunOnWorkers.of(trained, options.checkpoint), options.memory_limit
-    given = log_to_score(trained, *logs_given(options, trained))
-    with atomic_folder(options.out) as folder:
-        part = ScorePart(run, folder.absolute(), limit, rule_given(options, trained))
-        sessions = by_users(given, folder.parent, master, part)
-        number_sessions(folder, sessions)
-    print(f"{origin(options.out)}: {sum(sessions):,} sessions")

@@ -9,7 +9,9 @@ the same paths to the logs and the scratch folder.
 import os
 import re
 import shutil
+import signal
 import sys
+import threading
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -286,7 +288,7 @@ def spark_session(master: str) -> Iterator[Any]:
         raise InputError("--engine spark needs pyspark; pip install 'ucfrec[spark]'") from None
     if master.startswith("local"):
         os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
-    running = SparkSession.getActiveSession()
+    running, interrupted = SparkSession.getActiveSession(), signal.getsignal(signal.SIGINT)
     builder = SparkSession.builder.appName("ucfrec")
     try:
         # The commands' own bars show how far they are.
@@ -307,6 +309,8 @@ def spark_session(master: str) -> Iterator[Any]:
     finally:
         if running is None:
             started.stop()
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, interrupted)  # Spark's own would look for its session
 
 
 @contextmanager

@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark_users import GivenLog
+from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.off_policy.score import (
     SESSION,
     about_scores,
@@ -26,8 +26,48 @@ from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import ITEMS, TrainedPolicy
 
 
+def score_with_spark(
+    trained: TrainedPolicy,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    out: Path,
+    master: str,
+    *,
+    checkpoint: str = "best",
+    rule: DecisionRule | None = None,
+    memory_limit: str = "2GB",
+) -> int:
+    """Write the probability of every choice of logs, as `score` finds it.
+
+    Args:
+        files: logs, which every worker sees, as the run folder and `out`.
+        mapping: of the logs' columns; what it leaves open is as in the training logs.
+        out: folder for the scores, Parquet parts with sessions numbered throughout.
+        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
+        checkpoint: with which `trained` was loaded.
+        memory_limit: of a worker while it reads its rows.
+
+    Returns:
+        The number of sessions.
+
+    Raises:
+        InputError: the policy's actions are vectors, the logs cannot be used, or Spark is missing
+            or fails.
+    """
+    require_items(trained)
+    columns, options = as_trained(trained, mapping)
+    assert options.reward is not None
+    given = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
+    with atomic_folder(out) as folder:
+        run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
+        part = _ScorePart(run, folder.absolute(), memory_limit, rule)
+        sessions = by_users(given, folder.parent, master, part)
+        number_sessions(folder, sessions)
+    return sum(sessions)
+
+
 @dataclass(frozen=True)
-class ScorePart:
+class _ScorePart:
     """Scores the sessions of a part, see `ucfrec.logs.spark_users.Work`."""
 
     run: RunOnWorkers
@@ -46,18 +86,6 @@ class ScorePart:
             frames = score(trained, logged, self.rule)
             write_frames(self.out / part_name(part), frames, about_scores(trained, self.rule))
             return logged.store.n_episodes
-
-
-def log_to_score(trained: TrainedPolicy, files: Sequence[Path], mapping: LogMapping) -> GivenLog:
-    """Logs as `logged_sessions` reads them, for `by_users`.
-
-    Raises:
-        InputError: the policy's actions are vectors.
-    """
-    require_items(trained)
-    mapping, options = as_trained(trained, mapping)
-    assert options.reward is not None
-    return GivenLog(files, mapping, options.reward, options.session_by, trained.folder / ITEMS)
 
 
 def number_sessions(folder: Path, sessions: Sequence[int]) -> None:

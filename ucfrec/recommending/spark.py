@@ -7,19 +7,75 @@ from pathlib import Path
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark_users import GivenLog
+from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import Histories, columns_used, reward_of, session_by
-from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.recommend import recommend, require_whole
 from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
+def recommend_with_spark(
+    trained: TrainedPolicy,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    out: Path,
+    master: str,
+    k: int = 10,
+    *,
+    exposures: Path | None = None,
+    checkpoint: str = "best",
+    rule: DecisionRule | None = None,
+    filter_seen: bool = True,
+    skip_unknown: bool = False,
+    seed: int = 0,
+    memory_limit: str = "2GB",
+) -> int:
+    """Write the `k` best next items of every user of logs, as `recommend` finds them.
+
+    Args:
+        files: logs, which every worker sees, as the run folder and `out`.
+        mapping: of the logs' columns; what it leaves open is as in the training logs.
+        out: folder for the recommendations, Parquet parts with users in sorted order.
+        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
+        exposures: folder for what was shown, see `ucfrec.recommending.exposures`; None for none.
+        checkpoint: with which `trained` was loaded.
+        memory_limit: of a worker while it reads its rows.
+
+    Returns:
+        The number of recommended items.
+
+    Raises:
+        InputError: an argument or the logs cannot be used, or Spark is missing or fails.
+    """
+    rule = rule or trained.rule
+    trained.item_scorer(rule)
+    require_whole(k)
+    columns = columns_used(trained, mapping)
+    given = GivenLog(files, columns, reward_of(trained), session_by(trained))
+    with ExitStack() as stack:
+        folders = [out] if exposures is None else [out, exposures]
+        parts = [stack.enter_context(atomic_folder(each)).absolute() for each in folders]
+        part = _RecommendPart(
+            RunOnWorkers.of(trained, checkpoint),
+            parts[0],
+            None if exposures is None else parts[1],
+            memory_limit,
+            rule,
+            k,
+            filter_seen,
+            skip_unknown,
+            seed,
+        )
+        return sum(by_users(given, parts[0].parent, master, part))
+
+
 @dataclass(frozen=True)
-class RecommendPart:
+class _RecommendPart:
     """Recommends to the users of a part, see `ucfrec.logs.spark_users.Work`."""
 
     run: RunOnWorkers
@@ -61,11 +117,3 @@ class RecommendPart:
                 given = self.exposures / name, trained, self.rule.hash, frames
                 frames = stack.enter_context(exposures_written(*given))
             return write_frames(self.out / name, frames)
-
-
-def log_of_histories(
-    trained: TrainedPolicy, files: Sequence[Path], mapping: LogMapping
-) -> GivenLog:
-    """Logs as `histories_of_files` reads them, for `ucfrec.logs.spark_users.by_users`."""
-    columns = columns_used(trained, mapping)
-    return GivenLog(files, columns, reward_of(trained), session_by(trained))

@@ -17,7 +17,7 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-SHARE: Final = 1 / 8
+SHARE: Final = 1 / 16
 """Steps of a warm training, as a share of those of one from nothing."""
 _SCALES: Final = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
 """Buffers of a policy that its weights were trained with."""

@@ -13,7 +13,7 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
+from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation, longest_session
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
 from ucfrec.choosing.nearby import near
 from ucfrec.episodes.store import EpisodeStore
@@ -151,6 +151,39 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
     assert search.best([replace(sure, value=0.985 * sure.value), sure]).value < sure.value
     assert search.best([replace(sure, value=0.975 * sure.value), sure]) == sure
     assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
+
+
+def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    search = search_of(folder, trained)
+    rules = DecisionRule(2.0), DecisionRule(2.0, temperature=1.0)
+    found = search.simulate(rules)
+    luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
+    for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
+        search._returns[each] = returns
+    low, high = (
+        replace(each, value=float(search._returns[each.rule].mean()), error=3.2) for each in found
+    )
+    assert search.level([low, high]) == [high]
+    search._returns[low.rule] = np.roll(luck, 1)
+    assert search.level([low, high]) == [low, high]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "longest"),
+    [
+        (np.random.default_rng(0).geometric(0.45, 8000), None),
+        (np.minimum(np.random.default_rng(0).geometric(0.1, 2000), 20), 20),
+        (np.full(50, 7), 7),
+        (np.array([1, 1, 1]), 1),
+    ],
+)
+def test_sessions_may_be_longer_than_logged_ones_unless_something_ends_them(
+    lengths: np.ndarray, longest: int | None
+) -> None:
+    expected = 3 * lengths.max() if longest is None else longest
+    assert longest_session(lengths) == expected
 
 
 def test_halves_of_the_users_say_whether_they_would_choose_another_rule(

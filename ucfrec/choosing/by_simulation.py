@@ -39,6 +39,10 @@ _FAR_OFF: Final = 0.1
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
 (Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
+_BEYOND: Final = 3
+"""Simulated sessions may have so many times the steps of the longest logged one, …"""
+_CHANCE: Final = 0.001
+"""… unless all sessions that got there ended there, with less than this probability by chance."""
 _NEAR_THE_LOG: Final = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
@@ -58,7 +62,7 @@ class RuleSearch:
         train, seed = problem.train, problem.seed
         new = self.users.reward_report.new_users
         self._store = sessions_of(train, seed) if new else problem.validation
-        self._longest = int(train.lengths.max())
+        self._longest = longest_session(train.lengths)
         self._supported = train.item_counts() >= self._config.least_impressions
         self.least_items = float(min(self._config.least_items, self._supported.sum() / 4))
         logged = problem.scorer, problem.validation
@@ -118,13 +122,13 @@ class RuleSearch:
     def _simulated(
         self, rule: DecisionRule, returns: Float64Array, lengths: IntArray, items: IntArray
     ) -> SimulatedRule:
-        """What `rule` did in n sessions, (n,) each, by showing `items` (M,)."""
-        n, shares = len(returns), np.bincount(items) / len(items)
+        """What `rule` did in some sessions by showing `items` (M,)."""
+        shares = np.bincount(items) / len(items)
         shares = shares[shares > 0]
         return SimulatedRule(
             rule=rule,
             value=float(returns.mean()),
-            error=float(returns.std(ddof=1) / n**0.5) if n > 1 else 0.0,
+            error=_standard_error(returns),
             length=float(lengths.mean()),
             support=float(self._supported[items].mean()),
             items=float(np.exp(-(shares * np.log(shares)).sum())),
@@ -153,8 +157,8 @@ class RuleSearch:
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates that cannot be told apart from the best: within an error, or the
-        tolerance.
+        """The allowed candidates that cannot be told apart from the best: within the standard error
+        of the difference over pairs of sessions, or the tolerance.
 
         If the log can evaluate none, all that it supports are allowed; if it supports none, the one
         with the most effective items.
@@ -164,8 +168,17 @@ class RuleSearch:
         if not allowed:
             return [max(candidates, key=lambda each: each.items)]
         top = max(allowed, key=lambda each: each.value)
-        enough = top.value - max(top.error, self._config.tolerance * abs(top.value))
-        return [each for each in allowed if each.value >= enough]
+        least = self._config.tolerance * abs(top.value)
+        return [
+            each for each in allowed if top.value - each.value <= max(least, self._error(top, each))
+        ]
+
+    def _error(self, one: SimulatedRule, other: SimulatedRule) -> float:
+        """Standard error of the difference of their values; sessions draw the same numbers."""
+        returns, others = self._returns[one.rule], self._returns[other.rule]
+        if len(returns) != len(others):
+            return one.error
+        return _standard_error(returns - others)
 
     def best(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """The simplest of those that cannot be told apart from the best."""
@@ -197,8 +210,8 @@ class RuleSearch:
             if len(top) < _FEWEST:
                 agree.append(True)
                 continue
-            error, mean = float(top.std(ddof=1)) / len(top) ** 0.5, float(top.mean())
-            margin = max(error, self._config.tolerance * abs(mean))
+            mean = float(top.mean())
+            margin = max(_standard_error(top - own[mine]), self._config.tolerance * abs(mean))
             agree.append(bool(own[mine].mean() >= mean - margin))
         return agree[0], agree[1]
 
@@ -221,7 +234,25 @@ class RuleSearch:
         value, within = sum(values) / 2, sum(each.error**2 for each in found) ** 0.5 / 2
         error = max(within, abs(values[0] - values[1]) / 2)
         optimism = None if checked is None else (checked.optimism, checked.optimism_error)
-        return ValueEstimate(value, error, values, optimism, _doubts(value, error, self.users))
+        doubts = list(_doubts(value, error, self.users))
+        length, logged = max(each.length for each in found), self.problem.train.lengths.max()
+        if length > logged:
+            doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
+        return ValueEstimate(value, error, values, optimism, tuple(doubts))
+
+
+def longest_session(lengths: IntArray) -> int:
+    """Steps after which a simulated session ends in any case, from those of logged sessions (E,).
+
+    Policies may make sessions longer than any logged one, unless something ends them there: more
+    of the longest sessions than chance explains.
+    """
+    longest = int(lengths.max())
+    late = lengths[lengths > longest // 2]
+    ended = int((late < longest).sum())
+    hazard = ended / int((np.minimum(late, longest - 1) - longest // 2).sum() or 1)
+    limited = hazard ** (len(late) - ended) < _CHANCE
+    return longest if limited else _BEYOND * longest
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
@@ -385,6 +416,11 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
 
 def _mean(values: Float64Array) -> float:
     return float(values.mean()) if len(values) else 0.0
+
+
+def _standard_error(values: Float64Array) -> float:
+    """Of the mean."""
+    return float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
 
 
 def _least_evident(candidate: SimulatedRule) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ PYTHON ?= python3
 #   make demo PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PIP_FLAGS ?=
 BIN := .venv/bin
+PIP ?= $(BIN)/pip
 # Files of tests side by side, one per core; a file stays whole, so that what its tests share is made
 # once. One thread each, or the workers' linear algebra fights over the cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
@@ -42,15 +43,15 @@ wheel: .venv/dev  ## Build the wheel into dist/.
 .venv/base: pyproject.toml constraints.txt
 	@echo "Setting up .venv: downloads torch and some twenty packages, a few minutes"
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e .
+	$(PIP) install $(PIP_FLAGS) -c constraints.txt -e .
 	touch $@
 
 .venv/dev: .venv/base
-	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
+	$(PIP) install $(PIP_FLAGS) -c constraints.txt -e ".[control,dev]"
 	touch $@
 
 .venv/docs: .venv/base
-	$(BIN)/pip install $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
+	$(PIP) install $(PIP_FLAGS) -c constraints.txt -e ".[docs]"
 	touch $@
 
 clean:

@@ -126,6 +126,7 @@ def test_the_development_extra_can_run_the_notebooks() -> None:
 SMALL = ("train.steps=40", "policy.dim=16", "policy.context=4", "rule.sessions=4")
 
 
+@pytest.mark.slow
 def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) -> None:
     month = Month(days=2, sessions=50, users=80, items=110, settings=SMALL)
     days = simulate(tmp_path, replace(month, days=1))

@@ -153,6 +153,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_two_processes_on_one_file_share_the_work(tmp_path: Path) -> None:
     """Every cell is measured by one of them; both return the rows of all."""
     script = tmp_path / "run.py"

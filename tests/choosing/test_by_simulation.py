@@ -229,6 +229,7 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
 
 
+@pytest.mark.slow
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
     store = tiring_store(tmp_path)
     scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
@@ -296,6 +297,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert (own.value, own.error) == (simulated.value, simulated.error)
 
 
+@pytest.mark.slow
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     tmp_path: Path, trained: TrainedPolicy
 ) -> None:

@@ -72,7 +72,9 @@ def test_help_answers_at_once() -> None:
     assert min(seconds() for _ in range(3)) < 0.5
 
 
-@pytest.mark.parametrize("environment", ["synthetic-taobao", "synthetic-catalog"])
+@pytest.mark.parametrize(
+    "environment", [pytest.param("synthetic-taobao", marks=pytest.mark.slow), "synthetic-catalog"]
+)
 def test_evaluate_writes_the_rows_it_prints(
     folder: Path, environment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -76,6 +76,7 @@ def killed_often(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[s
     return folder, json.loads(script.stdout)
 
 
+@pytest.mark.slow
 def test_killed_training_ends_as_if_left_alone(
     left_alone: tuple[Path, Fit], killed_often: tuple[Path, dict[str, Any]]
 ) -> None:

@@ -107,6 +107,7 @@ def test_a_log_is_not_taken_for_exposures(tmp_path: Path) -> None:
     assert not (tmp_path / "out.parquet").exists()
 
 
+@pytest.mark.slow
 def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> None:
     rows = 200_000
     frame = pd.DataFrame({"user_id": [str(n % 977) for n in range(rows)]})

@@ -57,7 +57,10 @@ def assert_equal_stores(logs: list[Path], folder: Path, mapping: LogMapping, **g
     assert {p.name for p in folder.iterdir() if p.is_dir()} == {"duckdb", "spark"}
 
 
-@pytest.mark.parametrize(("text", "session_by"), [(False, "gap"), (True, "session_id")])
+@pytest.mark.parametrize(
+    ("text", "session_by"),
+    [pytest.param(False, "gap", marks=pytest.mark.slow), (True, "session_id")],
+)
 def test_stores_are_the_same(tmp_path: Path, spark: Any, text: bool, session_by: str) -> None:
     log = make_log(900, text, seed=len(session_by))
     log.iloc[:200].to_parquet(tmp_path / "a.parquet")

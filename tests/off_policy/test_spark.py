@@ -10,7 +10,7 @@ from ucfrec.commands.cli import main
 from ucfrec.off_policy import spark as scored_parts
 
 
-@pytest.mark.parametrize("session_by", ["gap", "session_id"])
+@pytest.mark.parametrize("session_by", [pytest.param("gap", marks=pytest.mark.slow), "session_id"])
 def test_rows_are_those_of_one_process(
     folder: Path, spark: Any, session_by: str, tmp_path: Path
 ) -> None:

@@ -113,5 +113,6 @@ def test_an_answer_carries_propensities_and_where_it_is_from(trained: TrainedPol
         assert told["run"] == trained.fingerprint
 
 
+@pytest.mark.slow
 def test_a_kill_loses_only_what_waited(trained: TrainedPolicy) -> None:
     assert kills("exposures", trained.folder.parent) >= 7

@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [pytest.param("drawn", marks=pytest.mark.slow), "explored"])
 def test_rows_are_those_of_one_process(folder: Path, spark: Any, rule: str, tmp_path: Path) -> None:
     command = ["recommend", str(folder / "run"), str(folder / "logs"), *RULES[rule]]
     command += ["--column", "item_id=shown", "--skip-unknown", "--where", "user_id <> 'é3'"]

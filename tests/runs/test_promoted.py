@@ -106,6 +106,7 @@ def test_a_damaged_run_or_pointer_is_refused(trained: TrainedPolicy, tmp_path: P
             promote_back(folder)
 
 
+@pytest.mark.slow
 def test_a_promotion_killed_at_any_moment_leaves_a_whole_pointer(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:

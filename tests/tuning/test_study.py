@@ -67,6 +67,7 @@ def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_and_the_same_search_gives_the_same_trials(
     store: Path, tmp_path: Path
 ) -> None:

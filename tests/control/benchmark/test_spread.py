@@ -56,6 +56,7 @@ def test_the_last_checkpoints_are_those_of_validations() -> None:
     assert kept_steps(replace(LOOP, steps=1)) == [1]
 
 
+@pytest.mark.slow
 def test_checkpoints_are_measured_once_and_share_the_run_of_the_main_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,6 +23,8 @@ _LAGS: Final = 6
 """Items shown before whose likeness counts."""
 _INPUTS: Final = 4 + _LAGS + 3 + 3
 """Number of inputs; see `_columns`."""
+_STEPS: Final = [0, 1]
+"""Numbers of the inputs that grow with the number of the step."""
 _REWARD: Final = 3
 """Number of the input that is the step's reward."""
 _REMEMBERED: Final = 10
@@ -33,7 +35,7 @@ estimated."""
 _STEP: Final = 2.0**-10
 """Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
 on one side of a tree's threshold."""
-_LOGISTIC: Final = ("mean", "scale", "weights", "bias")
+_LOGISTIC: Final = ("highest", "mean", "scale", "weights", "bias")
 _MOST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
 
@@ -140,7 +142,8 @@ class SessionEnd:
 
     likeness: Likeness
     tensors: Mapping[str, Tensor]
-    """Those of `BoostedTrees`; or `mean` and `scale` (F,) of the inputs, `weights` (F,) and `bias`
+    """Those of `BoostedTrees`; or the `highest` (F,) inputs that count, so that steps later than
+    logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights` (F,) and `bias`
     (), all float64."""
     uses_rewards: bool = field(init=False)
     """Whether the reward of the step counts."""
@@ -252,7 +255,7 @@ class SessionEnd:
         tensors = self.tensors
         if self._trees is not None:
             return self._trees(inputs)
-        standard = (inputs - tensors["mean"]) / tensors["scale"]
+        standard = (inputs.minimum(tensors["highest"]) - tensors["mean"]) / tensors["scale"]
         return standard @ tensors["weights"] + tensors["bias"]
 
 
@@ -263,7 +266,13 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     rate, zeros = float(ended.mean()) if len(ended) else 0.0, torch.zeros_like(inputs[:0].sum(0))
     if not weights:
         bias = torch.logit(torch.tensor(rate).double())
-        return {"mean": zeros, "scale": zeros + 1, "weights": zeros.clone(), "bias": bias}
+        scale, highest = zeros + 1, zeros + torch.inf
+        parts = {"mean": zeros, "scale": scale, "weights": zeros.clone(), "highest": highest}
+        return {**parts, "bias": bias}
+    # The last steps of the longest sessions are too few to tell more than those before.
+    latest = inputs[:, _STEPS].topk(_FEWEST, 0).values[-1]
+    highest = torch.full_like(inputs[0], torch.inf).index_copy(0, torch.tensor(_STEPS), latest)
+    inputs = inputs.minimum(highest)
     mean, spread = inputs.mean(0), inputs.std(0, correction=0)
     scale = torch.where(spread > 0, spread, 1.0)
     model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
@@ -272,7 +281,7 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
         "weights": torch.from_numpy(model.coef_[0]),
         "bias": torch.tensor(model.intercept_[0]),
     }
-    return {"mean": mean, "scale": scale, **fitted}
+    return {"highest": highest, "mean": mean, "scale": scale, **fitted}
 
 
 def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:

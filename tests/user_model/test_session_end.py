@@ -55,6 +55,25 @@ def test_that_repetition_ends_sessions_is_found_if_there_are_steps_to_show_it(la
         assert (gain > error) or kind != report.kept or kind == "constant"
 
 
+def test_steps_later_than_logged_ones_are_like_the_last() -> None:
+    """The log has eight steps; sessions end the likelier, the later."""
+    likeness, logged = planted_ends()
+    ended = np.random.default_rng(1).random(len(logged.steps)) < 0.05 * (1 + logged.steps)
+    parts = [
+        part_of(replace(logged, ended=ended), rows) for rows in (slice(4000), slice(4000, 6000))
+    ]
+    end, report = SessionEnd.fit(likeness, *parts, 0)
+    assert report.kept == "logistic"
+
+    def at(step: int) -> float:
+        steps = np.full(len(logged.steps), step)
+        return float(end.probabilities(logged.shown, logged.items, logged.rewards, steps).mean())
+
+    assert at(7) == pytest.approx(0.4, abs=0.05)
+    assert at(7) > at(6)
+    assert at(7) == at(8) == at(100)
+
+
 def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
     """Sessions end with the second of two alike items, but not with the third."""
     likeness, logged = planted_ends()

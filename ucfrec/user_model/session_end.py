@@ -263,15 +263,14 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     """Tensors of a logistic regression; without `weights`, of its bias alone."""
     from sklearn.linear_model import LogisticRegression
 
-    rate, zeros = float(ended.mean()) if len(ended) else 0.0, torch.zeros_like(inputs[:0].sum(0))
+    size = inputs.shape[1]
+    zeros, highest = inputs.new_zeros(size), inputs.new_full((size,), torch.inf)
     if not weights:
-        bias = torch.logit(torch.tensor(rate).double())
-        scale, highest = zeros + 1, zeros + torch.inf
-        parts = {"mean": zeros, "scale": scale, "weights": zeros.clone(), "highest": highest}
-        return {**parts, "bias": bias}
+        bias = torch.logit(torch.tensor(float(ended.mean()) if len(ended) else 0.0).double())
+        parts = {"mean": zeros, "scale": zeros + 1, "weights": zeros.clone(), "bias": bias}
+        return {"highest": highest, **parts}
     # The last steps of the longest sessions are too few to tell more than those before.
-    latest = inputs[:, _STEPS].topk(_FEWEST, 0).values[-1]
-    highest = torch.full_like(inputs[0], torch.inf).index_copy(0, torch.tensor(_STEPS), latest)
+    highest[_STEPS] = inputs[:, _STEPS].topk(_FEWEST, 0).values[-1]
     inputs = inputs.minimum(highest)
     mean, spread = inputs.mean(0), inputs.std(0, correction=0)
     scale = torch.where(spread > 0, spread, 1.0)

@@ -42,7 +42,7 @@ _WIDEST: Final = 0.4
 _BEYOND: Final = 3
 """Simulated sessions may have so many times the steps of the longest logged one, …"""
 _CHANCE: Final = 0.001
-"""… unless fewer sessions would end there by chance, but for this probability."""
+"""… unless chance ends all sessions that get there with a lower probability than this."""
 _NEAR_THE_LOG: Final = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},

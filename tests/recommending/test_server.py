@@ -135,6 +135,8 @@ REQUESTS = {
     "a header without end": (head(b"a: " + b"b" * 2**20)[:-4], b"4"),
     "a long address": (head(what=b"GET /" + b"a" * 2**17), b"4"),
     "trailers without end": (CHUNKED + b"0\r\n" + b"a: b\r\n" * 2**18, b"4"),
+    "two lengths": (head(b"Content-Length: 3", b"Content-Length: 4") + b"abcd", b"400"),
+    "few requests at once": (head() * 9 + head(CLOSE), b"200"),
     "no HTTP": (b"\x16\x03\x01" * 100 + b"\r\n\r\n", b"400"),
     "another host": (head(CLOSE).replace(b"localhost", b"evil.example"), b"400"),
     "another port": (head(CLOSE).replace(b"localhost", b"localhost:99"), b"200"),

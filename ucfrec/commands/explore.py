@@ -48,30 +48,20 @@ def run(options: argparse.Namespace) -> None:
             cannot be listened on.
     """
     try:
-        import uvicorn
-
         from ucfrec.exploring.web import application
+        from ucfrec.recommending.server import Server, listening_socket, server_config
     except ModuleNotFoundError as error:
         raise InputError(
             f"exploring needs {error.name}, which is not installed; install ucfrec[serve]"
         ) from None
     from ucfrec.exploring.page import Explorer
-    from ucfrec.recommending.server import Server, listening_socket
     from ucfrec.reporting.samples import read_features
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     features = None if options.items is None else read_features(options.items)
     runs = [TrainedPolicy.load(run) for run in options.runs]
     explorer = Explorer(runs, features, options.results)
-    config = uvicorn.Config(
-        application(explorer, _OWN_NAMES),
-        http="h11",
-        h11_max_incomplete_event_size=2**16,
-        ws="none",
-        access_log=False,
-        log_level="warning",
-        server_header=False,
-    )
+    config = server_config(application(explorer, _OWN_NAMES))
     with listening_socket("127.0.0.1", options.port) as listening:
         try:
             Server(config, "ucfrec explore", page="/").run([listening])

@@ -127,21 +127,11 @@ def _serve(
     of_server: "ServerLimits",
     exposures: "ExposureLog | None",
 ) -> None:
-    import uvicorn
-
-    from ucfrec.recommending.server import Server, listening_socket
+    from ucfrec.recommending.server import Server, listening_socket, server_config
     from ucfrec.recommending.web import application
 
-    # h11 takes one request of a connection after the other and bounds what it keeps of a head;
-    # httptools does neither.
-    config = uvicorn.Config(
+    config = server_config(
         application(served, of_server, _allowed_hosts(options), exposures),
-        http="h11",
-        h11_max_incomplete_event_size=2**16,
-        ws="none",
-        access_log=False,
-        log_level="warning",
-        server_header=False,
         timeout_graceful_shutdown=int(of_server.timeout) + 1,
     )
     with listening_socket(options.host, options.port) as listening:

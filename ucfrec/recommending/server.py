@@ -1,12 +1,30 @@
-"""The web server's process: the address it listens on, and saying that it is ready."""
+"""The web server's process: how and where it listens, and saying that it is ready."""
 
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from ucfrec.errors import InputError, explain_os_error
+
+
+def server_config(application: ASGIApp, **more: Any) -> uvicorn.Config:
+    """How `application` is served; `more` goes to uvicorn."""
+    # h11 takes one request of a connection after the other and bounds what it keeps of a head;
+    # httptools does neither, and saves 5% of the processor time at most.
+    return uvicorn.Config(
+        application,
+        http="h11",
+        h11_max_incomplete_event_size=2**16,
+        ws="none",
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        **more,
+    )
 
 
 @contextmanager

@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--replications", type=int, default=20)
     parser.add_argument("--sessions", type=int, default=10_000)
-    parser.add_argument("--episodes", type=int, default=3000)
+    parser.add_argument("--episodes", type=int, default=20_000)
     options = parser.parse_args()
     found = list[dict[str, Any]]()
     for seed in range(options.replications):

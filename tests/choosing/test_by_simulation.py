@@ -177,6 +177,8 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
         (np.minimum(np.random.default_rng(0).geometric(0.1, 2000), 20), 20),
         (np.full(50, 7), 7),
         (np.array([1, 1, 1]), 1),
+        (np.arange(1, 60), 100),
+        (np.arange(1, 500), 499),
     ],
 )
 def test_sessions_may_be_longer_than_logged_ones_unless_something_ends_them(

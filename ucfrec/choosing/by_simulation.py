@@ -39,8 +39,9 @@ _FAR_OFF: Final = 0.1
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
 (Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
-_BEYOND: Final = 3
-"""Simulated sessions may have so many times the steps of the longest logged one, …"""
+_BEYOND: Final = 3, 100
+"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
+than so many, …"""
 _CHANCE: Final = 0.001
 """… unless chance ends all sessions that get there with a lower probability than this."""
 _NEAR_THE_LOG: Final = (
@@ -251,8 +252,10 @@ def longest_session(lengths: IntArray) -> int:
     late = lengths[lengths > longest // 2]
     ended = int((late < longest).sum())
     hazard = ended / int((np.minimum(late, longest - 1) - longest // 2).sum() or 1)
-    limited = hazard ** (len(late) - ended) < _CHANCE
-    return longest if limited else _BEYOND * longest
+    if hazard ** (len(late) - ended) < _CHANCE:
+        return longest
+    times, most = _BEYOND
+    return max(longest, min(times * longest, most))
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

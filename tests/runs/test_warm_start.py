@@ -38,9 +38,9 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
 def test_warm_settings_are_a_share_of_the_whole() -> None:
     config = resolve_config("ucf", None, ["train.steps=800"])
     warm = warm_settings(config)
-    assert warm.train.steps == 100
-    assert warm.train.warmup_steps == 10
-    assert warm.train.validate_every == 100
+    assert warm.train.steps == 50
+    assert warm.train.warmup_steps == 5
+    assert warm.train.validate_every == 50
     assert warm.crm.epochs == 1
     assert warm.policy == config.policy
     assert warm_settings(config, 1.0).train.steps == 800

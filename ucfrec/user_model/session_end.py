@@ -19,16 +19,15 @@ from ucfrec.user_model.trees import BoostedTrees
 
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
-_LAGS: Final = 6
-"""Items shown before whose likeness counts."""
-_INPUTS: Final = 4 + _LAGS + 3 + 3
+_LAGS: Final = 10
+"""Items shown before that count: as many as a tag window of a decision rule may keep from being
+repeated."""
+_INPUTS: Final = 4 + _LAGS + 4 + 3
 """Number of inputs; see `_columns`."""
 _STEPS: Final = [0, 1]
 """Numbers of the inputs that grow with the number of the step."""
 _REWARD: Final = 3
 """Number of the input that is the step's reward."""
-_REMEMBERED: Final = 10
-"""Items shown before that are compared with the item."""
 _FEWEST: Final = 20
 """Fewest steps that end a session, and that do not, from which more than their share is
 estimated."""
@@ -136,8 +135,8 @@ class SessionEnd:
     """The probability that a session ends with a step.
 
     A constant, a logistic regression, or boosted trees, of the number of the step, its reward, how
-    alike its item is to each of the last six, the largest of these over the last 2, 3 and 4, and
-    how often the item was shown in the last 1, 3 and 10.
+    alike its item is to each of the last ten, the largest of these over the last 2, 3, 4 and 10,
+    and how often the item was shown in the last 1, 3 and 10.
     """
 
     likeness: Likeness
@@ -306,11 +305,11 @@ def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:
 
 
 def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
-    """Inputs (M, ..., F) from likeness (M, 6, ...) and repetition (M, L, ...), the latest first."""
+    """Inputs (M, ..., F) from likeness (M, 10, ...) and repetition (M, L, ...), latest first."""
     numbers = steps.double().expand(rewards.shape)
     columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
     alike = (alike.double() / _STEP).round() * _STEP
     columns += [*alike.unbind(1)]
-    columns += [alike[:, :reach].amax(1) for reach in (2, 3, 4)]
-    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _REMEMBERED)]
+    columns += [alike[:, :reach].amax(1) for reach in (2, 3, 4, _LAGS)]
+    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _LAGS)]
     return torch.stack(columns, -1)

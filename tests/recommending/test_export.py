@@ -111,7 +111,6 @@ RULES = {
 TAGGED = ("run", "full", "everything")
 CASES = [
     ("tags", False, "run"),
-    ("tags", False, "ahead"),
     # Tastes move what the reward model says; without its weight they would move nothing.
     ("tags", True, "everything"),
     ("no tags", True, "ahead"),

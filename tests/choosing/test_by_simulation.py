@@ -13,7 +13,7 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation, longest_session
+from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
 from ucfrec.choosing.nearby import near
 from ucfrec.episodes.store import EpisodeStore
@@ -168,24 +168,6 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.level([low, high]) == [high]
     search._returns[low.rule] = np.roll(luck, 1)
     assert search.level([low, high]) == [low, high]
-
-
-@pytest.mark.parametrize(
-    ("lengths", "longest"),
-    [
-        (np.random.default_rng(0).geometric(0.45, 8000), None),
-        (np.minimum(np.random.default_rng(0).geometric(0.1, 2000), 20), 20),
-        (np.full(50, 7), 7),
-        (np.array([1, 1, 1]), 1),
-        (np.arange(1, 60), 100),
-        (np.arange(1, 500), 499),
-    ],
-)
-def test_sessions_may_be_longer_than_logged_ones_unless_something_ends_them(
-    lengths: np.ndarray, longest: int | None
-) -> None:
-    expected = 3 * lengths.max() if longest is None else longest
-    assert longest_session(lengths) == expected
 
 
 def test_halves_of_the_users_say_whether_they_would_choose_another_rule(

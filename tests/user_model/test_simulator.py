@@ -14,7 +14,7 @@ from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
-from ucfrec.user_model.simulator import LoggedRewards, UserSimulator
+from ucfrec.user_model.simulator import LoggedRewards, UserSimulator, longest_session
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +122,21 @@ def test_equal_seeds_give_equal_sessions(store: EpisodeStore) -> None:
         rewards.append([users.step(np.full(50, i))[0] for i in range(6)])
     assert np.array_equal(rewards[0], rewards[1])
     assert not np.array_equal(rewards[0], rewards[2])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "longest"),
+    [
+        (np.random.default_rng(0).geometric(0.45, 8000), None),
+        (np.minimum(np.random.default_rng(0).geometric(0.1, 2000), 20), 20),
+        (np.full(50, 7), 7),
+        (np.array([1, 1, 1]), 1),
+        (np.arange(1, 60), 100),
+        (np.arange(1, 500), 499),
+    ],
+)
+def test_sessions_may_be_longer_than_logged_ones_unless_something_ends_them(
+    lengths: np.ndarray, longest: int | None
+) -> None:
+    expected = 3 * lengths.max() if longest is None else longest
+    assert longest_session(lengths) == expected

@@ -23,7 +23,7 @@ from ucfrec.choosing.many_rules import roll_out
 from ucfrec.choosing.nearby import near
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
-from ucfrec.user_model.simulator import UserSimulator
+from ucfrec.user_model.simulator import UserSimulator, longest_session
 from ucfrec.user_model.training_users import half_of, sessions_of
 
 _LOGGED_STEPS: Final = 10_000, 1000
@@ -39,11 +39,6 @@ _FAR_OFF: Final = 0.1
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
 (Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
-_BEYOND: Final = 3, 100
-"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
-than so many, …"""
-_CHANCE: Final = 0.001
-"""… unless chance ends all sessions that get there with a lower probability than this."""
 _NEAR_THE_LOG: Final = (
     {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
@@ -240,22 +235,6 @@ class RuleSearch:
         if length > logged:
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
         return ValueEstimate(value, error, values, optimism, tuple(doubts))
-
-
-def longest_session(lengths: IntArray) -> int:
-    """Steps after which a simulated session ends in any case, from those of logged sessions (E,).
-
-    Policies may make sessions longer than any logged one, unless something ends them there: more
-    of the longest sessions than chance explains.
-    """
-    longest = int(lengths.max())
-    late = lengths[lengths > longest // 2]
-    ended = int((late < longest).sum())
-    hazard = ended / int((np.minimum(late, longest - 1) - longest // 2).sum() or 1)
-    if hazard ** (len(late) - ended) < _CHANCE:
-        return longest
-    times, most = _BEYOND
-    return max(longest, min(times * longest, most))
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

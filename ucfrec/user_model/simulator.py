@@ -15,6 +15,11 @@ from ucfrec.user_model.model import UserModel
 
 _GROUPS: Final = 32
 """Most rewards to draw from."""
+_BEYOND: Final = 3, 100
+"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
+than so many, …"""
+_CHANCE: Final = 0.001
+"""… unless chance ends all sessions that get there with a lower probability than this."""
 
 
 @dataclass(frozen=True)
@@ -154,3 +159,19 @@ class UserSimulator:
         self._shown = self._shown.at(torch.from_numpy(rows))
         for name in ("_steps", "_episodes", "_numbers"):
             setattr(self, name, getattr(self, name)[rows])
+
+
+def longest_session(lengths: IntArray) -> int:
+    """Steps after which a simulated session ends in any case, from those of logged sessions (E,).
+
+    Policies may make sessions longer than any logged one, unless something ends them there: more
+    of the longest sessions than chance explains.
+    """
+    longest = int(lengths.max())
+    late = lengths[lengths > longest // 2]
+    ended = int((late < longest).sum())
+    hazard = ended / int((np.minimum(late, longest - 1) - longest // 2).sum() or 1)
+    if hazard ** (len(late) - ended) < _CHANCE:
+        return longest
+    times, most = _BEYOND
+    return max(longest, min(times * longest, most))

@@ -14,8 +14,9 @@ from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
+from ucfrec.choosing.candidates import near
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
-from ucfrec.choosing.nearby import near
+from ucfrec.choosing.many_rules import Sessions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -124,7 +125,7 @@ def test_a_rule_simulated_twice_gives_the_same(folder: Path, trained: TrainedPol
 
 
 def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: TrainedPolicy) -> None:
-    search = search_of(folder, trained)
+    search = search_of(folder, trained, replace(FEW, sessions=30))
     rules = [
         DecisionRule(2.0, temperature=1.0),
         DecisionRule(1.0, minimum_target=1.0, reward_weight=2.0, temperature=0.5),
@@ -160,20 +161,51 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     rules = DecisionRule(2.0), DecisionRule(2.0, temperature=1.0)
     found = search.simulate(rules)
     luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
+    nothing = np.zeros(0, dtype=np.int64)
     for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
-        search._returns[each] = returns
+        search._sessions[each] = Sessions(returns, nothing, nothing)
     low, high = (
-        replace(each, value=float(search._returns[each.rule].mean()), error=3.2) for each in found
+        replace(each, value=float(search._sessions[each.rule].returns.mean()), error=3.2)
+        for each in found
     )
     assert search.level([low, high]) == [high]
-    search._returns[low.rule] = np.roll(luck, 1)
+    search._sessions[low.rule] = Sessions(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
+
+
+def test_rules_far_behind_are_not_simulated_in_all_sessions(
+    folder: Path, trained: TrainedPolicy
+) -> None:
+    search = search_of(folder, trained, replace(FEW, sessions=120))
+    plain, close, best = (
+        DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 3.8, 4.0)
+    )
+    found = dict(zip((plain, close, best), search.simulate([plain, close, best]), strict=True))
+    sizes = {rule: len(sessions.returns) for rule, sessions in search._sessions.items()}
+    assert sizes == {plain: 30, close: 120, best: 120}
+    returns = {rule: sessions.returns for rule, sessions in search._sessions.items()}
+    ahead = max(close, best, key=lambda rule: float(returns[rule][:30].mean()))
+    behind = float((returns[ahead][:30] - returns[plain]).mean())
+    assert found[ahead].value == pytest.approx(returns[ahead].mean())
+    assert found[plain].value == pytest.approx(found[ahead].value - behind)
+    assert found[plain].error > found[ahead].error
+    # The first sessions are those of a search that has no others.
+    few = search_of(folder, trained, replace(FEW, sessions=30))
+    few.simulate([plain, best])
+    for rule in (plain, best):
+        expected = few._sessions[rule].returns
+        np.testing.assert_array_equal(search._sessions[rule].returns[:30], expected)
+    # A rule that the log does not support rules nothing out.
+    unsupported = search_of(folder, trained, replace(FEW, sessions=120))
+    unsupported.least_items = 1e9
+    unsupported.simulate([plain, best])
+    assert {len(each.returns) for each in unsupported._sessions.values()} == {120}
 
 
 def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
     folder: Path, trained: TrainedPolicy
 ) -> None:
-    search = search_of(folder, trained, replace(FEW, sessions=60))
+    search = search_of(folder, trained, replace(FEW, sessions=39))
     plain, weighted = search.simulate(
         [DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 4.0)]
     )

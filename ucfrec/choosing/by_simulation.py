@@ -8,19 +8,19 @@ than a handful of them; where the log has propensities, it must also leave enoug
 evaluate it off-policy.
 """
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.arrays import Float64Array
+from ucfrec.choosing.candidates import near, unweighted, variants
 from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
-from ucfrec.choosing.many_rules import roll_out
-from ucfrec.choosing.nearby import near
+from ucfrec.choosing.many_rules import Sessions, roll_out
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator, longest_session
@@ -33,7 +33,13 @@ _FINALISTS: Final = 8
 _TIMES: Final = 4
 """… in so many times the sessions: few sessions there say as much of the users as of the rules."""
 _FEWEST: Final = 10
-"""Sessions of a half of the users that can disagree."""
+"""Sessions of a half of the users that can disagree, and that can rule a candidate out."""
+_PARTS: Final = 4
+"""Part of the sessions after which candidates are ruled out: one in so many."""
+_FAR: Final = 3.0
+"""Standard errors by which a rule that is ruled out is behind."""
+_SEEDS: Final = 3
+"""Seeds of the first sessions and of the halves of an estimate; the rest have the next one."""
 _FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
 _WIDEST: Final = 0.4
@@ -66,10 +72,13 @@ class RuleSearch:
         wanted = self._config.evidence if self._many.has_propensities else 0
         self.least_users = float(wanted)
         """Effective users that a rule must leave; 0 without propensities."""
-        self._returns: dict[DecisionRule, Float64Array] = {}
+        self._sessions: dict[DecisionRule, Sessions] = {}
 
     def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
         """Roll out each of the rules, side by side, all with the same draws.
+
+        A rule that is far behind the best one after a part of the sessions is not simulated in the
+        rest; its value is that of the best one less the difference.
 
         Args:
             times: how many times the sessions of the configuration.
@@ -77,10 +86,39 @@ class RuleSearch:
         if not rules:
             return []
         n = times * self._config.sessions
-        found = self._rolled(rules, self.users, self._store, n, self.problem.seed)
+        first = n // _PARTS if n >= _PARTS * _FEWEST else n
+        begun = self._roll(rules, self._store, first, self.problem.seed)
+        self._sessions |= begun
+        found = [self._simulated(*each) for each in begun.items()]
         if 0 < self.least_users < self._many.users:
             found = [replace(one, evidence=each) for one, each in self._with_evidence(found)]
+        return found if first == n else self._continued(found, n - first)
+
+    def _continued(self, begun: Sequence[SimulatedRule], n: int) -> list[SimulatedRule]:
+        """The rules in `n` more sessions, where they are not far behind the best one."""
+        allowed = [each for each in begun if self.allowed(each)]
+        allowed = allowed or [each for each in begun if self.supported(each)]
+        top = max(allowed or begun, key=_value)
+        going = [each.rule for each in begun if not (allowed and self._far_behind(top, each))]
+        first = len(self._sessions[top.rule].returns)
+        store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
+        rest = self._roll(going, store, n, self.problem.seed + _SEEDS)
+        whole = {rule: self._sessions[rule].followed_by(more) for rule, more in rest.items()}
+        self._sessions |= whole
+        best = self._simulated(top.rule, whole[top.rule])
+        found = list[SimulatedRule]()
+        for each in begun:
+            behind, error = top.value - each.value, self._error(top, each)
+            found.append(
+                replace(self._simulated(each.rule, whole[each.rule]), evidence=each.evidence)
+                if each.rule in whole
+                else replace(each, value=best.value - behind, error=math.hypot(best.error, error))
+            )
         return found
+
+    def _far_behind(self, top: SimulatedRule, other: SimulatedRule) -> bool:
+        margin = max(_FAR * self._error(top, other), self._config.tolerance * abs(top.value))
+        return top.value - other.value > margin
 
     def _with_evidence(
         self, found: Sequence[SimulatedRule]
@@ -96,37 +134,31 @@ class RuleSearch:
             for pair in zip(some, logged.of([each.rule for each in some]), strict=True)
         ]
 
-    def _rolled(
+    def _roll(
         self,
         rules: Sequence[DecisionRule],
-        users: UserModel,
         store: EpisodeStore,
         n: int,
         seed: int,
-    ) -> list[SimulatedRule]:
+        users: UserModel | None = None,
+    ) -> dict[DecisionRule, Sessions]:
+        """Simulate `n` sessions of each rule that begin as those of a store."""
+        users = users or self.users
         simulator = UserSimulator(users, store, n, self._longest, seed, times=len(rules))
         scorers = [self.problem.scorer.under(rule) for rule in rules]
         states, size = store.item_states, store.observation_size
-        returns, lengths, shown = roll_out(simulator, scorers, n, states, size, seed)
-        numbers = np.arange(len(returns)).reshape(len(rules), n)
-        self._returns |= {rule: returns[own] for rule, own in zip(rules, numbers, strict=True)}
-        return [
-            self._simulated(rule, returns[own], lengths[own], shown[shown[:, 0] // n == i, 1])
-            for i, (rule, own) in enumerate(zip(rules, numbers, strict=True))
-        ]
+        found = roll_out(simulator, scorers, n, states, size, seed)
+        return dict(zip(rules, found, strict=True))
 
-    def _simulated(
-        self, rule: DecisionRule, returns: Float64Array, lengths: IntArray, items: IntArray
-    ) -> SimulatedRule:
-        """What `rule` did in some sessions by showing `items` (M,)."""
-        shares = np.bincount(items) / len(items)
+    def _simulated(self, rule: DecisionRule, sessions: Sessions) -> SimulatedRule:
+        shares = np.bincount(sessions.items) / len(sessions.items)
         shares = shares[shares > 0]
         return SimulatedRule(
             rule=rule,
-            value=float(returns.mean()),
-            error=_standard_error(returns),
-            length=float(lengths.mean()),
-            support=float(self._supported[items].mean()),
+            value=float(sessions.returns.mean()),
+            error=_standard_error(sessions.returns),
+            length=float(sessions.lengths.mean()),
+            support=float(self._supported[sessions.items].mean()),
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
 
@@ -148,7 +180,7 @@ class RuleSearch:
     ) -> list[SimulatedRule]:
         """The best and those of the highest value among the allowed, in more sessions."""
         allowed = [each for each in candidates if self.allowed(each)]
-        highest = sorted(allowed, key=lambda each: each.value, reverse=True)
+        highest = sorted(allowed, key=_value, reverse=True)
         rules = dict.fromkeys(each.rule for each in (best, *highest))
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
@@ -163,7 +195,7 @@ class RuleSearch:
         allowed = allowed or [each for each in candidates if self.supported(each)]
         if not allowed:
             return [max(candidates, key=lambda each: each.items)]
-        top = max(allowed, key=lambda each: each.value)
+        top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
         return [
             each for each in allowed if top.value - each.value <= max(least, self._error(top, each))
@@ -171,10 +203,9 @@ class RuleSearch:
 
     def _error(self, one: SimulatedRule, other: SimulatedRule) -> float:
         """Standard error of the difference of their values; sessions draw the same numbers."""
-        returns, others = self._returns[one.rule], self._returns[other.rule]
-        if len(returns) != len(others):
-            return one.error
-        return _standard_error(returns - others)
+        returns, others = (self._sessions[each.rule].returns for each in (one, other))
+        both = min(len(returns), len(others))
+        return _standard_error(returns[:both] - others[:both])
 
     def best(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """The simplest of those that cannot be told apart from the best."""
@@ -196,10 +227,11 @@ class RuleSearch:
     ) -> tuple[bool, bool]:
         """Whether the chosen rule cannot be told apart from the best allowed one in the sessions of
         either half of the users, as in `level`."""
-        own = self._returns[chosen.rule]
+        own = self._sessions[chosen.rule].returns
         half = half_of(self._store)[np.arange(len(own)) % len(self._store)]
         allowed = {each.rule for each in candidates if self.allowed(each)} | {chosen.rule}
-        returns = [self._returns[rule] for rule in allowed if len(self._returns[rule]) == len(own)]
+        returns = [self._sessions[rule].returns[: len(own)] for rule in allowed]
+        returns = [each for each in returns if len(each) == len(own)]
         agree = []
         for mine in (half == 0, half == 1):
             top = max((each[mine] for each in returns), key=_mean)
@@ -225,7 +257,8 @@ class RuleSearch:
             users = self.users
             if checked is not None:
                 users = replace(users, calibration=checked.halves[number])
-            found += self._rolled([rule], users, rest, n, self.problem.seed + 1 + number)
+            simulated = self._roll([rule], rest, n, self.problem.seed + 1 + number, users)
+            found.append(self._simulated(rule, simulated[rule]))
         values = found[0].value, found[1].value
         value, within = sum(values) / 2, sum(each.error**2 for each in found) ** 0.5 / 2
         error = max(within, abs(values[0] - values[1]) / 2)
@@ -283,9 +316,9 @@ def _near(search: RuleSearch, start: DecisionRule) -> list[SimulatedRule]:
 def _all(search: RuleSearch) -> list[SimulatedRule]:
     """All candidates of the configuration that the best of the earlier ones leads to."""
     problem = search.problem
-    tried = search.simulate([*_unweighted(problem)])
+    tried = search.simulate([*unweighted(problem)])
     first = search.best(tried).rule
-    tried += search.simulate([*_variants(first, reward_weight=problem.config.reward_weights)])
+    tried += search.simulate([*variants(first, reward_weight=problem.config.reward_weights)])
     second = search.best(tried).rule
     tried += _with_lookahead(search, second)
     if problem.validation.item_states.tags.shape[1]:
@@ -294,7 +327,7 @@ def _all(search: RuleSearch) -> list[SimulatedRule]:
         tried += _with_tag_run(search, second)
     if search.least_users:
         done = {each.rule for each in tried}
-        others = (replace(first, **parts) for grid in _NEAR_THE_LOG for parts in _grid(**grid))
+        others = (rule for grid in _NEAR_THE_LOG for rule in variants(first, **grid))
         tried += search.simulate([rule for rule in others if rule not in done])
     return tried
 
@@ -333,7 +366,7 @@ def _with_lookahead(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRul
     if search.users.session_end_report.kept == "constant":
         return []
     weights = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
-    return search.simulate([*_variants(rule, lookahead=lookaheads, **weights)])
+    return search.simulate([*variants(rule, lookahead=lookaheads, **weights)])
 
 
 def _with_tag_window(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
@@ -344,12 +377,12 @@ def _with_tag_window(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRu
     """
     config, known = search.problem.config, search.problem.scorer.known
     windows = [window for window in config.tag_windows if 0 < window <= known]
-    tried = search.simulate([*_variants(rule, temperature=config.temperatures, tag_window=windows)])
+    tried = search.simulate([*variants(rule, temperature=config.temperatures, tag_window=windows)])
     if not tried:
         return []
     best = search.best(tried).rule
     weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
-    others = _variants(best, tag_window=sorted({*windows}), reward_weight=weights)
+    others = variants(best, tag_window=sorted({*windows}), reward_weight=weights)
     return [*tried, *search.simulate([*others])]
 
 
@@ -358,34 +391,12 @@ def _with_tag_run(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]
     weights."""
     config = search.problem.config
     runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
-    tried = search.simulate([*_variants(rule, tag_run=runs)])
+    tried = search.simulate([*variants(rule, tag_run=runs)])
     if not tried:
         return []
     best = search.best(tried).rule
     weights = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
-    return [*tried, *search.simulate([*_variants(best, **weights)])]
-
-
-def _unweighted(problem: Problem) -> Iterator[DecisionRule]:
-    config, targets, policy = problem.config, problem.targets, problem.scorer.policy
-    learned = policy.values is not None and bool(policy.config.max_return)
-    for temperature in sorted(config.temperatures, reverse=True):
-        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
-            yield DecisionRule(target, temperature=temperature)
-            yield DecisionRule(target, minimum_target=target, temperature=temperature)
-        if learned:
-            yield DecisionRule(None, temperature=temperature)
-
-
-def _variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
-    """The rule with every combination of other values of its fields."""
-    others = (replace(rule, **parts) for parts in _grid(**values))
-    return (other for other in others if other != rule)
-
-
-def _grid(**values: Sequence[Any]) -> Iterator[dict[str, Any]]:
-    """Every combination of the values."""
-    return (dict(zip(values, each, strict=True)) for each in product(*values.values()))
+    return [*tried, *search.simulate([*variants(best, **weights)])]
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
@@ -394,6 +405,10 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
         *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
+
+
+def _value(candidate: SimulatedRule) -> float:
+    return candidate.value
 
 
 def _mean(values: Float64Array) -> float:

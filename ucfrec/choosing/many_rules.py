@@ -1,7 +1,7 @@
 """Several decision rules of one policy, rolled out side by side."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,23 @@ _ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
 
 
+@dataclass(frozen=True)
+class Sessions:
+    """What happened in n simulated sessions of one rule."""
+
+    returns: Float64Array
+    """(n,), in reward units."""
+    lengths: IntArray
+    """(n,), steps."""
+    items: IntArray
+    """(M,), all that were shown."""
+
+    def followed_by(self, more: "Sessions") -> "Sessions":
+        """These sessions and more of the same rule."""
+        pairs = zip(vars(self).values(), vars(more).values(), strict=True)
+        return Sessions(*(np.concatenate(pair) for pair in pairs))
+
+
 def roll_out(
     simulator: UserSimulator,
     scorers: Sequence[Scorer],
@@ -29,7 +46,7 @@ def roll_out(
     states: ItemStates,
     observation_size: int,
     seed: int,
-) -> tuple[Float64Array, IntArray, IntArray]:
+) -> list[Sessions]:
     """Simulate sessions by each of C rules of the same policy of items.
 
     Args:
@@ -40,7 +57,7 @@ def roll_out(
         seed: of the draws of each rule.
 
     Returns:
-        Returns (C · n,), lengths (C · n,), and the session and item of every step, (M, 2).
+        The sessions of each rule.
     """
     actor = _ManyRules(scorers, sessions, states, observation_size, seed)
     live = np.arange(len(scorers) * sessions)
@@ -59,7 +76,12 @@ def roll_out(
             if len(going) < len(live):
                 live = live[going]
                 actor.keep(going)
-    return returns, lengths, np.concatenate(shown)
+    numbers, items = np.concatenate(shown).T
+    of_rules = np.split(returns, len(scorers)), np.split(lengths, len(scorers))
+    return [
+        Sessions(mine, steps, items[numbers // sessions == rule])
+        for rule, (mine, steps) in enumerate(zip(*of_rules, strict=True))
+    ]
 
 
 class _ManyRules(PolicyActor):

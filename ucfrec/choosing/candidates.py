@@ -1,4 +1,4 @@
-"""Rules near another one, for a choice that begins where an earlier one ended."""
+"""Candidates for the decision rule: grids, and rules near one that an earlier choice ended with."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -7,6 +7,24 @@ from typing import Any
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.choosing.choice import Problem
+
+
+def unweighted(problem: Problem) -> Iterator[DecisionRule]:
+    """Rules of the policy alone, the highest temperature first."""
+    config, targets, policy = problem.config, problem.targets, problem.scorer.policy
+    learned = policy.values is not None and bool(policy.config.max_return)
+    for temperature in sorted(config.temperatures, reverse=True):
+        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
+            yield DecisionRule(target, temperature=temperature)
+            yield DecisionRule(target, minimum_target=target, temperature=temperature)
+        if learned:
+            yield DecisionRule(None, temperature=temperature)
+
+
+def variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
+    """The rule with every combination of other values of its fields."""
+    others = (replace(rule, **parts) for parts in _grid(**values))
+    return (other for other in others if other != rule)
 
 
 def near(
@@ -60,3 +78,8 @@ def _beside(value: float, values: Sequence[float]) -> list[Any]:
 
 def _middle(values: Sequence[float]) -> float:
     return sorted(values)[len(values) // 2]
+
+
+def _grid(**values: Sequence[Any]) -> Iterator[dict[str, Any]]:
+    """Every combination of the values."""
+    return (dict(zip(values, each, strict=True)) for each in product(*values.values()))

@@ -25,7 +25,9 @@ from ucfrec.fitting.loop import Fit, LoopConfig, RowAdamW, clip_gradients, fit
 from ucfrec.fitting.metrics_log import read_metrics
 
 ROOT = Path(__file__).parents[2]
-FAST = LoopConfig(steps=12, batch_size=4, learning_rate=0.1, warmup_steps=0, validate_every=2)
+FAST = LoopConfig(
+    steps=12, batch_size=4, learning_rate=0.1, warmup_steps=0, validate_every=2, average=0.0
+)
 
 
 def draw(generator: np.random.Generator) -> Tensor:
@@ -178,7 +180,7 @@ def test_the_best_weights_come_back(tmp_path: Path) -> None:
 )
 def test_patience_stops_early(tmp_path: Path, patience: int, steps: int, best: int) -> None:
     config = LoopConfig(
-        steps=16, batch_size=4, learning_rate=0.1, validate_every=2, patience=patience
+        steps=16, batch_size=4, learning_rate=0.1, validate_every=2, patience=patience, average=0.0
     )
     losses = [3.0, 2.0, 2.0, 2.5, 1.9, 2.0, 1.0, 1.5]
     fitted, module, seen = validated(tmp_path, losses, config)
@@ -201,7 +203,7 @@ def test_without_validation_the_last_weights_count(tmp_path: Path) -> None:
 
 
 def test_the_last_step_is_validated_even_if_it_is_odd(tmp_path: Path) -> None:
-    config = LoopConfig(steps=5, batch_size=4, validate_every=2)
+    config = LoopConfig(steps=5, batch_size=4, validate_every=2, average=0.0)
     fitted, _, seen = validated(tmp_path, [3.0, 2.0, 1.0], config)
     assert (fitted.steps, fitted.best_step, len(seen)) == (5, 5, 3)
 
@@ -244,6 +246,7 @@ def test_steps_are_adamw_with_warm_up_and_clipping(
         learning_rate=0.1,
         weight_decay=0.2,
         warmup_steps=5,
+        average=0.0,
         cosine=cosine,
         clip_norm=0.3,
         validate_every=3,

@@ -18,6 +18,7 @@ from ucfrec.runs.start import new_policy, training_views
 SETTINGS = [
     "train.steps=16", "train.validate_every=4", "train.batch_size=16", "train.warmup_steps=2",
     "train.learning_rate=0.02", "policy.dim=16", "policy.context=4", "policy.dropout=0.1",
+    "train.average=0",
 ]  # fmt: skip
 
 

@@ -294,6 +294,7 @@ def _faithful(
         warmup_steps=0,
         clip_norm=0.0,
         validate_every=epoch,
+        average=0.0,
     )
     crm.requires_grad_(False)
     fit(csg, draw, loss, loop, folder, seed=seed, describe="state generator")

@@ -236,6 +236,7 @@ def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
         clip_norm=0.0,
         validate_every=max(epoch, epochs * epoch // _MOST_VALIDATIONS),
         patience=config.patience,
+        average=0.0,
     )
 
 

@@ -67,7 +67,7 @@ class LoopConfig:
     patience: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Number of consecutive validations without improvement after which training stops early; 0
     disables early stopping."""
-    average: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.999
     """Decay of an exponential moving average of the weights, which is validated and saved as the
     trained weights; 0 for the weights of the last step themselves."""
 

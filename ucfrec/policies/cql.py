@@ -144,6 +144,7 @@ def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) 
         learning_rate=config.learning_rate,
         clip_norm=1.0,
         warmup_steps=0,
+        average=0.0,
     )
 
     def draw(generator: np.random.Generator) -> Transitions:

@@ -181,6 +181,7 @@ class UCFPaperPolicy(UCFPolicy):
         "crm.epochs": 40,
         "csg.kind": "faithful",
         "rule.choose": False,
+        "train.average": 0.0,
     }
 
 

@@ -37,6 +37,7 @@ BUDGETS: Final[Mapping[str, Budget]] = {
             "train.learning_rate=1e-3",
             "train.warmup_steps=40",
             "train.validate_every=100",
+            "train.average=0.0",
             "crm.epochs=8",
             "crm.learning_rate=4e-3",
             "rule.sessions=50",

@@ -169,6 +169,7 @@ def complete(
         clip_norm=0.0,
         validate_every=50,
         patience=6,
+        average=0.0,
     )
     with atomic_folder(out) as folder:
         with TemporaryDirectory(dir=folder) as work:

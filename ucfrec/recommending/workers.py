@@ -232,3 +232,7 @@ def _begin(
     parent = Parent(connection, first)
     with suppress(Interrupted), interruptions_raised():
         work(listening, parent)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Ending Python while a thread waits for the parent takes seconds, and libraries complain.
+    os._exit(0)

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -48,7 +48,9 @@ class Parent:
         """Whether this is the one of the workers that says what all would say."""
         self._connection, self._lock = connection, threading.Lock()
         self._server: _Ends | None = None
-        threading.Thread(target=self._watch, name="parent", daemon=True).start()
+        self._closed, self._close = get_context().Pipe(duplex=False)
+        self._thread = threading.Thread(target=self._watch, name="parent", daemon=True)
+        self._thread.start()
 
     def ends(self, server: _Ends) -> None:
         """From now on the parent ends a server; before, it ends the process, which serves no one
@@ -64,12 +66,19 @@ class Parent:
         """Report why the worker cannot start."""
         self._report("failed", why)
 
+    def close(self) -> None:
+        """End the thread that listens to the parent: Python ends in order only without it."""
+        self._close.close()
+        self._thread.join()
+
     def _report(self, news: str, text: str) -> None:
         with suppress(OSError):  # the parent has ended
             self._connection.send((news, text))
 
     def _watch(self) -> None:
         for force in (False, True):
+            if self._closed in wait([self._connection, self._closed]):
+                return
             try:
                 self._connection.recv()
             except (EOFError, OSError):
@@ -230,9 +239,5 @@ def _begin(
     """A worker's process."""
     os.environ[METRICS] = folder  # prometheus_client reads it when it is imported
     parent = Parent(connection, first)
-    with suppress(Interrupted), interruptions_raised():
+    with closing(parent), suppress(Interrupted), interruptions_raised():
         work(listening, parent)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    # Ending Python while a thread waits for the parent takes seconds, and libraries complain.
-    os._exit(0)

@@ -98,8 +98,8 @@ def test_ctrl_c_reaches_workers_by_their_parent_and_a_second_one_hurries_them() 
     assert (printed, errors) == ("forced\nforced\n", "")
 
 
-def test_workers_end_in_order_when_their_parent_is_killed() -> None:
-    with light("answer") as (process, _):
+def test_workers_end_in_order_when_their_parent_is_killed(tmp_path: Path) -> None:
+    with light("answer", TMPDIR=str(tmp_path)) as (process, _):  # it leaves a folder there
         workers = workers_of(process.pid)
         process.kill()
         printed, errors = process.communicate(timeout=60)  # the workers hold stdout until they end

@@ -4,8 +4,9 @@
 
 Starts the server on a free port of the loopback interface, with further options such as
 `--reward-weight 2`, and asks it with wrk where that is installed, otherwise with httpx: one client
-first, then many. Appends a row for each number of clients and prints a table. Client and server
-share the cores; the CPU time of either, unlike the rate, hardly depends on what else these do.
+first, then many; then the same with each further number of workers. Appends a row for each number
+of clients and prints a table. Requests/s are of wall time. Client and server share the cores; the
+CPU time of either, unlike the rate, hardly depends on what else these do.
 """
 
 import argparse
@@ -132,10 +133,26 @@ def measured(address: str, body: bytes, clients: int, seconds: float) -> dict[st
     return found
 
 
+def measurements(
+    run: Path, options: argparse.Namespace, workers: int, rule: list[str]
+) -> Iterator[tuple[int, dict[str, float], float]]:
+    """For each number of clients: what is measured, and the seconds that it took."""
+    trained = TrainedPolicy.load(run)
+    body = request(trained, options.history)
+    how = ["--workers", str(workers), "--threads", str(options.threads), *rule]
+    with served(run, *how) as address:
+        measured(address, body, 4 * workers, options.seconds)  # warms the server up
+        for clients in options.clients:
+            began = time.perf_counter()
+            found = measured(address, body, clients, options.seconds)
+            yield clients, found, time.perf_counter() - began
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 64])
+    parser.add_argument("--workers", type=int, nargs="+", default=[1], help="(default: 1)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each (default: 10)")
     parser.add_argument("--history", type=int, default=20, help="rows of a request (default: 20)")
     parser.add_argument("--threads", type=int, default=1, help="of a forward pass (default: 1)")
@@ -144,15 +161,12 @@ def main() -> None:
     )
     options, rule = parser.parse_known_args()
     trained = TrainedPolicy.load(options.run)
-    body, tool = request(trained, options.history), "wrk" if shutil.which("wrk") else "httpx"
+    tool = "wrk" if shutil.which("wrk") else "httpx"
     assert trained.item_ids is not None
     lines = list[tuple[object, ...]]()
-    with served(options.run, "--threads", str(options.threads), *rule) as address:
-        measured(address, body, 1, options.seconds)  # warms the server up
-        for clients in options.clients:
-            began = time.perf_counter()
-            found = measured(address, body, clients, options.seconds)
-            lines.append((clients, *(f"{value:,.4g}" for value in found.values())))
+    for workers in options.workers:
+        for clients, found, wall_time_s in measurements(options.run, options, workers, rule):
+            lines.append((workers, clients, *(f"{value:,.4g}" for value in found.values())))
             row = ResultRow(
                 suite="serve-load",
                 table="serve-load",
@@ -161,6 +175,7 @@ def main() -> None:
                 policy=trained.name,
                 conditions={
                     "clients": clients,
+                    "workers": workers,
                     "history": options.history,
                     "threads": options.threads,
                     "seconds": options.seconds,
@@ -169,11 +184,11 @@ def main() -> None:
                 data_fingerprint=trained.record.fingerprint,
                 metric="rate",
                 metrics=found,
-                wall_time_s=time.perf_counter() - began,
+                wall_time_s=wall_time_s,
                 **provenance(),
             )
             append_rows(options.results, [row])
-    heads = ("clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
+    heads = ("workers", "clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
     print(markdown_table((*heads, "CPU of the server, ms", "of the client, ms"), lines))
 
 

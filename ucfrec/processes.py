@@ -113,6 +113,13 @@ def interruptions_raised() -> Iterator[None]:
 @contextmanager
 def without_ctrl_c() -> Iterator[None]:
     """Processes that are started in the block are not reached by Ctrl-C; their parent ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Starting the first process starts the tracker, too, which lets Ctrl-C through again.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -157,5 +157,5 @@ def test_unknown_items_and_users_are_counted(folder: Path) -> None:
     requests = [{"user_id": user, "history": rows} for user in (100, "nobody")]
     by.answers([Request.model_validate(each) for each in requests])
     found = by.drift()
-    assert found["unknown_items"] == pytest.approx(1 / 3)
-    assert found["unknown_users"] == pytest.approx(1 / 2)
+    assert found["unknown_items"].value == pytest.approx(1 / 3)
+    assert found["unknown_users"].value == pytest.approx(1 / 2)

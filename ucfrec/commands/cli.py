@@ -84,7 +84,7 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     debug = "--debug" in (sys.argv[1:] if arguments is None else arguments)
     name = program.name
     try:
-        with interruptions_raised(), _notes_on_one_line(program.name):
+        with interruptions_raised(), notes_on_one_line(program.name):
             arguments = sys.argv[1:] if arguments is None else arguments
             options = build_parser(program, arguments).parse_args(arguments)
             name = f"{program.name} {options.command}"
@@ -153,7 +153,7 @@ _NO_SPACE: Final = ("No space left on device", "Disk quota exceeded", "File too 
 
 
 @contextmanager
-def _notes_on_one_line(name: str) -> Iterator[None]:
+def notes_on_one_line(name: str) -> Iterator[None]:
     """Print each `InputNote` as one line on stderr; other warnings as always."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", InputNote)

@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     """
     try:
         from ucfrec.exploring.web import application
-        from ucfrec.recommending.server import Server, listening_socket, server_config
+        from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
     except ModuleNotFoundError as error:
         raise InputError(
             f"exploring needs {error.name}, which is not installed; install ucfrec[serve]"
@@ -64,6 +64,6 @@ def run(options: argparse.Namespace) -> None:
     config = server_config(application(explorer, _OWN_NAMES))
     with listening_socket("127.0.0.1", options.port) as listening:
         try:
-            Server(config, "ucfrec explore", page="/").run([listening])
+            PrintingServer(config, "ucfrec explore", page="/").run([listening])
         except Interrupted:
             print("ucfrec explore: stopped", file=sys.stderr)

@@ -2,9 +2,13 @@
 
 import argparse
 import sys
-from contextlib import closing
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.commands.options import (
     draw_options,
@@ -15,14 +19,19 @@ from ucfrec.commands.options import (
     responder_given,
     rule_options,
 )
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.processes import Interrupted
 
 if TYPE_CHECKING:
-    from ucfrec.recommending.exposures import ExposureLog
+    import socket
+
+    import uvicorn
+
     from ucfrec.recommending.responder import Responder
-    from ucfrec.recommending.served import Served
-    from ucfrec.recommending.web import ServerLimits
+    from ucfrec.recommending.workers import Parent
+
+
+_STOPPED: Final = "ucfrec serve: stopped"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +68,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     item_options(parser)
     parser.add_argument(
-        "--threads", type=int, metavar="N", help="of a forward pass (default: one per core)"
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processes that answer on the address, each with the run in its memory (default: 1)",
+    )
+    parser.add_argument(
+        "--threads",
+        type=int,
+        metavar="N",
+        help="of a forward pass (default: one per core, divided by --workers)",
     )
     rule_options(parser)
     draw_options(parser, "DIR")
@@ -84,22 +103,61 @@ def run(options: argparse.Namespace) -> None:
         InputError: the run cannot be used or has no checksums, a file of it was changed, the extra
             `serve` is not installed, or the address cannot be listened on.
     """
+    from ucfrec.recommending.workers import MOST, Workers
+
+    if not 1 <= options.workers <= MOST:
+        raise InputError(f"--workers is {options.workers}; give a number from 1 to {MOST}")
     try:
-        from ucfrec.recommending.web import ServerLimits
+        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"serving needs {error.name}, which is not installed; install ucfrec[serve]"
-        ) from None
+        raise _missing(error) from None
+    address = listening_socket(options.host, options.port)
+    if options.workers == 1:
+        _serve(options, address, PrintingServer)
+        return
+    with address as listening, Workers(partial(_work, options), listening) as workers:
+        what = workers.start(options.workers)
+        print(ready_line(what, listening), flush=True)
+        try:
+            workers.keep()
+        except Interrupted:
+            workers.end()
+            print(_STOPPED, file=sys.stderr)
+
+
+def _missing(error: ModuleNotFoundError) -> InputError:
+    return InputError(f"serving needs {error.name}, which is not installed; install ucfrec[serve]")
+
+
+def _serve(
+    options: argparse.Namespace,
+    address: "AbstractContextManager[socket.socket]",
+    server: "Callable[[uvicorn.Config, str], uvicorn.Server]",
+) -> None:
+    """Answer requests in this process.
+
+    Args:
+        server: makes the server, given what it answers with.
+    """
+    try:
+        from ucfrec.recommending.web import ServerLimits, application
+    except ModuleNotFoundError as error:
+        raise _missing(error) from None
     import torch
 
     from ucfrec.recommending.served import Served, parse_split
+    from ucfrec.recommending.server import server_config
     from ucfrec.runs.record import RUN, verified
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    if options.threads is not None:
-        if options.threads < 1:
-            raise InputError(f"--threads is {options.threads}; give 1 or more")
-        torch.set_num_threads(options.threads)
+    several = options.workers > 1
+    threads = options.threads
+    if threads is None and several:
+        threads = max(1, torch.get_num_threads() // options.workers)
+    if threads is not None:
+        if threads < 1:
+            raise InputError(f"--threads is {threads}; give 1 or more")
+        torch.set_num_threads(threads)
     of_server = ServerLimits(
         batch=options.max_batch, queue=options.max_queue, timeout=options.timeout
     )
@@ -118,28 +176,40 @@ def run(options: argparse.Namespace) -> None:
     ):
         if shares is None:
             served.follow()
-        _serve(options, served, of_server, exposures)
+        config = server_config(
+            application(served, of_server, _allowed_hosts(options), exposures, several),
+            timeout_graceful_shutdown=int(of_server.timeout) + 1,
+            workers=options.workers,
+        )
+        with address as listening:
+            try:
+                server(config, f"ucfrec serve: {served.trained!r}").run([listening])
+            except Interrupted:
+                # What was asked of a server that is stopped is done.
+                if not several:
+                    print(_STOPPED, file=sys.stderr)
 
 
-def _serve(
-    options: argparse.Namespace,
-    served: "Served",
-    of_server: "ServerLimits",
-    exposures: "ExposureLog | None",
-) -> None:
-    from ucfrec.recommending.server import Server, listening_socket, server_config
-    from ucfrec.recommending.web import application
+def _work(options: argparse.Namespace, listening: "socket.socket", parent: "Parent") -> None:
+    """Answer requests in one of several processes."""
+    from ucfrec.commands.cli import explanation, notes_on_one_line
+    from ucfrec.recommending.server import Server
 
-    config = server_config(
-        application(served, of_server, _allowed_hosts(options), exposures),
-        timeout_graceful_shutdown=int(of_server.timeout) + 1,
-    )
-    with listening_socket(options.host, options.port) as listening:
-        try:
-            Server(config, f"ucfrec serve: {served.trained!r}").run([listening])
-        except Interrupted:
-            # What was asked of a server that is stopped is done.
-            print("ucfrec serve: stopped", file=sys.stderr)
+    def server(config: "uvicorn.Config", what: str) -> Server:
+        made = Server(config, lambda _: parent.ready(what))
+        parent.ends(made)
+        return made
+
+    try:
+        with notes_on_one_line("ucfrec serve"):
+            if not parent.first:
+                warnings.simplefilter("ignore", InputNote)
+            _serve(options, listening, server)
+    except Exception as error:
+        why = explanation(error)
+        if why is None:
+            traceback.print_exc()
+        parent.failed(why or "a worker has a defect; see the traceback")
 
 
 _OWN_NAMES = ("localhost", "127.0.0.1", "::1")

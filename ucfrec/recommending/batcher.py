@@ -21,9 +21,11 @@ class Answers(Protocol):
 
 
 class Watcher(Protocol):
-    """Receives every batch."""
+    """Receives every batch, and how many requests wait whenever that changes."""
 
     def batch(self, requests: int, seconds: float) -> None: ...
+
+    def waiting(self, requests: int) -> None: ...
 
 
 class QueueFullError(Exception):
@@ -46,7 +48,7 @@ class Batcher:
         """
         Args:
             answers: computes a batch.
-            watcher: receives every batch.
+            watcher: receives what happens.
             largest: most requests of a batch.
             queue: most requests that wait.
         """
@@ -55,11 +57,6 @@ class Batcher:
         self._queue: deque[_Waiting] = deque()
         self._thread = ThreadPoolExecutor(1, "forward")
         self._running: asyncio.Task[None] | None = None
-
-    @property
-    def waiting(self) -> int:
-        """Requests that wait for a forward pass."""
-        return len(self._queue)
 
     async def answer(self, request: Request) -> Outcome:
         """The answer to a request, or what is wrong with it; a cancelled one has no one waiting.
@@ -71,6 +68,7 @@ class Batcher:
             raise QueueFullError
         outcome: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._queue.append(_Waiting(request, outcome))
+        self._watcher.waiting(len(self._queue))
         if self._running is None or self._running.done():
             self._running = asyncio.create_task(self._run())
         return await outcome
@@ -107,4 +105,5 @@ class Batcher:
             waiting = self._queue.popleft()
             if not waiting.outcome.done():
                 batch.append(waiting)
+        self._watcher.waiting(len(self._queue))
         return batch

@@ -52,6 +52,18 @@ class Answer(NamedTuple):
         return {"user_id": exact_id(user_id), **names, "items": items}
 
 
+class Mean(NamedTuple):
+    """A mean that can be pooled with those of other processes."""
+
+    total: float
+    weight: float
+
+    @property
+    def value(self) -> float:
+        """The mean; 0 if it is of nothing."""
+        return self.total / self.weight if self.weight else 0.0
+
+
 def exact_id(given: int | str) -> int | str:
     """An identifier for JSON: as text if a client that reads numbers as doubles would round it."""
     return str(given) if isinstance(given, int) and abs(given) > _LARGEST_EXACT else given
@@ -130,20 +142,15 @@ class Responder:
         self._busy = threading.Lock()
         self._requests, self._rows = [0, 0], [0, 0]
 
-    def drift(self) -> dict[str, float]:
+    def drift(self) -> dict[str, Mean]:
         """Share of unknown items among rows of histories, and of unknown users among requests, so
         far; and the drift that the run's update found, as `update_…`."""
         update = self.trained.record.update
         found = {
-            f"update_{name}": float(value)
+            f"update_{name}": Mean(float(value), 1.0)
             for name, value in ((update and update.drift) or {}).items()
         }
-        for name, (unknown, every) in (
-            ("unknown_items", self._rows),
-            ("unknown_users", self._requests),
-        ):
-            found[name] = unknown / max(every, 1)
-        return found
+        return found | {"unknown_items": Mean(*self._rows), "unknown_users": Mean(*self._requests)}
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""

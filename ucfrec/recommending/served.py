@@ -12,7 +12,7 @@ import xxhash
 
 from ucfrec.errors import InputError
 from ucfrec.recommending.requests import Limits, Request
-from ucfrec.recommending.responder import Answer, Responder
+from ucfrec.recommending.responder import Answer, Mean, Responder
 from ucfrec.runs.promoted import promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -131,7 +131,7 @@ class Served:
             found["refused"] = dict(zip(("name", "error"), self._refused, strict=True))
         return found
 
-    def drift(self) -> dict[str, float]:
+    def drift(self) -> dict[str, Mean]:
         """See `Responder.drift`; of the first arm."""
         return self._arms[0].responder.drift()
 

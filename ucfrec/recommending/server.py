@@ -1,7 +1,7 @@
 """The web server's process: how and where it listens, and saying that it is ready."""
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -49,17 +49,33 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         yield bound
 
 
-class Server(uvicorn.Server):
-    """A server that says on stdout when it is ready, and where."""
+def ready_line(what: str, listening: socket.socket, page: str = "/docs") -> str:
+    """What is printed on stdout when a server is ready."""
+    host, port = listening.getsockname()[:2]
+    where = f"[{host}]" if ":" in host else host
+    return f"{what}, ready at http://{where}:{port} (page: {page})"
 
-    def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
+
+class Server(uvicorn.Server):
+    """A server that reports when it is ready."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[socket.socket], None]) -> None:
+        """
+        Args:
+            ready: is called with the socket on which requests are answered from now on.
+        """
         super().__init__(config)
-        self._what, self._page = what, page
+        self._ready = ready
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen."""
         await super().startup(sockets)
         for each in sockets or []:
-            host, port = each.getsockname()[:2]
-            where = f"[{host}]" if ":" in host else host
-            print(f"{self._what}, ready at http://{where}:{port} (page: {self._page})", flush=True)
+            self._ready(each)
+
+
+class PrintingServer(Server):
+    """A server that says on stdout when it is ready, and where."""
+
+    def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
+        super().__init__(config, lambda at: print(ready_line(what, at, page), flush=True))

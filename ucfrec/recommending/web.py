@@ -5,7 +5,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from ipaddress import IPv6Address
 from typing import Annotated, Any, Final
@@ -13,15 +13,7 @@ from typing import Annotated, Any, Final
 from fastapi import FastAPI, Response
 from fastapi import Request as HTTPRequest
 from fastapi_offline import FastAPIOffline
-from prometheus_client import (
-    CONTENT_TYPE_LATEST,
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    ProcessCollector,
-    generate_latest,
-)
+from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -33,13 +25,12 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.exposures import ExposureLog
+from ucfrec.recommending.metrics import ServingMetrics
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.served import Served
 from ucfrec.settings import settings_table
 
-_SECONDS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-_SIZES: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
 _PATH: Final = "/recommendations"
 _JSON: Final = "application/json"
@@ -85,70 +76,6 @@ _MOST_HEADER_BYTES: Final = 2**16
 whole by then."""
 _HUNG_UP: Final = 499
 """For the metrics, as no client receives it; nginx calls it so."""
-
-
-class ServingMetrics:
-    """What one server has done, in a registry of its own."""
-
-    def __init__(self) -> None:
-        self._registry = CollectorRegistry()
-        ProcessCollector(registry=self._registry)
-        self._requests = Counter(
-            "ucfrec_requests",
-            "Requests for recommendations, by HTTP status.",
-            ["status"],
-            registry=self._registry,
-        )
-        self._seconds = Histogram(
-            "ucfrec_request_seconds",
-            "Time from the request's first byte to its answer.",
-            buckets=_SECONDS,
-            registry=self._registry,
-        )
-        self._sizes = Histogram(
-            "ucfrec_batch_requests",
-            "Requests of a forward pass.",
-            buckets=_SIZES,
-            registry=self._registry,
-        )
-        self._passes = Histogram(
-            "ucfrec_batch_seconds",
-            "Time of reading and scoring the requests of a forward pass.",
-            buckets=_SECONDS,
-            registry=self._registry,
-        )
-        self.waiting = Gauge(
-            "ucfrec_waiting_requests",
-            "Requests that wait for a forward pass.",
-            registry=self._registry,
-        )
-
-        self.drift: Callable[[], Mapping[str, float]] = dict
-        """Returns what is different in requests, or in the logs of the last update, by name."""
-        self._drift = Gauge(
-            "ucfrec_drift",
-            "Unknown items and users of requests, shares since the run began to answer; and the "
-            "drift that the run's update found (update_…).",
-            ["measure"],
-            registry=self._registry,
-        )
-
-    def request(self, status: int, seconds: float) -> None:
-        """Count a request that was answered."""
-        self._requests.labels(str(status)).inc()
-        self._seconds.observe(seconds)
-
-    def batch(self, requests: int, seconds: float) -> None:
-        """Count a forward pass."""
-        self._sizes.observe(requests)
-        self._passes.observe(seconds)
-
-    def text(self) -> bytes:
-        """All metrics in Prometheus' text format."""
-        self._drift.clear()
-        for name, value in self.drift().items():
-            self._drift.labels(name).set(value)
-        return generate_latest(self._registry)
 
 
 @settings_table("")
@@ -219,6 +146,7 @@ def application(
     limits: ServerLimits,
     allowed_hosts: Sequence[str] = ("*",),
     exposures: ExposureLog | None = None,
+    shared_metrics: bool = False,
 ) -> FastAPI:
     """The application of one model; it keeps no state but the model and its metrics.
 
@@ -226,15 +154,14 @@ def application(
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
             addresses, *.example.org for all names below, or * for any.
         exposures: gets every answer; None for none.
+        shared_metrics: `/metrics` has the totals of several processes; see `ServingMetrics`.
 
     Raises:
         InputError: a host is written otherwise.
     """
     hosts = [_host(each) for each in allowed_hosts]
-    metrics = ServingMetrics()
+    metrics = ServingMetrics(responder.drift, shared_metrics)
     batcher = Batcher(responder, metrics, limits.batch, limits.queue)
-    metrics.waiting.set_function(lambda: batcher.waiting)
-    metrics.drift = responder.drift
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

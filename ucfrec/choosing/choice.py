@@ -54,7 +54,7 @@ class RuleConfig:
     """Candidates for how often in a row one main tag may be liked, where the log shows that more
     causes fatigue."""
     sessions: Count = 100
-    """Sessions simulated of each candidate."""
+    """Sessions simulated of each candidate; a quarter of them of those that are far behind then."""
     least_impressions: Count = 10
     """Training impressions from which on the log supports an item."""
     least_support: Share = 0.9

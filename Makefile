@@ -6,8 +6,9 @@ PIP_FLAGS ?=
 BIN := .venv/bin
 PIP ?= $(BIN)/pip
 # Files of tests side by side, one per core; a file stays whole, so that what its tests share is made
-# once. One thread each, or the workers' linear algebra fights over the cores.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
+# once. One thread each, or the workers' linear algebra fights over the cores. Compiled modules are
+# kept: every command that a test starts would compile them again, and every worker the tests.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --dist loadfile --durations 30
 
 .PHONY: demo test test-slow torture lint types docs wheel clean
 

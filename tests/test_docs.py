@@ -58,7 +58,8 @@ def test_the_commands_parse(page: str, command: str) -> None:
 @pytest.mark.parametrize(
     ("page", "code"),
     [
-        (page.name, code)
+        # Code that trains is the whole job, end to end.
+        pytest.param(page.name, code, marks=[pytest.mark.slow] if ".fit(" in code else [])
         for page in PAGES[1:]
         for code in page.code("python")
         if not code.startswith("--8<--")  # a file with tests of its own

@@ -11,6 +11,7 @@ from tests.support.markdown import ROOT, Page, parse, run_python
 README = Page("README.md")
 
 
+@pytest.mark.slow
 def test_the_python_example_prints_what_is_shown(tmp_path: Path) -> None:
     (code,) = README.code("python")
     assert len([line for line in code.splitlines() if line.strip()]) == 10

@@ -44,9 +44,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sessions = str(logs / "sessions.parquet")
         feedback = load_plugin("simulators", environment).feedback
         assert main(["prepare", sessions, "--out", str(store), "--reward", feedback]) == 0
-        run = str(folder / f"{environment}-run")
-        assert main(["train", str(store), "--out", run, *settings()]) == 0
+    trained_on(folder, "synthetic-catalog")
     return folder
+
+
+def trained_on(folder: Path, environment: str) -> str:
+    """The run on one of the stores."""
+    run, store = str(folder / f"{environment}-run"), str(folder / f"{environment}-store")
+    assert main(["train", store, "--out", run, *settings()]) == 0
+    return run
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -79,7 +85,7 @@ def test_evaluate_writes_the_rows_it_prints(
     folder: Path, environment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "rows.json"
-    run = str(folder / f"{environment}-run")
+    run = trained_on(folder, environment)
     arguments = ["evaluate", run, "--env", environment, "--episodes", "10", "--seed", "7"]
     arguments += ["--behavior", "random", "--json", str(out)]
     assert main(arguments) == 0
@@ -398,7 +404,9 @@ def test_score_and_ope_refuse_what_they_cannot_use(
     log.drop(columns="observation").to_parquet(blind)
     out = str(tmp_path / "out")
     assert "not a density" in refused(["ope", run, density, "--json", out], capsys)
-    vectors = str(folder / "synthetic-taobao-run")
+    vectors = str(tmp_path / "vectors")
+    store = str(folder / "synthetic-taobao-store")
+    assert main(["train", store, "--out", vectors, "--policy", "bc", *settings()]) == 0
     for command, to in (("score", "--out"), ("ope", "--json")):
         assert "item is not in the store" in refused([command, run, other, to, out], capsys)
         assert "observations of 16 numbers" in refused([command, run, blind, to, out], capsys)

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import rankdata
 
-from ucfrec.results.statistics import group_auc, grouped, ratio_with_error, summary
+from ucfrec.results.statistics import average_ranks, group_auc, grouped, ratio_with_error, summary
 
 
 def test_the_spread_is_that_of_a_sample() -> None:
@@ -29,6 +30,12 @@ def test_groups_keep_the_order_in_which_they_come() -> None:
         ("a", ["A", "a"]),
         ("c", ["c"]),
     ]
+
+
+def test_ranks_of_equal_values_are_their_mean() -> None:
+    rng = np.random.default_rng(0)
+    for values in (rng.integers(5, size=40), rng.normal(size=40), np.array([np.inf, -np.inf, 0.0])):
+        np.testing.assert_array_equal(average_ranks(values), rankdata(values))
 
 
 def test_group_auc_is_the_mean_over_pairs_of_a_user() -> None:

@@ -115,6 +115,8 @@ def test_all_items_at_once_end_sessions_as_each_alone() -> None:
     every = torch.arange(ITEMS).expand(400, -1)
     rewards = rewards.unsqueeze(1).expand(-1, ITEMS)
     (together,) = end.of_items(logged.shown, every, [rewards], steps)
+    two = end.of_items(logged.shown, every, [torch.zeros_like(rewards), rewards], steps)
+    assert torch.equal(two[1], together)
     for item in range(ITEMS):
         alone = end.probabilities(
             *(logged.shown, torch.full((400,), item), logged.rewards, logged.steps)

@@ -209,13 +209,18 @@ class Likeness(nn.Module):
         return _read(nn.functional.pad(profile, (0, 1)), self.tags[items[:, 0]]).sum(1)
 
     def to_candidates(self, profile: Tensor, items: Tensor) -> Tensor:
-        """Likeness (M, C) to profiles (M, F) of items (M, C)."""
+        """Likeness (M, C) to profiles (M, F) of items (M, C); to (M, L, F) it is (M, L, C)."""
+        if profile.dim() == 2:
+            return self.to_candidates(profile.unsqueeze(1), items).squeeze(1)
+        shape = *profile.shape[:2], items.shape[1]
         if not self.tags.shape[1]:
-            return torch.einsum("mf,mcf->mc", profile, self.directions[items])
+            every = self.directions[items].unsqueeze(1).expand(-1, shape[1], -1, -1)
+            flat = torch.einsum("mf,mcf->mc", profile.flatten(0, 1), every.flatten(0, 1))
+            return flat.view(shape)
         tags = self.tags[items]
-        places = torch.where(tags < 0, self._count(), tags)
-        read = nn.functional.pad(profile, (0, 1)).gather(1, places.flatten(1))
-        return read.view(tags.shape).sum(2)
+        places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
+        read = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
+        return read.view(*shape, tags.shape[2]).sum(3)
 
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""

@@ -13,7 +13,6 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from scipy.stats import rankdata
 from torch import Tensor
 
 from ucfrec import schema
@@ -24,7 +23,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.session_metrics import resampled_ratios
-from ucfrec.results.statistics import group_auc
+from ucfrec.results.statistics import average_ranks, group_auc
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
@@ -169,7 +168,7 @@ def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArr
 
 def _ranked_alike(scores: Tensor, shown: IntArray, k: int) -> tuple[Float64Array, IntArray]:
     """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
-    ranks = rankdata(-scores.double().numpy(), method="average")
+    ranks = average_ranks(-scores.double().numpy())
     top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
     return ranks[shown], top
 

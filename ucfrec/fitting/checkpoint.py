@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -10,6 +10,7 @@ import xxhash
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file
@@ -198,10 +199,29 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 def _shapes(build: Callable[[], nn.Module]) -> dict[str, torch.Size]:
     """Shapes of a module's weights, without memory for them; none if its constructor needs some."""
     try:
-        with torch.device("meta"):
+        with torch.device("meta"), _Unfilled():
             return {name: tensor.shape for name, tensor in build().state_dict().items()}
     except NotImplementedError:
         return {}
+
+
+class _Unfilled(TorchFunctionMode):
+    """Fills no weights: where they have no memory, torch imports its compiler to draw normal
+    numbers, and sympy to space numbers evenly, which takes as long as importing torch itself."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        given = kwargs or {}
+        if func in (nn.init.normal_, Tensor.normal_):
+            return args[0] if args else given["tensor"]
+        if func is torch.linspace:
+            return torch.empty(given["steps"] if "steps" in given else args[2])
+        return func(*args, **given)
 
 
 def load_weights(path: Path, module: nn.Module, tensors: dict[str, Tensor]) -> None:

@@ -7,10 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.proto.summary_pb2 import Summary
-
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 
@@ -122,6 +118,10 @@ class Events:
     """
 
     def __init__(self, folder: Path, start: int) -> None:
+        # Not above: it imports boto3 if that is installed, and most commands only read metrics.
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
         # tensorboardX names files by the second; the suffix keeps a quick resumption from reusing
         # the name.
         self._writer = EventsWriter(str(folder / "events"), f".{start:09d}")
@@ -131,6 +131,9 @@ class Events:
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
         """Log named scalars."""
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
+
         values = [Summary.Value(tag=name, simple_value=x) for name, x in scalars.items()]
         summary = Summary(value=values)
         self._writer.write_event(Event(wall_time=time.time(), step=step, summary=summary))

@@ -54,6 +54,16 @@ def effective_number(weights: Float64Array) -> float:
     return float(shares.sum() ** 2 / (shares**2).sum())
 
 
+def average_ranks(values: Array) -> Float64Array:
+    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean.
+
+    As `scipy.stats.rankdata`; that module takes a second to import.
+    """
+    _, level, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks: Float64Array = (counts.cumsum() - (counts - 1) / 2)[level]
+    return ranks
+
+
 def group_auc(
     scores: Float64Array, liked: BoolArray, owner: Array, n_users: int
 ) -> tuple[Float64Array, Float64Array]:
@@ -71,12 +81,10 @@ def group_auc(
     Returns:
         Two arrays (U,).
     """
-    from scipy.stats import rankdata
-
     sizes = np.bincount(owner, minlength=n_users)
     _, level = np.unique(scores, return_inverse=True)
     # Ranks within users: ranks of (user, score) minus the number of steps of earlier users.
-    ranks = rankdata(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
+    ranks = average_ranks(owner * len(scores) + level) - (np.cumsum(sizes) - sizes)[owner]
     positive = np.bincount(owner, liked, minlength=n_users)
     negative = sizes - positive
     above = np.bincount(owner, ranks * liked, minlength=n_users) - positive * (positive + 1) / 2

@@ -242,12 +242,17 @@ class SessionEnd:
         batch, count = items.shape
         lately = F.pad(shown.items[:, :_LAGS], (0, max(0, _LAGS - shown.items.shape[1])), value=-1)
         profiles = self.likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
-        every = items.unsqueeze(1).expand(-1, _LAGS, -1).reshape(-1, count)
-        alike = self.likeness.to_candidates(profiles, every).view(batch, _LAGS, count)
+        alike = self.likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
         repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
-        inputs = [_columns(alike, repeated, each, steps.unsqueeze(1)) for each in rewards]
-        ends = torch.sigmoid(self._log_odds(torch.cat(inputs).flatten(0, 1)))
-        return [*ends.view(-1, batch, count).unbind(0)]
+        number = steps.unsqueeze(1)
+        if self._trees is None:
+            inputs = [torch.stack(_columns(alike, repeated, each, number), -1) for each in rewards]
+            odds = self._log_odds(torch.cat(inputs).flatten(0, 1))
+            return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
+        columns = torch.stack(_columns(alike, repeated, rewards[0], number)).flatten(1)
+        given = [each.flatten() for each in rewards]
+        odds_of_each = self._trees.with_values(columns.T, _REWARD, given)
+        return [torch.sigmoid(each).view(batch, count) for each in odds_of_each]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""
@@ -301,15 +306,15 @@ def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:
     shown, items = logged.shown, logged.items.unsqueeze(1)
     alike = [likeness.to_items(_profile(likeness, shown, lag), items) for lag in range(_LAGS)]
     rewards, steps = torch.from_numpy(logged.rewards), torch.from_numpy(logged.steps)
-    return _columns(torch.stack(alike, 1), shown.items == items, rewards, steps)
+    return torch.stack(_columns(torch.stack(alike, 1), shown.items == items, rewards, steps), -1)
 
 
-def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> Tensor:
-    """Inputs (M, ..., F) from likeness (M, 10, ...) and repetition (M, L, ...), latest first."""
+def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> list[Tensor]:
+    """F inputs (M, ...) from likeness (M, 10, ...) and repetition (M, L, ...), latest first."""
     numbers = steps.double().expand(rewards.shape)
     columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
     alike = (alike.double() / _STEP).round() * _STEP
     columns += [*alike.unbind(1)]
     columns += [alike[:, :reach].amax(1) for reach in (2, 3, 4, _LAGS)]
     columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _LAGS)]
-    return torch.stack(columns, -1)
+    return columns

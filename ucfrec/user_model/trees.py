@@ -1,6 +1,6 @@
 """Gradient-boosted trees, fitted by scikit-learn and kept as tensors: data, never a program."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Self
 
@@ -44,6 +44,8 @@ class BoostedTrees:
     """Input and threshold (U,) of the different splits."""
     _bits: Tensor = field(init=False)
     """(T, U) float32 bits of the columns' numbers that a split stands for."""
+    _places: dict[int, slice] = field(init=False)
+    """Where the splits of an input are among the different splits."""
 
     @classmethod
     def fit(cls, inputs: Array, target: Array, seed: int) -> Self:
@@ -91,17 +93,46 @@ class BoostedTrees:
         pairs = torch.stack([self.inputs.double(), self.thresholds], 2).flatten(0, 1)
         splits, which = torch.unique(pairs, dim=0, return_inverse=True)
         bits = torch.zeros(len(self.inputs), len(splits))
-        numbers = (2.0 ** torch.arange(self.inputs.shape[1])).expand(self.inputs.shape)
-        bits.scatter_add_(1, which.view(self.inputs.shape), numbers)
-        object.__setattr__(self, "_splits", (splits[:, 0].long(), splits[:, 1:]))
+        powers = (2.0 ** torch.arange(self.inputs.shape[1])).expand(self.inputs.shape)
+        bits.scatter_add_(1, which.view(self.inputs.shape), powers)
+        numbers = splits[:, 0].long()
+        present, counts = (each.tolist() for each in numbers.unique(return_counts=True))
+        ends = np.cumsum(counts).tolist()
+        places = {i: slice(end - n, end) for i, n, end in zip(present, counts, ends, strict=True)}
+        object.__setattr__(self, "_places", places)
+        object.__setattr__(self, "_splits", (numbers, splits[:, 1:]))
         object.__setattr__(self, "_bits", bits)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Log-odds (M,) float64 from inputs (M, F)."""
+        return self._sums(self._bits @ self._at_most(inputs))
+
+    def with_values(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:
+        """Log-odds (M,) as from `inputs` with one of them replaced by each of some values (M,).
+
+        Args:
+            inputs: (M, F); fastest as the transpose of columns (F, M).
+            number: of the input that is replaced.
+        """
+        own = self._places.get(number, slice(0, 0))
+        at_most = self._at_most(inputs)
+        at_most[own] = 0.0
+        others, bits, thresholds = self._bits @ at_most, self._bits[:, own], self._splits[1][own]
+        return [
+            self._sums(others + bits @ (each.double() <= thresholds).float()) for each in values
+        ]
+
+    def _at_most(self, inputs: Tensor) -> Tensor:
+        """(U, M) float32, 1 where the input of a split is at most its threshold."""
         numbers, thresholds = self._splits
-        at_most = inputs.double().T[numbers] <= thresholds
-        # Sums of a few powers of two are exact in float32.
-        return self.base + self.leaves.gather(1, (self._bits @ at_most.float()).long()).sum(0)
+        return (inputs.double().T[numbers] <= thresholds).float()
+
+    def _sums(self, columns: Tensor) -> Tensor:
+        """The trees' sum (M,) from the numbers of their columns (T, M).
+
+        These are sums of a few powers of two, which are exact in float32.
+        """
+        return self.base + self.leaves.gather(1, columns.long()).sum(0)
 
 
 def _table(nodes: Array) -> tuple[Array, Array, Array]:

@@ -1,6 +1,6 @@
 """Can the log evaluate the decision rule that `train` chooses by default?
 
-    python benchmarks/evaluable_rule.py --out FOLDER [--replications 20]
+    python benchmarks/evaluable_rule.py --out FOLDER [--replications 30]
 
 Each replication collects a log of the catalogue by a softmax policy, with exact propensities,
 trains on it, lets `ope` estimate the chosen rule on the test split, and evaluates the rule in the
@@ -63,7 +63,7 @@ def main() -> None:
     """Replicate and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--replications", type=int, default=20)
+    parser.add_argument("--replications", type=int, default=30)
     parser.add_argument("--sessions", type=int, default=10_000)
     parser.add_argument("--episodes", type=int, default=20_000)
     options = parser.parse_args()

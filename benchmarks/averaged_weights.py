@@ -34,7 +34,8 @@ from ucfrec_simulators.benchmark.tasks import Log, kuairand, sardine, synthetic_
 
 DECAYS = (0.0, 0.99, 0.999)
 TASKS = ("synthetic-catalog", "kuairand", "sardine-boredinf")
-SETTINGS = ("policy.dim=64", "train.learning_rate=1e-3", "train.warmup_steps=40")
+WARMUP = 40
+SETTINGS = ("policy.dim=64", "train.learning_rate=1e-3", f"train.warmup_steps={WARMUP}")
 SUITE, DECAY = "averaged-weights", "decay"
 
 
@@ -52,8 +53,9 @@ class Averages:
 
     def step(self, step: int) -> None:
         """Average the weights of a step, by the formula of `ucfrec.fitting.average`."""
+        t = max(0, step - WARMUP)
         for decay, means in self._means.items():
-            torch._foreach_lerp_(means, self._weights, 1 - min(decay, step / (9 + step)))
+            torch._foreach_lerp_(means, self._weights, 1 - min(decay, t / (9 + t)))
 
     @torch.no_grad()
     def validate(self) -> None:

@@ -65,20 +65,34 @@ def train(
     return module, seen
 
 
-def test_averages_are_those_of_the_formula_for_rows_that_rest_too(tmp_path: Path) -> None:
-    module, seen = train(tmp_path, validated=False)
+@pytest.mark.parametrize("warmup", [0, 15])
+def test_averages_are_those_of_the_formula_for_rows_that_rest_too(
+    tmp_path: Path, warmup: int
+) -> None:
+    config = replace(AVERAGED, warmup_steps=warmup)
+    module, seen = train(tmp_path, config, validated=False)
     raw, _ = load_tensors(tmp_path / "last.safetensors")
     names = [name for name, _ in module.named_parameters()]
     steps = [*seen[1:], [raw[name] for name in names]]
     expected = [each.double() for each in seen[0]]
     for t, weights in enumerate(steps, start=1):
-        d = min(AVERAGED.average, t / (9 + t))
+        after = max(0, t - warmup)
+        d = min(AVERAGED.average, after / (9 + after))
         expected = [
             d * mean + (1 - d) * w.double() for mean, w in zip(expected, weights, strict=True)
         ]
     for name, parameter, mean in zip(names, module.parameters(), expected, strict=True):
         torch.testing.assert_close(parameter.detach().double(), mean, rtol=1e-5, atol=1e-6)
         assert not torch.equal(parameter.detach(), raw[name])
+
+
+def test_a_training_that_ends_with_its_warm_up_is_not_averaged(tmp_path: Path) -> None:
+    averaged, raw = (
+        train(tmp_path / str(decay), replace(AVERAGED, warmup_steps=40, average=decay))[0]
+        for decay in (0.9, 0.0)
+    )
+    for one, other in zip(averaged.parameters(), raw.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_an_interrupted_training_ends_with_the_same_bits(tmp_path: Path) -> None:

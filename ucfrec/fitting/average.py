@@ -17,8 +17,9 @@ _WHEN: Final = ".when"
 class WeightAverage:
     """The mean θ̄ of a module's weights θ over its steps: θ̄ₜ = dₜ θ̄ₜ₋₁ + (1 − dₜ) θₜ.
 
-    dₜ = min(decay, t / (9 + t)), so that a short training is not held back by its first weights.
-    Buffers are not averaged.
+    dₜ = min(decay, t / (9 + t)), with t counted from the end of the learning rate's warm-up, and 0
+    before, so that a short training is not held back by its first weights. Buffers are not
+    averaged.
 
     Of a table with sparse gradients, a step averages the rows that it moves. While a row rests, its
     average approaches it by the product of the steps' d, which is applied when the row moves again
@@ -26,13 +27,14 @@ class WeightAverage:
     resumed training ends with the bits of an uninterrupted one.
     """
 
-    def __init__(self, module: nn.Module, decay: float) -> None:
+    def __init__(self, module: nn.Module, decay: float, start: int = 0) -> None:
         """
         Args:
             module: averaged from its present weights on, which then change in place.
             decay: the largest d, above 0 and below 1.
+            start: steps whose weights are not averaged.
         """
-        self._decay, self._step = decay, 0
+        self._decay, self._start, self._step = decay, start, 0
         self._log = 0.0  # Σ log d of the steps so far
         self._weights = {name: each.detach() for name, each in module.named_parameters()}
         self._gradients = dict(module.named_parameters())
@@ -62,8 +64,10 @@ class WeightAverage:
     def after_step(self, moved: Mapping[str, Tensor]) -> None:
         """Average the weights after a step; `moved` is what `before_step` returned."""
         self._step += 1
-        decay = min(self._decay, self._step / (9 + self._step))
-        self._log += math.log(decay)
+        t = max(0, self._step - self._start)
+        decay = min(self._decay, t / (9 + t))
+        if decay:  # otherwise the averages are the weights, also of rows that rest
+            self._log += math.log(decay)
         for name, rows in moved.items():
             self._means[name][rows] = self._means[name][rows].lerp_(
                 self._weights[name][rows], 1 - decay

@@ -68,8 +68,8 @@ class LoopConfig:
     """Number of consecutive validations without improvement after which training stops early; 0
     disables early stopping."""
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    """Decay of an exponential moving average of the weights, which is validated and saved as the
-    trained weights; 0 for the weights of the last step themselves."""
+    """Decay of an exponential moving average of the weights after the warm-up. It is validated and
+    saved as the trained weights; 0 for the weights of the last step themselves."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,8 @@ class _Training:
             weight_decay=config.weight_decay,
             fused=True,
         )
-        self._average = WeightAverage(module, config.average) if config.average else None
+        average, start = config.average, config.warmup_steps
+        self._average = WeightAverage(module, average, start) if average else None
         self.counters: dict[str, float] = {
             "step": 0,
             "best_step": 0,

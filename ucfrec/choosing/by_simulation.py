@@ -34,12 +34,12 @@ _TIMES: Final = 4
 """… in so many times the sessions: few sessions there say as much of the users as of the rules."""
 _FEWEST: Final = 10
 """Sessions of a half of the users that can disagree, and that can rule a candidate out."""
-_PARTS: Final = 4
-"""Part of the sessions after which candidates are ruled out: one in so many."""
-_FAR: Final = 3.0
-"""Standard errors by which a rule that is ruled out is behind."""
-_SEEDS: Final = 3
-"""Seeds of the first sessions and of the halves of an estimate; the rest have the next one."""
+_FIRST_PART: Final = 4
+"""One in so many of the sessions are simulated before candidates are ruled out, …"""
+_ERRORS_BEHIND: Final = 3.0
+"""… which are those that are so many standard errors behind the best."""
+_SEED_OF_REST: Final = 3
+"""Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
 _FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
 _WIDEST: Final = 0.4
@@ -86,7 +86,7 @@ class RuleSearch:
         if not rules:
             return []
         n = times * self._config.sessions
-        first = n // _PARTS if n >= _PARTS * _FEWEST else n
+        first = n // _FIRST_PART if n >= _FIRST_PART * _FEWEST else n
         begun = self._roll(rules, self._store, first, self.problem.seed)
         self._sessions |= begun
         found = [self._simulated(*each) for each in begun.items()]
@@ -102,7 +102,7 @@ class RuleSearch:
         going = [each.rule for each in begun if not (allowed and self._far_behind(top, each))]
         first = len(self._sessions[top.rule].returns)
         store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
-        rest = self._roll(going, store, n, self.problem.seed + _SEEDS)
+        rest = self._roll(going, store, n, self.problem.seed + _SEED_OF_REST)
         whole = {rule: self._sessions[rule].followed_by(more) for rule, more in rest.items()}
         self._sessions |= whole
         best = self._simulated(top.rule, whole[top.rule])
@@ -117,7 +117,9 @@ class RuleSearch:
         return found
 
     def _far_behind(self, top: SimulatedRule, other: SimulatedRule) -> bool:
-        margin = max(_FAR * self._error(top, other), self._config.tolerance * abs(top.value))
+        margin = max(
+            _ERRORS_BEHIND * self._error(top, other), self._config.tolerance * abs(top.value)
+        )
         return top.value - other.value > margin
 
     def _with_evidence(

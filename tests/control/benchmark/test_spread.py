@@ -62,8 +62,9 @@ def test_checkpoints_are_measured_once_and_share_the_run_of_the_main_table(
 ) -> None:
     write_hdf5(tmp_path / f"{FILE}.hdf5", hopper_like((30, 8, 25) * 8))
     sizes = ("train.steps=6", "train.validate_every=2", "policy.dim=16", "policy.context=5")
-    settings = (*sizes, "train.average=0.9", "train.learning_rate=0.01")
-    tiny = Budget("medium", (FILE,), 1, Evaluation(2, 1000), settings, methods=("ucf-wo-count",))
+    rates = ("train.average=0.9", "train.warmup_steps=2", "train.learning_rate=0.01")
+    evaluation, settings = Evaluation(2, 1000), (*sizes, *rates)
+    tiny = Budget("medium", (FILE,), 1, evaluation, settings, methods=("ucf-wo-count",))
     monkeypatch.setitem(BUDGETS, "medium", tiny)
     out = tmp_path / "out"
     arguments = ["--budget", "medium", "--out", str(out)]

@@ -17,7 +17,7 @@ import numpy as np
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array
-from ucfrec.choosing.candidates import near, unweighted, variants
+from ucfrec.choosing.candidates import NEAR_THE_LOG, lookaheads, near, unweighted, variants
 from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import Sessions, roll_out
@@ -42,14 +42,11 @@ _SEED_OF_REST: Final = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
 _FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
+_TELLS: Final = _FAR_OFF / 4
+"""Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
 (Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
-_NEAR_THE_LOG: Final = (
-    {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
-    {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
-)
-"""Candidates where a rule must leave effective users of a log with propensities."""
 
 
 class RuleSearch:
@@ -248,28 +245,37 @@ class RuleSearch:
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it.
 
-        Either half of the users is simulated with the calibration of its own rows.
+        Either half of the users is simulated with the calibration of its own rows, in twice the
+        sessions where the first ones do not tell the return well.
         """
-        half, n = half_of(self._store), 2 * self._config.sessions
-        checked, found = self.users.calibration_report, list[SimulatedRule]()
-        for number in (0, 1):
-            own = np.flatnonzero(half == number)
-            own = own if len(own) else np.arange(len(half))
-            rest = self._store.select(np.roll(own, -(self._config.sessions // 2)))
-            users = self.users
-            if checked is not None:
-                users = replace(users, calibration=checked.halves[number])
-            simulated = self._roll([rule], rest, n, self.problem.seed + 1 + number, users)
-            found.append(self._simulated(rule, simulated[rule]))
-        values = found[0].value, found[1].value
-        value, within = sum(values) / 2, sum(each.error**2 for each in found) ** 0.5 / 2
+        halves = [self._of_half(rule, number) for number in (0, 1)]
+        returns = np.concatenate([each.returns for each in halves])
+        if _standard_error(returns) > _TELLS * abs(returns.mean()):
+            more = (self._of_half(rule, number, part=1) for number in (0, 1))
+            halves = [one.followed_by(other) for one, other in zip(halves, more, strict=True)]
+        values = _mean(halves[0].returns), _mean(halves[1].returns)
+        value = sum(values) / 2
+        within = math.hypot(*(_standard_error(each.returns) for each in halves)) / 2
         error = max(within, abs(values[0] - values[1]) / 2)
+        checked = self.users.calibration_report
         optimism = None if checked is None else (checked.optimism, checked.optimism_error)
         doubts = list(_doubts(value, error, self.users))
-        length, logged = max(each.length for each in found), self.problem.train.lengths.max()
-        if length > logged:
+        length = max(float(each.lengths.mean()) for each in halves)
+        if length > (logged := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
         return ValueEstimate(value, error, values, optimism, tuple(doubts))
+
+    def _of_half(self, rule: DecisionRule, number: int, part: int = 0) -> Sessions:
+        """Sessions of one half of the users, with its own calibration; each part has others."""
+        half, n = half_of(self._store), self._config.sessions
+        own = np.flatnonzero(half == number)
+        own = own if len(own) else np.arange(len(half))
+        store = self._store.select(np.roll(own, -(n // 2 + part * n)))
+        users, checked = self.users, self.users.calibration_report
+        if checked is not None:
+            users = replace(users, calibration=checked.halves[number])
+        seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
+        return self._roll([rule], store, n, seed, users)[rule]
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
@@ -311,7 +317,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
 
 def _near(search: RuleSearch, start: DecisionRule) -> list[SimulatedRule]:
     """The rule `start` and its neighbours."""
-    more = _NEAR_THE_LOG if search.least_users else ()
+    more = NEAR_THE_LOG if search.least_users else ()
     return search.simulate([*dict.fromkeys(near(start, search.problem, more))])
 
 
@@ -329,7 +335,7 @@ def _all(search: RuleSearch) -> list[SimulatedRule]:
         tried += _with_tag_run(search, second)
     if search.least_users:
         done = {each.rule for each in tried}
-        others = (rule for grid in _NEAR_THE_LOG for rule in variants(first, **grid))
+        others = (rule for grid in NEAR_THE_LOG for rule in variants(first, **grid))
         tried += search.simulate([rule for rule in others if rule not in done])
     return tried
 
@@ -362,13 +368,11 @@ def _doubts(value: float, error: float, users: UserModel) -> tuple[str, ...]:
 
 def _with_lookahead(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
     """The rule with a lookahead, if more than randomness ends sessions."""
-    config, train = search.problem.config, search.problem.train
-    mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
-    lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
+    config, values = search.problem.config, lookaheads(search.problem)
     if search.users.session_end_report.kept == "constant":
         return []
     weights = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
-    return search.simulate([*variants(rule, lookahead=lookaheads, **weights)])
+    return search.simulate([*variants(rule, lookahead=values, **weights)])
 
 
 def _with_tag_window(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:

@@ -3,10 +3,16 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, Final
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.choosing.choice import Problem
+
+NEAR_THE_LOG: Final = (
+    {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
+    {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
+)
+"""Candidates where a rule must leave effective users of a log with propensities."""
 
 
 def unweighted(problem: Problem) -> Iterator[DecisionRule]:
@@ -25,6 +31,12 @@ def variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRu
     """The rule with every combination of other values of its fields."""
     others = (replace(rule, **parts) for parts in _grid(**values))
     return (other for other in others if other != rule)
+
+
+def lookaheads(problem: Problem) -> list[float]:
+    """Values of going on, in reward units; those that are not positive are left out."""
+    mean = float(problem.train.returns.sum(dtype="float64")) / problem.train.n_steps
+    return [each * mean for each in problem.config.lookaheads if each * mean > 0]
 
 
 def near(
@@ -50,16 +62,14 @@ def near(
         name: [*getattr(config, f"{name}s"), *(each for part in more for each in part[name])]
         for name in ("temperature", "reward_weight")
     }
-    mean = float(problem.train.returns.sum(dtype="float64")) / problem.train.n_steps
-    lookaheads = [each * mean for each in config.lookaheads if each * mean > 0]
     middle = _middle(config.policy_weights)
     if rule.looks_ahead:
-        grid |= {"lookahead": lookaheads, "policy_weight": config.policy_weights}
+        grid |= {"lookahead": lookaheads(problem), "policy_weight": config.policy_weights}
         grid["reward_weight"] = config.lookahead_weights
         weight = _middle(config.reward_weights)
         yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
     elif problem.users.session_end_report.kept != "constant":
-        for ahead, weight in product(lookaheads, config.lookahead_weights):
+        for ahead, weight in product(lookaheads(problem), config.lookahead_weights):
             yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
     if problem.validation.item_states.tags.shape[1]:
         known = problem.scorer.known

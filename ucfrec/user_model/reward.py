@@ -231,9 +231,9 @@ class ItemRewardModel(nn.Module):
 
     def expected(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""
-        span = self.reward_high - self.reward_low
-        likely = self.reward_low + span * torch.sigmoid(scores)
-        return torch.where(self.binary, likely, self.reward_mean + self.reward_std * scores)
+        origin = torch.where(self.binary, self.reward_low, self.reward_mean)
+        scale = torch.where(self.binary, self.reward_high - self.reward_low, self.reward_std)
+        return origin + scale * torch.where(self.binary, torch.sigmoid(scores), scores)
 
     @torch.no_grad()
     def set_effects(

@@ -36,7 +36,7 @@ def replicate(folder: Path, seed: int, sessions: int, episodes: int) -> dict[str
     record = train_run(store, run, resolve_config("ucf", None, SETTINGS, seed))
     assert record.rule is not None
     trained = TrainedPolicy.load(run)
-    found = evaluate_off_policy(run, trained, held_out_sessions([trained]), seed=seed)
+    found = evaluate_off_policy(trained, held_out_sessions([trained]), seed=seed)
     true = evaluate_policy(CATALOG, trained, "ucf", episodes, 1_000_000 + seed)
     rows = {row.method: row for row in found.rows}
     row = rows[found.verdict.estimator or "logged"]

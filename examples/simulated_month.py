@@ -74,8 +74,8 @@ class Month:
         "policy.exposure=true",
         "rule.sessions=50",
     )
-    from_nothing: tuple[int, ...] = ()
-    """Days on which a training from nothing is measured beside the update."""
+    from_scratch: tuple[int, ...] = ()
+    """Days on which a training from scratch is measured beside the update."""
     seed: int = 0
 
 
@@ -310,7 +310,7 @@ def _day(folder: Path, world: World, day: int) -> Day:
         validation_loss=record.finished.best_validation,
         covered=tuple(_covered(world, runs / current, log)),
     )
-    if day not in month.from_nothing:
+    if day not in month.from_scratch:
         return found
     began = time.process_time()
     config = resolve_config(month.policy, None, month.settings, month.seed)
@@ -332,7 +332,7 @@ def _covered(world: World, run: Path, log: Path) -> Iterator[bool | None]:
     trained = TrainedPolicy.load(run)
     drawing = replace(trained.rule, temperature=1.0)
     rules = drawing, replace(trained.rule, explore=0.5), replace(drawing, explore=1.0)
-    with logged_sessions(run, trained, [log], LogMapping()) as logged:
+    with logged_sessions(trained, [log], LogMapping()) as logged:
         store = logged.store.select(np.arange(min(_ESTIMATED, logged.store.n_episodes)))
         places = store.all_steps()
         users, items = logged.users[places[0]], store.step_values("item", *places)
@@ -393,7 +393,7 @@ def _against_nothing(day: Day) -> str:
     assert day.nothing_seconds is not None
     assert day.nothing_loss is not None
     return (
-        f"day {day.day}: update {day.update_seconds:.0f} s of processor time, from nothing "
+        f"day {day.day}: update {day.update_seconds:.0f} s of processor time, from scratch "
         f"{day.nothing_seconds:.0f} s ({day.update_seconds / day.nothing_seconds:.0%}); validation "
         f"loss {day.validation_loss:.4f} and {day.nothing_loss:.4f} "
         f"({day.validation_loss / day.nothing_loss - 1:+.1%})"
@@ -407,10 +407,10 @@ def main() -> None:
     parser.add_argument("--days", type=int, default=30)
     parser.add_argument("--sessions", type=int, default=1000)
     parser.add_argument("--users", type=int, default=2000)
-    parser.add_argument("--from-nothing", type=int, nargs="*", default=[], metavar="DAY")
+    parser.add_argument("--from-scratch", type=int, nargs="*", default=[], metavar="DAY")
     options = parser.parse_args()
-    nothing = tuple(options.from_nothing)
-    month = Month(options.days, options.sessions, users=options.users, from_nothing=nothing)
+    nothing = tuple(options.from_scratch)
+    month = Month(options.days, options.sessions, users=options.users, from_scratch=nothing)
     days = simulate(options.out, month)
     plot(days, options.out / "month.svg")
     print(summary(days))

@@ -2,19 +2,12 @@
 
 import sys
 
-from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions, print_anywhere
+from ucfrec.processes import run_program
 
 
 def main() -> int:
-    """Run one `ucfrec` command; returns its exit status, as `ucfrec.commands.cli.main` does."""
-    end_at_once_when_interrupted()
-    print_anywhere()
-    from ucfrec.commands.cli import main as run
-
-    try:
-        return run()
-    finally:
-        ignore_interruptions()
+    """Run one command; returns its exit status, as `ucfrec.commands.cli.main` does."""
+    return run_program("ucfrec.commands.cli")
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ _OS_ERRORS = {
     errno.ELOOP: ("too many symbolic links", "check the path"),
     errno.EMFILE: ("too many files are open in this process", "raise the limit (ulimit -n)"),
     errno.ENFILE: ("too many files are open on this machine", "close other programs"),
-    errno.ENOMEM: ("no memory is left", "close other programs or use smaller settings"),
+    errno.ENOMEM: ("out of memory", "close other programs or use smaller settings"),
     errno.EIO: ("the disk reports an input or output error", "check the disk"),
     errno.ESTALE: ("the network file system lost the file", "run again"),
     errno.ENOLCK: ("the file system offers no locks", "write to another file system"),

@@ -104,7 +104,7 @@ def logs_given(
     with ExitStack() as stack:
         files, given, frame = stack.enter_context(files_given(trained, logs, mapping))
         with in_words_of_python(frame):
-            read = logged_sessions(trained.folder, trained, files, given, keep_unknown)
+            read = logged_sessions(trained, files, given, keep_unknown)
             logged = stack.enter_context(read)
         note_dropped("", logged.report["dropped"], logged.report["rows_read"])
         yield logged

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn
 
@@ -47,7 +48,7 @@ def end_at_once_when_interrupted() -> None:
 def print_anywhere() -> None:
     """From now on stdout and stderr replace characters that their encoding lacks.
 
-    An ASCII terminal, as PYTHONIOENCODING=ascii makes one, or a file name that is no Unicode must
+    An ASCII terminal, as PYTHONIOENCODING=ascii makes one, or a file name that is not Unicode must
     not end a command whose work is done.
     """
     for stream in (sys.stdout, sys.stderr):
@@ -63,6 +64,20 @@ def ignore_interruptions() -> None:
     """
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
+
+
+def run_program(module: str) -> int:
+    """Run the `main` of a module with the arguments of this process; returns its exit status.
+
+    It is imported once Ctrl-C and TERM end the process with one line.
+    """
+    end_at_once_when_interrupted()
+    print_anywhere()
+    main: Callable[[], int] = import_module(module).main
+    try:
+        return main()
+    finally:
+        ignore_interruptions()
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:

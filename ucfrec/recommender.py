@@ -36,6 +36,7 @@ from ucfrec.given_data import (
 )
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.expressions import Expression
+from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles, LogMapping
 from ucfrec.off_policy.evaluate import (
     DEFAULTS,
@@ -201,9 +202,7 @@ class Recommender:
         Raises:
             InputError: the recommender is not trained; call `fit` first.
         """
-        if self._folder is None:
-            raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
-        return self._folder
+        return self.trained.folder
 
     @property
     def trained(self) -> TrainedPolicy:
@@ -373,9 +372,7 @@ class Recommender:
         """
         trained = self._evaluated(logs)
         with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
-            report = evaluate_off_policy(
-                trained.folder, trained, logged, rule=rule, seed=seed, options=options
-            )
+            report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
         card_of_estimates(trained.folder, [_named(logs)], report)
         return report
 
@@ -456,7 +453,7 @@ class Recommender:
             InputError: the recommender is not trained, its store is gone, or the logs cannot be
                 used.
         """
-        window = None if window_days is None else round(window_days * 86_400_000)
+        window = None if window_days is None else round(window_days * DAY_MS)
         options = UpdateOptions(AppendOptions(window), refit=refit)
         given = files_given(self.trained, logs, mapping)
         with given as (files, columns, frame), in_words_of_python(frame):
@@ -478,7 +475,8 @@ class Recommender:
             InputError: the extra `export` is not installed, the policy cannot be exported, or the
                 folder exists.
         """
-        return export(self.trained, Path(folder), rule=rule, k=k)
+        with in_words_of_python():
+            return export(self.trained, Path(folder), rule=rule, k=k)
 
     def report(
         self,

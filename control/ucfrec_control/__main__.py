@@ -2,19 +2,12 @@
 
 import sys
 
-from ucfrec.processes import end_at_once_when_interrupted, ignore_interruptions, print_anywhere
+from ucfrec.processes import run_program
 
 
 def main() -> int:
     """Run one command; returns its exit status, as `ucfrec.commands.cli.main` does."""
-    end_at_once_when_interrupted()
-    print_anywhere()
-    from ucfrec_control.cli import main as run
-
-    try:
-        return run()
-    finally:
-        ignore_interruptions()
+    return run_program("ucfrec_control.cli")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 
-Actions = Array
+Array = Array
 
 
 class Constant(Memoryless):
@@ -19,7 +19,7 @@ class Constant(Memoryless):
     def __init__(self, action: Float32Array) -> None:
         self._action = action
 
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Repeat the action, (N, A)."""
         return np.tile(self._action, (len(observations), 1)), None
 
@@ -38,7 +38,7 @@ def truncated_normal(
         scale: standard deviation of the normal before truncation.
 
     Returns:
-        Actions (N, A), and their densities (N,): products over the dimensions, which may exceed 1.
+        Array (N, A), and their densities (N,): products over the dimensions, which may exceed 1.
     """
     center = mean.astype(np.float64)
     below, above = ndtr((-1 - center) / scale), ndtr((1 - center) / scale)
@@ -64,7 +64,7 @@ class Rule(Memoryless):
     def __init__(self, rule: Callable[[Float32Array], Float32Array]) -> None:
         self._rule = rule
 
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Apply the rule, (N, A)."""
         return self._rule(observations), None
 
@@ -84,7 +84,7 @@ class Blend(Memoryless):
         # The quality is part of the seed so that components of one mixture draw independently.
         self._generator = np.random.default_rng([seed, 2, round(1000 * quality)])
 
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Blended actions with exploration noise, (N, A)."""
         target, _ = self._target.act(observations, live)
         explored = self._noise * self._generator.standard_normal(target.shape)
@@ -118,10 +118,8 @@ class SessionMixture:
         for actor in self._actors:
             actor.begin(rows)
 
-    def act(
-        self, observations: Float32Array, live: BoolArray
-    ) -> tuple[Actions, Float32Array | None]:
-        """Actions (N, A) or (N,) of the sessions' actors; propensities (N,) if all report them."""
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
+        """Array (N, A) or (N,) of the sessions' actors; propensities (N,) if all report them."""
         choices = [actor.act(observations, live) for actor in self._actors]
         rows = np.arange(len(observations))
         actions = np.stack([chosen for chosen, _ in choices])[self.component, rows]
@@ -130,7 +128,7 @@ class SessionMixture:
             return actions, None
         return actions, np.stack(known)[self.component, rows]
 
-    def observe(self, actions: Actions, rewards: Float32Array) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Pass the actions taken and rewards (N,) to every actor."""
         for actor in self._actors:
             actor.observe(actions, rewards)

@@ -5,5 +5,5 @@ from pathlib import Path
 
 
 def data_folder(name: str) -> Path:
-    """The folder `name` in `UCFREC_DATA`, or in ../shared/data."""
-    return Path(os.environ.get("UCFREC_DATA", "../shared/data")) / name
+    """The folder `name` in `UCFREC_DATA`, by default in `data`."""
+    return Path(os.environ.get("UCFREC_DATA", "data")) / name

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow as pa
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.uniform import Actions, Uniform
-from ucfrec.arrays import BoolArray, Float32Array, IntArray
+from ucfrec.acting.uniform import Uniform
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import GymnasiumCatalog
 from ucfrec.evaluation.simulator import Simulator
@@ -117,7 +117,7 @@ class GreedyOracle:
         propensities = self._epsilon / n_items + (1 - self._epsilon) * (chosen == greedy)
         return chosen, propensities.astype(np.float32)
 
-    def observe(self, actions: Actions, rewards: Float32Array) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Do nothing: tastes are read from the environment."""
 
 

@@ -2,9 +2,8 @@
 ends."""
 
 from abc import ABC, abstractmethod
-from typing import Any, SupportsFloat, cast
+from typing import Any
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
@@ -143,42 +142,3 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
         if not np.isfinite(actions).all():
             raise InputError(f"{type(self).__name__} got actions that are not finite")
         return actions.astype(np.float32, copy=False)
-
-
-class SingleSession(gymnasium.Env[Float32Array, Array]):
-    """A plain Gymnasium environment of an environment with one session.
-
-    Raises:
-        InputError: the environment has more than one session.
-    """
-
-    def __init__(self, environment: VectorEnv[Float32Array, Array, Array]) -> None:
-        if environment.num_envs != 1:
-            raise InputError(
-                f"SingleSession needs an environment of one session, got {environment.num_envs}"
-            )
-        self._environment = environment
-        self.observation_space = environment.single_observation_space
-        self.action_space = environment.single_action_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float32Array, dict[str, Any]]:
-        """Start a session; returns the observation (O,) and info."""
-        super().reset(seed=seed, options=options)
-        observations, infos = self._environment.reset(seed=seed, options=options)
-        return observations[0], _first(infos)
-
-    def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Take one action; returns observation (O,), reward, terminated, truncated and info."""
-        observations, rewards, terminated, truncated, infos = self._environment.step(
-            np.asarray(action)[None]
-        )
-        ended = bool(terminated[0] | truncated[0])
-        observation = cast(Float32Array, infos["final_obs"][0]) if ended else observations[0]
-        info = _first(infos["final_info"] if ended else infos)
-        return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
-
-
-def _first(infos: dict[str, Any]) -> dict[str, Any]:
-    return {key: value[0] for key, value in infos.items() if not key.startswith("_")}

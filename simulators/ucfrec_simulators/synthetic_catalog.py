@@ -130,14 +130,6 @@ class SyntheticCatalog(SessionsEnv):
         order = np.argsort(-np.take_along_axis(probabilities, by_tag, 1), axis=1, kind="stable")
         return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
 
-    def optimal_returns(self) -> Float64Array:
-        """(n_users,) expected return of `Rotation` for each user, which is the largest possible."""
-        best = np.take_along_axis(
-            self.click_probabilities, self.favourites(self.click_probabilities), axis=1
-        )
-        ranks = np.arange(self.max_turn - 1) % self.boredom_window
-        return np.asarray(best[:, ranks].sum(axis=1) + best[:, 0])
-
     def _begin(self, rows: IntArray) -> None:
         self.users[rows] = self.np_random.integers(len(self.logits), size=len(rows))
         self.turns[rows] = 0

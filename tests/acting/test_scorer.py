@@ -21,6 +21,7 @@ from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
 from ucfrec.acting.sessions import History, seen_before
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
@@ -235,7 +236,7 @@ def test_all_may_be_left_out_where_it_is_said_and_no_score_may_be_nan() -> None:
     excluded[1, 4] = False
     assert scorer.scores(history, excluded=excluded)[1].argmax() == 4
     scorer.policy.head.bias.data[0] = torch.nan  # type: ignore[union-attr,index]
-    with pytest.raises(InputError, match="in 3 of 3 decisions scores are no numbers"):
+    with pytest.raises(InputError, match="in 3 of 3 decisions scores are not numbers"):
         Scorer(scorer.policy, scorer.rule, scorer.states).scores(history)
 
 
@@ -332,13 +333,11 @@ def test_played_scored_ranked_and_recommended_alike(
     latest = log.sort_values("timestamp").groupby("user_id").tail(1)
     more = latest.assign(timestamp=latest.timestamp + 1000, item_id=5, reward=1.0)
     pd.concat([log, more]).to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(
-        trained.folder, trained, [tmp_path / "log.parquet"], LogMapping()
-    ) as logged:
+    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
         store, ranker = logged.store, PolicyRanker(trained, given, "ucf")
         batches = list(scored_steps(trained, store, given))
         (batch,) = batches
-        later = Later.alone(store, np.array(logged.users))
+        later = Later(store, UserRows.of(store, np.array(logged.users), None))
         ends = np.flatnonzero(np.append(np.diff(batch.episodes) > 0, True))
         for user, found in expected.items():
             last = max(end for end in ends if logged.users[batch.episodes[end]] == user)

@@ -135,7 +135,7 @@ def test_an_interruption_that_a_library_renames_is_no_failed_cell(tmp_path: Path
 def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
     results.write_text("\n[broken\n")
-    with pytest.raises(InputError, match="line 2 is no result row"):
+    with pytest.raises(InputError, match="line 2 is not a result row"):
         run_grid(_cells(tmp_path, 1), HOW, results, 1)
     assert not (tmp_path / "marks").exists()
 

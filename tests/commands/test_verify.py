@@ -70,7 +70,7 @@ def test_other_paths(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "neither an episode store" in capsys.readouterr().err
     (tmp_path / "rows.jsonl").write_text("{}\n")
     assert main(["verify", str(tmp_path / "rows.jsonl")]) == 2
-    assert "line 1 is no result row" in capsys.readouterr().err
+    assert "line 1 is not a result row" in capsys.readouterr().err
     record = read_json(made / "run" / "run.json")
     del record["files"]
     write_json(tmp_path / "run.json", record)

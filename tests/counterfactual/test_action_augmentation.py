@@ -112,7 +112,7 @@ def test_only_other_actions_of_the_same_cluster_are_asked_about() -> None:
 def test_the_gate_opens_and_shuts() -> None:
     steps = view().n_steps
     _, open_ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
-    # A draw of the logged action is no proposal; in large clusters that is rare.
+    # A draw of the logged action is not a proposal; in large clusters that is rare.
     assert 2.9 * steps < open_.proposals <= 3 * steps
     assert open_.copies == open_.proposals
     assert open_.reproduced == 1

@@ -45,7 +45,7 @@ def test_indicators_of_a_category_are_kept_beside_a_measurement(tmp_path: Path) 
 
 
 def test_weak_causes_of_a_noisy_reward_are_kept(tmp_path: Path) -> None:
-    """Where a quarter of the reward is noise, no visible help is no evidence."""
+    """Where a quarter of the reward is noise, no visible help is not evidence."""
     store = planted_category(tmp_path / "store", moves=0.05, noise=0.5)
     report = screen(store.split("train"), QUICK, seed=0)
     assert report.flagged == (6,)

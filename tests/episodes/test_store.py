@@ -785,7 +785,7 @@ def bad_writes() -> dict[str, tuple[dict[str, object], str]]:
         ),
         "lengths that do not add up": ({"lengths": np.array([3, 2])}, "4 steps instead of 5"),
         "an empty episode": ({"lengths": np.array([3, 0, 1])}, "without steps"),
-        "rewards that are no numbers": (
+        "rewards that are not numbers": (
             {"steps": {**steps, schema.REWARD: np.array([1, np.nan, 2, np.inf])}},
             "2 of 4 rewards are not finite",
         ),

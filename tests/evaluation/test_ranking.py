@@ -17,6 +17,7 @@ from tests.recommending.test_recommend import SETTINGS, random_log
 from tests.support.logs import store_of
 from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation import ranking
@@ -95,7 +96,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 
 def alone(store: EpisodeStore) -> Later:
-    return Later.alone(store, store.episode_values(schema.USER))
+    return Later(store, UserRows.of(store, store.episode_values(schema.USER), None))
 
 
 class Oracle:
@@ -259,9 +260,7 @@ def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
     assert trained.item_ids is not None
     rule = replace(trained.rule, temperature=0.0)  # does not draw
     ranker = PolicyRanker(trained, rule, "ucf")
-    with logged_sessions(
-        trained.folder, trained, [tmp_path / "after.parquet"], LogMapping()
-    ) as logged:
+    with logged_sessions(trained, [tmp_path / "after.parquet"], LogMapping()) as logged:
         assert logged.rows is not None
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)

@@ -27,14 +27,14 @@ def test_ids_come_back(tmp_path: Path) -> None:
 def test_a_pipe_is_refused_and_not_read(tmp_path: Path) -> None:
     for name in ("items.parquet", "items.csv", "items.npy"):
         os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=r"items\.parquet is no regular file"):
+    with pytest.raises(InputError, match=r"items\.parquet is not a regular file"):
         read_ids(tmp_path / "items.parquet", "item_id")
     for name in ("items.parquet", "items.csv"):
-        with pytest.raises(InputError, match="is no regular file"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read_features(tmp_path / name)
     env = gymnasium.make("CartPole-v1")
     for name in ("items.parquet", "items.npy"):
-        with pytest.raises(InputError, match="is no regular file"):
+        with pytest.raises(InputError, match="is not a regular file"):
             item_table(str(tmp_path / name), env, 2)
 
 

@@ -66,7 +66,7 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not an example: it has no record"):
         Example.read(tmp_path)
     (tmp_path / "record.json").write_text("[]")
-    with pytest.raises(InputError, match="it is no JSON object; make it again"):
+    with pytest.raises(InputError, match="it is not a JSON object; make it again"):
         Example.read(tmp_path)
     (tmp_path / "record.json").write_text("{}")
     with pytest.raises(InputError, match=r"record\.json has no files; make it again"):

@@ -329,14 +329,14 @@ def test_messages_say_where_the_expression_is_and_what_is_allowed(
     reward_of_run(tmp_path / "run", "sum(is_click)")
     (tmp_path / "m.toml").write_text('[columns]\nuser_id = "(FROM x)"\n')
     assert told("prepare", log, "--out", out, "--reward", "read_text('x')") == (
-        "ucfrec prepare: --reward: for the reward: \"read_text('x')\" is no scalar SQL expression "
-        f"over the columns of {log}: it calls 'read_text'; allowed are columns, literals, "
-        "operators, casts, CASE, and the functions of ucfrec.logs.expressions"
+        "ucfrec prepare: --reward: for the reward: \"read_text('x')\" is not a scalar SQL "
+        f"expression over the columns of {log}: it calls 'read_text'; allowed are columns, "
+        "literals, operators, casts, CASE, and the functions of ucfrec.logs.expressions"
     )
     by_column = told("prepare", log, "--out", out, "--column", "user_id=1; SELECT 2")
-    assert "--column: for user_id: '1; SELECT 2' is no scalar SQL" in by_column
+    assert "--column: for user_id: '1; SELECT 2' is not a scalar SQL" in by_column
     by_file = told("prepare", log, "--out", out, "--mapping", str(tmp_path / "m.toml"))
-    assert f"{tmp_path / 'm.toml'}: for user_id: '(FROM x)' is no scalar" in by_file
+    assert f"{tmp_path / 'm.toml'}: for user_id: '(FROM x)' is not a scalar" in by_file
     assert "it has a subquery" in by_file
     by_run = told("recommend", str(tmp_path / "run"), log, "--out", out)
     assert f"{tmp_path / 'run' / 'run.json'}: for the reward: 'sum(is_click)'" in by_run

@@ -87,7 +87,7 @@ def test_the_command_writes_a_log_that_prepare_reads(
     arguments = [str(exposures(tmp_path / "shown")), str(tmp_path / "clicks.csv"), "--out", out]
     join = ["join", *arguments, "--column", "user_id=visitor"]
     assert main([*join, "--within", "soon"]) == 2
-    assert "--within soon is no time" in capsys.readouterr().err
+    assert "--within soon is not a duration" in capsys.readouterr().err
     assert main([*join, "--within", "30m"]) == 0
     assert "1 of them with feedback (25.0%)" in capsys.readouterr().out
     assert main(["prepare", out, "--reward", "click", "--validate"]) == 0

@@ -507,7 +507,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "log.txt").touch()
     with pytest.raises(InputError, match=r"log.txt is not a .parquet or"):
         log_files([tmp_path / "log.txt"])
-    with pytest.raises(InputError, match=r"'item' is no log column"):
+    with pytest.raises(InputError, match=r"'item' is not a log column"):
         LogMapping({"item": "x"})
 
 
@@ -582,7 +582,7 @@ def test_a_mapping_is_read_from_toml(tmp_path: Path) -> None:
         item_features=(FeatureTable((tmp_path / "items.csv",), "iid", ("price",)),),
     )
     (tmp_path / "bad.toml").write_text("[columns]\nitem = 'x'\n")
-    with pytest.raises(InputError, match=r"bad.toml: 'item' is no log column"):
+    with pytest.raises(InputError, match=r"bad.toml: 'item' is not a log column"):
         read_mapping(tmp_path / "bad.toml")
     (tmp_path / "bad.toml").write_text("rewards = 'x'\n")
     with pytest.raises(InputError, match=r"bad.toml: .*rewards"):

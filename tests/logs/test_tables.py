@@ -63,7 +63,7 @@ def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
     lake = tmp_path / "lake"
     for day, part in log.groupby(days):
         write(part, lake / f"timestamp={day}" / "hour=0" / "part.parquet")
-    # Writers leave what is no part of the table.
+    # Writers leave what is not part of the table.
     for hidden in (".tmp", "_temporary", "_delta_log"):
         write(log, lake / hidden / "part.parquet")
     write(log, lake / ".part.parquet")

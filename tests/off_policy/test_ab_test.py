@@ -56,7 +56,7 @@ def test_users_in_both_arms_and_rows_without_one_are_left_out(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"arm": "a"}, "two arms"), ({"feedback": "x"}, "no number"), ({"arm": None}, "two arms")],
+    [({"arm": "a"}, "two arms"), ({"feedback": "x"}, "not a number"), ({"arm": None}, "two arms")],
 )
 def test_logs_without_two_arms_are_refused(
     tmp_path: Path, change: dict[str, str], message: str

@@ -24,9 +24,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 @pytest.fixture
 def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with logged_sessions(
-        folder / "run", trained, [folder / "rest.parquet"], LogMapping()
-    ) as logged:
+    with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
         yield logged
 
 

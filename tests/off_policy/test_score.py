@@ -22,9 +22,7 @@ RULE = DecisionRule(7.5, temperature=1.0)
 
 @pytest.fixture
 def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with logged_sessions(
-        folder / "run", trained, [folder / "rest.parquet"], LogMapping()
-    ) as logged:
+    with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
         yield logged
 
 
@@ -96,7 +94,7 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
     changed.to_parquet(tmp_path / "changed.parquet")
     thought = []
     for file in (folder / "rest.parquet", tmp_path / "changed.parquet"):
-        with logged_sessions(folder / "run", trained, [file], LogMapping()) as logged:
+        with logged_sessions(trained, [file], LogMapping()) as logged:
             _, steps = logged.store.all_steps()
             batches = scored_steps(trained, logged.store, RULE)
             thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
@@ -143,13 +141,13 @@ def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -
     pd.concat([log, strange]).to_parquet(tmp_path / "log.parquet")
     trained = TrainedPolicy.load(folder / "run")
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(folder / "run", trained, files, LogMapping()) as logged:
+    with logged_sessions(trained, files, LogMapping()) as logged:
         assert logged.report["dropped"]["unknown_item"] == 4
         assert sum(map(len, score(trained, logged, RULE))) == len(log)
     strange.to_parquet(tmp_path / "log.parquet")
     with (
         pytest.raises(InputError, match=r"no row is left \(4 rows: item is not in the store"),
-        logged_sessions(folder / "run", trained, files, LogMapping()),
+        logged_sessions(trained, files, LogMapping()),
     ):
         pass
 
@@ -164,7 +162,7 @@ def test_unknown_items_may_stay_with_no_probability(
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
     before = logged_steps(trained, logged, RULE, seed=0).steps
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(folder / "run", trained, files, LogMapping(), keep_unknown=True) as kept:
+    with logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
@@ -186,9 +184,7 @@ def test_logs_of_another_catalogue_are_refused(
     log.assign(item_id=log.item_id + 1000).to_parquet(tmp_path / "log.parquet")
     with (
         pytest.raises(InputError, match=r"in all .* rows the item is not in the store"),
-        logged_sessions(
-            folder / "run", trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True
-        ),
+        logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
     ):
         pass
 
@@ -201,7 +197,7 @@ def test_ids_may_be_text_where_the_run_has_integers(
     text.loc[text.index[0], "user_id"] = "somebody"
     text.to_parquet(tmp_path / "log.parquet")
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(folder / "run", trained, files, LogMapping()) as other:
+    with logged_sessions(trained, files, LogMapping()) as other:
         there = other.store.step_values("item", *other.store.all_steps())
         assert len(there) == len(log)
         assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))

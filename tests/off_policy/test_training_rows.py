@@ -33,17 +33,15 @@ def test_the_share_of_rows_seen_in_training(
     rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
     # The last tenth of the training log is its test split, which the run never saw.
     pd.concat([train.head(seen), rest]).to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(
-        folder / "run", trained, [tmp_path / "log.parquet"], LogMapping()
-    ) as logged:
+    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
         assert share_seen(trained, logged.store) == pytest.approx(expected, abs=0.01)
 
 
 def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
     log = folder / "train.parquet"
-    with logged_sessions(folder / "run", trained, [log], LogMapping(), keep_unknown=True) as logged:
+    with logged_sessions(trained, [log], LogMapping(), keep_unknown=True) as logged:
         rule = DecisionRule(5.0, temperature=1.0)
-        evaluated = evaluate_off_policy(folder / "run", trained, logged, rule=rule, seed=0)
+        evaluated = evaluate_off_policy(trained, logged, rule=rule, seed=0)
     assert not evaluated.verdict.reliable
     assert "90% of the rows were seen in training" in evaluated.verdict.reasons[0]
     assert evaluated.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
@@ -57,7 +55,7 @@ def test_a_refit_has_seen_the_test_split_too(
     held_out = pd.read_parquet(log).sort_values("timestamp").tail(50)
     held_out.to_parquet(tmp_path / "held-out.parquet")
     files = [tmp_path / "held-out.parquet"]
-    with logged_sessions(folder / "run", trained, files, LogMapping()) as logged:
+    with logged_sessions(trained, files, LogMapping()) as logged:
         assert share_seen(trained, logged.store) == 0
         assert share_seen(TrainedPolicy.load(again), logged.store) == 1
     capsys.readouterr()
@@ -76,9 +74,7 @@ def test_without_the_training_store_nothing_is_known(
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
         moved = replace(trained, record=trained.record.with_entries(**places))
-        with logged_sessions(
-            folder / "run", trained, [folder / "rest.parquet"], LogMapping()
-        ) as logged:
+        with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
             assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
 
 

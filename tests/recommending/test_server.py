@@ -193,7 +193,7 @@ def test_what_is_no_host_is_refused(
     trained: TrainedPolicy, capsys: pytest.CaptureFixture[str], hosts: str
 ) -> None:
     assert main(["serve", str(trained.folder), "--port", "0", "--allowed-hosts", hosts]) == 2
-    assert "is no host" in capsys.readouterr().err
+    assert "is not a host" in capsys.readouterr().err
 
 
 def test_requests_of_many_clients_are_answered(address: str) -> None:

@@ -222,8 +222,8 @@ def test_what_policies_earn_comes_by_environment_with_intervals(runs: Path, tmp_
     [
         (None, "does not exist"),
         ("{}", "holds no list of result rows"),
-        ("[1]", "row 1 is no result row"),
-        (json.dumps([row("a", "ucf", 1.0).to_json(), {}]), "row 2 is no result row"),
+        ("[1]", "row 1 is not a result row"),
+        (json.dumps([row("a", "ucf", 1.0).to_json(), {}]), "row 2 is not a result row"),
         (json.dumps([row("a", "ucf", 1.0, interval=None).to_json()]), "row 1, has no R_cum with"),
     ],
 )

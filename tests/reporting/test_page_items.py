@@ -233,5 +233,5 @@ def test_estimates_of_another_kind_are_refused(
 ) -> None:
     good = estimate("DR", 1.0).to_json()
     (tmp_path / "ope.json").write_text(json.dumps([good, good | wrong]))
-    with pytest.raises(InputError, match=f"row 2 is no result row: .*{next(iter(wrong))}"):
+    with pytest.raises(InputError, match=f"row 2 is not a result row: .*{next(iter(wrong))}"):
         write_report(tmp_path / "out.html", [folder / "ucf"], [tmp_path / "ope.json"])

@@ -65,7 +65,7 @@ def test_what_a_row_does_not_say_is_not_written() -> None:
     ],
 )
 def test_what_is_of_another_kind_is_refused(change: dict[str, Any], says: str) -> None:
-    with pytest.raises(InputError, match=r"x\.jsonl, line 3 is no result row") as refused:
+    with pytest.raises(InputError, match=r"x\.jsonl, line 3 is not a result row") as refused:
         row_from_json(result_row().to_json() | change, "x.jsonl, line 3")
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
@@ -98,7 +98,7 @@ def test_whatever_stands_in_a_field_it_is_a_row_or_refused(name: str, value: Any
 
 @given(value=_JSON)
 def test_whatever_is_no_row_is_refused(value: Any) -> None:
-    with pytest.raises(InputError, match="here is no result row"):
+    with pytest.raises(InputError, match="here is not a result row"):
         row_from_json(value, "here")
 
 

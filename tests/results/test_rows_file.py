@@ -50,7 +50,7 @@ def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes) ->
     path = tmp_path / "rows.jsonl"
     append_rows(path, [result_row()])
     path.write_bytes(path.read_bytes() + torn)
-    with pytest.raises(InputError, match="line 2 is no result row"):
+    with pytest.raises(InputError, match="line 2 is not a result row"):
         read_rows(path)
 
 
@@ -63,7 +63,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
 
 def test_numbers_that_are_none_are_never_written(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
-    with pytest.raises(InputError, match="is no result row"):
+    with pytest.raises(InputError, match="is not a result row"):
         append_rows(path, [result_row(), result_row(float("nan"))])
     assert not path.exists()
 

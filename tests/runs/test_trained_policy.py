@@ -106,7 +106,7 @@ def test_weights_that_are_no_numbers_are_said_to_be_so(changed: Path) -> None:
     tensors, about = load_tensors(path)
     save_tensors(path, {**tensors, "head.bias": tensors["head.bias"] * torch.nan}, about)
     actor = TrainedPolicy.load(changed).actor(2)
-    with pytest.raises(InputError, match="in 1 of 1 decisions scores are no numbers"):
+    with pytest.raises(InputError, match="in 1 of 1 decisions scores are not numbers"):
         actor.act(np.zeros((2, 0), dtype=np.float32), np.array([True, False]))
 
 

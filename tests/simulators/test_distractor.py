@@ -11,6 +11,7 @@ from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
 from tests.support.causes import QUICK as QUICK_SCREENING
+from tests.support.single_session import SingleSession
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
@@ -27,7 +28,6 @@ from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.distractor import DistractorEnv, DistractorEnvironment, plant_distractor
 from ucfrec_simulators.kuai.completion import complete
-from ucfrec_simulators.session_env import SingleSession
 
 TINY = ["train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=4"]
 

@@ -1,4 +1,4 @@
-"""SQL that is no scalar expression over a log: what a hostile reward or mapping might say."""
+"""SQL that is not a scalar expression over a log: what a hostile reward or mapping might say."""
 
 from typing import Final
 

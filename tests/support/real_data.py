@@ -8,9 +8,7 @@ import pytest
 
 def data_folder(name: str) -> Path:
     """The folder `name` of the real data, or skip the test where it is absent."""
-    root = os.environ.get("UCFREC_DATA")
-    base = Path(root) if root else Path(__file__).parents[3] / "shared" / "data"
-    folder = base / name
+    folder = Path(os.environ["UCFREC_DATA"]) / name
     if not folder.is_dir():
         pytest.skip(f"no real data at {folder}; set UCFREC_DATA to the folder that holds {name}/")
     return folder

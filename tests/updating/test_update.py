@@ -105,7 +105,7 @@ def test_the_command_says_what_was_read_and_what_is_better(
     assert record.update.verdict is not None
     assert record.update.verdict.steps == 75
     assert main([*arguments[:5], "--window", "soon"]) == 2
-    assert "--window soon is no time" in capsys.readouterr().err
+    assert "--window soon is not a duration" in capsys.readouterr().err
 
 
 def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:

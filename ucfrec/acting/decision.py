@@ -226,7 +226,7 @@ def _saved(value: object) -> DecisionRule:
     if isinstance(value, DecisionRule):
         return value
     if not isinstance(value, Mapping):
-        raise InputError("its rule is no decision rule")
+        raise InputError("its rule is not a decision rule")
     return DecisionRule.from_dict(value, "the rule")
 
 

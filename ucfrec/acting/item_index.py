@@ -18,7 +18,7 @@ _SHARE: Final = 16
 _AT_LEAST: Final = 8
 """Lists that are searched at least."""
 _MORE: Final = 256
-"""Candidates that are scored beside three times those requested."""
+"""Candidates that are scored beside four times those requested."""
 _SAMPLE: Final = 32
 """One in so many sessions is also searched exactly."""
 

@@ -415,7 +415,7 @@ def _require_scores(scores: Tensor, empty: bool) -> Tensor:
     undefined = ~(highest < torch.inf)
     if undefined.any():
         raise InputError(
-            f"in {int(undefined.sum())} of {len(scores)} decisions scores are no numbers, as "
+            f"in {int(undefined.sum())} of {len(scores)} decisions scores are not numbers, as "
             "weights of the policy or the reward model are NaN or infinite; train again, with "
             "a lower train.learning_rate if the training diverged"
         )

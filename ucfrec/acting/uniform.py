@@ -11,8 +11,6 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.schema import FORBIDDEN
 
-Actions = Array
-
 
 class Memoryless:
     """An actor whose choice depends on the current observation only."""
@@ -20,7 +18,7 @@ class Memoryless:
     def begin(self, rows: IntArray) -> None:
         """Do nothing: there is no state to reset."""
 
-    def observe(self, actions: Actions, rewards: Float32Array) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Do nothing: there is no state to update."""
 
 
@@ -46,9 +44,7 @@ class Uniform(Memoryless):
         items."""
         self._forbidden = info.get(FORBIDDEN)
 
-    def act(
-        self, observations: Float32Array, live: BoolArray
-    ) -> tuple[Actions, Float32Array | None]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
         """Draw actions: (N, A) without propensities, or items (N,) with propensities (N,)."""
         count = len(observations)
         if isinstance(self._space, spaces.Discrete):

@@ -87,8 +87,8 @@ def run_grid(
         The rows of all cells, in the order of `cells`.
 
     Raises:
-        InputError: `workers` is below 1, a line of `results` is no result row, or at least one cell
-            failed.
+        InputError: `workers` is below 1, a line of `results` is not a result row, or at least one
+            cell failed.
     """
     if workers < 1:
         raise InputError(f"--workers is {workers}; at least one is needed")
@@ -182,7 +182,7 @@ def _here(tasks: Mapping[str, _Task[Cell]]) -> Generator[_Outcome, None, None]:
         while left:
             name, task = left.popleft()
             try:
-                # What a library makes of an interruption is no failure of the cell.
+                # What a library makes of an interruption is not a failure of the cell.
                 with interruptions_raised():
                     rows = _measure(task)
             except Exception as error:

@@ -427,11 +427,15 @@ def _standard_error(values: Float64Array) -> float:
 
 
 def _least_evident(candidate: SimulatedRule) -> tuple[float, ...]:
-    """Orders rules by evidence, the most first; equal ones by `_simplicity`."""
-    evidence = candidate.evidence
+    """Orders rules by evidence, the most first; equal ones by `_simplicity`.
+
+    A handful of effective users is not evidence, and neither is a difference in hits below one
+    percentage point: few logged steps are compared.
+    """
+    evidence, users = candidate.evidence, candidate.effective_users
     assert evidence is not None
-    support = evidence.effective_users or evidence.likelihood
-    return (-support, -evidence.hits, *_simplicity(candidate))
+    support = users if users >= _FEWEST else evidence.likelihood
+    return (-support, -round(evidence.hits, 2), *_simplicity(candidate))
 
 
 def _chosen_by(users: UserModel) -> str:

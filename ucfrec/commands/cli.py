@@ -42,11 +42,11 @@ UCFREC = Program(
         "datasets": "list public data sets, or download one",
         "collect": "simulate sessions and write them as Parquet logs",
         "prepare": "turn logs into an episode store",
-        "screen": "which logged observation columns have no effect",
+        "screen": "find logged observation columns that have no effect",
         "train": "train a policy on an episode store; resumes",
         "tune": "search the settings of a training; resumes",
         "update": "train on from a run with new logs, and compare both; resumes",
-        "promote": "make a run the one that `serve RUNS` answers with",
+        "promote": "make `serve RUNS` answer with a run",
         "settings": "list every training setting: default, range, meaning",
         "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",
@@ -54,7 +54,7 @@ UCFREC = Program(
         "serve": "answer requests for recommendations over HTTP",
         "explore": "try out one or two policies in the browser",
         "join": "make a log of exposures and the feedback that they got",
-        "compare": "difference between two runs that shared the traffic (A/B test)",
+        "compare": "compare two runs that shared the traffic (A/B test)",
         "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",
         "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
@@ -94,10 +94,12 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
     except Interrupted as interruption:
         if sys.stderr.isatty():
             print(file=sys.stderr)  # after ^C, or a progress bar
-        print(f"{name}: interrupted; the same command goes on or starts again", file=sys.stderr)
+        print(
+            f"{name}: interrupted; run the same command again to resume or restart", file=sys.stderr
+        )
         return interruption.status
     except BrokenPipeError:
-        # The reader of a pipe, such as `head`, closed it: that is no failure.
+        # The reader of a pipe, such as `head`, closed it: that is not a failure.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
@@ -110,7 +112,7 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
 
 
 def explanation(error: BaseException) -> str | None:
-    """What a user can do about an error, on one line; None if it is a defect of ucfrec."""
+    """What a user can do about an error, on one line; None if it is a bug of ucfrec."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError):

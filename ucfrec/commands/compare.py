@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--expected",
         type=float,
         metavar="DIFFERENCE",
-        help="difference per shown item that the interval at any time is shortest for; fix it "
+        help="difference per shown item for which the always-valid interval is shortest; fix it "
         "before the test (default: 5%% of the value of A)",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers as JSON")

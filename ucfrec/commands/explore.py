@@ -4,7 +4,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from ucfrec.errors import InputError
 from ucfrec.processes import Interrupted
 
 _OWN_NAMES = ("localhost", "127.0.0.1", "[::1]")
@@ -47,14 +46,9 @@ def run(options: argparse.Namespace) -> None:
         InputError: a run or file cannot be used, the extra `serve` is not installed, or the port
             cannot be listened on.
     """
-    try:
-        from ucfrec.exploring.web import application
-        from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"exploring needs {error.name}, which is not installed; install ucfrec[serve]"
-        ) from None
     from ucfrec.exploring.page import Explorer
+    from ucfrec.exploring.web import application
+    from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
     from ucfrec.reporting.samples import read_features
     from ucfrec.runs.trained_policy import TrainedPolicy
 

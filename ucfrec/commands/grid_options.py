@@ -107,10 +107,10 @@ def seed_given(text: str) -> int:
     """The value of an option for a seed.
 
     Raises:
-        ArgumentTypeError: `text` is no whole number from 0 to 2**32 − 1.
+        ArgumentTypeError: `text` is not a whole number from 0 to 2**32 − 1.
     """
     if not text.isdecimal() or len(text) > 10 or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"{text:.40} is no whole number from 0 to {2**32 - 1}")
+        raise argparse.ArgumentTypeError(f"{text:.40} is not a whole number from 0 to {2**32 - 1}")
     return int(text)
 
 

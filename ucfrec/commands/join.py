@@ -1,15 +1,10 @@
 """`ucfrec join`: exposures and the feedback that they got, as a log."""
 
 import argparse
-import re
 from pathlib import Path
-from typing import Final
 
-from ucfrec.commands.options import log_options, logs_given, memory_option
-from ucfrec.errors import InputError
+from ucfrec.commands.options import duration_ms, log_options, logs_given, memory_option
 from ucfrec.files.remote import Input, Output, origin, uri_or_path
-
-_UNITS: Final = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -37,20 +32,13 @@ def run(options: argparse.Namespace) -> None:
     """Run `ucfrec join` and print what was matched.
 
     Raises:
-        InputError: a file cannot be used, or --within is no time.
+        InputError: a file cannot be used, or --within is not a duration.
     """
     from ucfrec.logs.join import join_feedback
 
-    within = _milliseconds(options.within)
+    within = duration_ms("--within", options.within)
     files, mapping = logs_given(options)
     joined = join_feedback(
         [options.exposures], files, options.out, within, mapping, options.memory_limit
     )
     print(f"{joined}\n\n{origin(options.out)}")
-
-
-def _milliseconds(given: str) -> int:
-    found = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", given.strip())
-    if found is None:
-        raise InputError(f"--within {given} is no time; write e.g. 90s, 30m, 2h or 1d")
-    return round(float(found[1]) * _UNITS[found[2]])

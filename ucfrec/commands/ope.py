@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `ope` takes."""
+    """Add the options of `ucfrec ope`."""
     log_options(parser)
     memory_option(parser)
     rule_options(parser)
@@ -45,22 +45,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--scored",
         action="store_true",
         help="LOGS are what `ucfrec score` wrote for RUN with the same decision rule, of any size: "
-        "a row a session is in memory, and there are no models of the reward",
+        "one row per session is in memory, and there are no reward models (DM, FQE, DR)",
     )
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
     parser.epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
         "targets or rules are ranked, with a band that holds all at once."
     )
-    estimate_options(parser)
-    parser.add_argument("--seed", type=int, default=0)
+    _estimate_options(parser)
+    parser.add_argument("--seed", type=int, default=0, help="of folds and bootstrap (default: 0)")
     parser.add_argument("--json", type=Path, help="write the result rows here")
 
 
-def estimate_options(parser: argparse.ArgumentParser) -> None:
-    """Add what `estimates_asked` reads."""
+def _estimate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--discount", type=float, default=1.0, help="of the returns that are estimated (default 1)"
+        "--discount", type=float, default=1.0, help="of the returns that are estimated (default: 1)"
     )
     parser.add_argument(
         "--pages",
@@ -71,14 +70,15 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--anonymous",
         action="store_true",
-        help="the logs' users are no persons (as in obd): treat each session as of another user",
+        help="treat each session as one of another user, for logs without user ids (as in obd)",
     )
     parser.add_argument(
         "--reward-range",
         type=float,
         nargs=2,
         metavar=("LEAST", "MOST"),
-        help="reward of a step, to bound what unsupported choices could (default: as observed)",
+        help="lowest and highest reward of a step, to bound the value of choices that the log "
+        "lacks (default: as observed)",
     )
     parser.add_argument(
         "--lift",
@@ -92,8 +92,8 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar="N",
-        help="groups of items, by their embeddings, for MIPS and the tests by group; 1 for neither "
-        "(default: the root of the number of items, up to 32)",
+        help="number of item groups (k-means of embeddings), for MIPS and the tests by group; 1 "
+        "for neither (default: square root of the number of items, up to 32)",
     )
     parser.add_argument(
         "--estimate-propensities",
@@ -102,12 +102,7 @@ def estimate_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
-    """What `estimate_options` were given.
-
-    Raises:
-        InputError: a value is out of its range.
-    """
+def _estimates_given(options: argparse.Namespace) -> "EstimateOptions":
     from ucfrec.off_policy.evaluate import EstimateOptions
 
     return EstimateOptions(
@@ -116,7 +111,7 @@ def estimates_asked(options: argparse.Namespace) -> "EstimateOptions":
         users_known=not options.anonymous,
         reward_range=None if options.reward_range is None else tuple(options.reward_range),
         wanted_lift=options.lift,
-        item_clusters=options.item_groups,
+        item_groups=options.item_groups,
         estimate_propensities=options.estimate_propensities,
     )
 
@@ -189,13 +184,13 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
     from ucfrec.reporting.cards import card_of_estimates
     from ucfrec.reporting.tables import format_rows
 
-    trained, run = candidate.trained, candidate.trained.folder
-    asked = {"rule": candidate.rule, "seed": options.seed, "options": estimates_asked(options)}
+    trained = candidate.trained
+    arguments = {"rule": candidate.rule, "seed": options.seed, "options": _estimates_given(options)}
     if options.scored:
-        found = evaluate_scored(trained, options.logs, **asked)
+        found = evaluate_scored(trained, options.logs, **arguments)
     else:
         with _logged(options, trained) as logged:
-            found = evaluate_off_policy(run, trained, logged, **asked)
+            found = evaluate_off_policy(trained, logged, **arguments)
     shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
     lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
     print(f"\n{format_rows(lines, shown)}")
@@ -218,7 +213,7 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
     print(_next_step(found.verdict))
-    card_of_estimates(run, options.logs or ["the test split"], found)
+    card_of_estimates(trained.folder, options.logs or ["the test split"], found)
     return found
 
 
@@ -247,7 +242,7 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
         return
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
-    with logged_sessions(trained.folder, trained, files, mapping, True, limit) as logged:
+    with logged_sessions(trained, files, mapping, True, limit) as logged:
         print(format_summary(logged.report))
         yield logged
 
@@ -269,7 +264,7 @@ def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[Decis
             temperatures = [float(part) for part in options.temperatures.split(",")]
         except ValueError:
             raise InputError(
-                f"--temperatures {options.temperatures} are no numbers; write e.g. 0,0.5,1"
+                f"--temperatures {options.temperatures} are not numbers; write e.g. 0,0.5,1"
             ) from None
     rules = [
         replace(own, target=target, temperature=temperature)

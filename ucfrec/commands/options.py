@@ -1,11 +1,12 @@
 """Options that several commands share, and the objects made from them."""
 
 import argparse
+import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
@@ -18,6 +19,21 @@ if TYPE_CHECKING:
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
+
+_UNITS_MS: Final = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
+
+
+def duration_ms(option: str, given: str) -> int:
+    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`.
+
+    Raises:
+        InputError: it is written otherwise, or is 0.
+    """
+    found = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", given.strip())
+    milliseconds = 0 if found is None else round(float(found[1]) * _UNITS_MS[found[2]])
+    if not milliseconds:
+        raise InputError(f"{option} {given} is not a duration; write e.g. 90s, 30m, 12h or 60d")
+    return milliseconds
 
 
 def environment_options(parser: argparse.ArgumentParser) -> None:
@@ -273,7 +289,7 @@ def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
 
 def limit_options(parser: argparse.ArgumentParser) -> None:
     """Add the limits of a request for recommendations."""
-    limits = parser.add_argument_group("limits of a request", "beyond one, it gets an error")
+    limits = parser.add_argument_group("request limits", "larger requests are rejected")
     limits.add_argument(
         "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
     )
@@ -289,7 +305,7 @@ def limit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = "") -> None:
-    """Add what computes the network of a request that comes alone.
+    """Add what computes the network of requests that are not batched.
 
     Args:
         more: further choices.
@@ -299,8 +315,8 @@ def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = 
         "--engine",
         choices=("torch", "onnxruntime", *more),
         default="torch",
-        help="what computes the network of a request that comes alone; onnxruntime is faster, but "
-        f"needs ucfrec[export] and some 10 seconds at the start{more_help} (default: torch)",
+        help="what computes the network of requests that are not batched; onnxruntime is faster, "
+        f"but needs ucfrec[export] and some 10 seconds at the start{more_help} (default: torch)",
     )
 
 

@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
     train, liked = training_store(trained[0]), _liked(options, trained[0])
     if options.logs:
         files, mapping = logs_given(options, trained[0])
-        with logged_sessions(runs[0], trained[0], files, mapping) as logged:
+        with logged_sessions(trained[0], files, mapping) as logged:
             print(format_summary(logged.report), end="\n\n")
             warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
             warnings[0] += [logged.history_lacking] if logged.history_lacking else []

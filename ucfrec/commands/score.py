@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
         return
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
-    with logged_sessions(options.run, trained, files, mapping, memory_limit=limit) as logged:
+    with logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))
         rule = rule_given(options, trained)
         frames = score(trained, logged, rule)

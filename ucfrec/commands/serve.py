@@ -52,8 +52,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen on; others than this machine's own are open to whoever reaches "
-        "them (default: 127.0.0.1)",
+        help="address to listen on; one that is not this machine's own exposes the server to the "
+        "network (default: 127.0.0.1)",
     )
     parser.add_argument(
         "--allowed-hosts",
@@ -78,7 +78,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--threads",
         type=int,
         metavar="N",
-        help="of a forward pass (default: one per core, divided by --workers)",
+        help="threads per forward pass (default: one per core, divided by --workers)",
     )
     rule_options(parser)
     draw_options(parser, "DIR")
@@ -86,13 +86,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     limit_options(parser)
     server = parser.add_argument_group("limits of the server")
     server.add_argument(
-        "--max-batch", type=int, default=64, metavar="N", help="requests of a forward pass (64)"
+        "--max-batch", type=int, default=64, metavar="N", help="requests per forward pass (64)"
     )
     server.add_argument(
-        "--max-queue", type=int, default=1024, metavar="N", help="requests that wait (1,024)"
+        "--max-queue", type=int, default=1024, metavar="N", help="requests in the queue (1,024)"
     )
     server.add_argument(
-        "--timeout", type=float, default=5.0, metavar="S", help="seconds of a request (5)"
+        "--timeout",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="timeout per request, in seconds (5)",
     )
 
 
@@ -107,10 +111,8 @@ def run(options: argparse.Namespace) -> None:
 
     if not 1 <= options.workers <= MOST:
         raise InputError(f"--workers is {options.workers}; give a number from 1 to {MOST}")
-    try:
-        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
-    except ModuleNotFoundError as error:
-        raise _missing(error) from None
+    from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
+
     address = listening_socket(options.host, options.port)
     if options.workers == 1:
         _serve(options, address, PrintingServer)
@@ -125,10 +127,6 @@ def run(options: argparse.Namespace) -> None:
             print(_STOPPED, file=sys.stderr)
 
 
-def _missing(error: ModuleNotFoundError) -> InputError:
-    return InputError(f"serving needs {error.name}, which is not installed; install ucfrec[serve]")
-
-
 def _serve(
     options: argparse.Namespace,
     address: "AbstractContextManager[socket.socket]",
@@ -139,14 +137,11 @@ def _serve(
     Args:
         server: makes the server, given what it answers with.
     """
-    try:
-        from ucfrec.recommending.web import ServerLimits, application
-    except ModuleNotFoundError as error:
-        raise _missing(error) from None
     import torch
 
     from ucfrec.recommending.served import Served, parse_split
     from ucfrec.recommending.server import server_config
+    from ucfrec.recommending.web import ServerLimits, application
     from ucfrec.runs.record import RUN, verified
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -209,7 +204,7 @@ def _work(options: argparse.Namespace, listening: "socket.socket", parent: "Pare
         why = explanation(error)
         if why is None:
             traceback.print_exc()
-        parent.failed(why or "a worker has a defect; see the traceback")
+        parent.failed(why or "a worker failed; see the traceback")
 
 
 _OWN_NAMES = ("localhost", "127.0.0.1", "::1")

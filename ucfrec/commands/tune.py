@@ -15,7 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder of the search; a search in it goes on",
+        help="folder of the search; an unfinished search in it is resumed",
     )
     parser.add_argument(
         "--policy",
@@ -55,8 +55,9 @@ def _search_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="TOML",
         help="settings to search, one table per section; each a list of choices or "
-        "{low = …, high = …, log = true} (default: rate, steps, width, context and dropout of "
-        "networks; also the reward weight with ndcg and gauc)",
+        "{low = …, high = …, log = true} (default: learning rate, steps, width, dropout, "
+        "context, exposure features and augmentation of networks, neighbours of item-knn; with "
+        "ndcg and gauc also the reward weight)",
     )
     parser.add_argument(
         "--set",

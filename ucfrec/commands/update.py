@@ -1,14 +1,9 @@
 """`ucfrec update`: bring a run up to date with new logs."""
 
 import argparse
-import re
 from pathlib import Path
-from typing import Final
 
-from ucfrec.commands.options import log_options, logs_given, memory_option
-from ucfrec.errors import InputError
-
-_DAY_MS: Final = 86_400_000
+from ucfrec.commands.options import duration_ms, log_options, logs_given, memory_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="RUN2",
-        help="folder of the new run; an interrupted update in it goes on",
+        help="folder of the new run; an interrupted update in it is resumed",
     )
     parser.add_argument(
         "--store",
@@ -78,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
         run = current.run(run)
     files, mapping = logs_given(options, TrainedPolicy.load(run))
     append = AppendOptions(
-        window_ms=None if options.window is None else window_ms(options.window),
+        window_ms=None if options.window is None else duration_ms("--window", options.window),
         split=SPLIT if options.split is None else parse_split(options.split),
         memory_limit=options.memory_limit,
     )
@@ -105,21 +100,6 @@ def run(options: argparse.Namespace) -> None:
     print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")
     print(f"\nrun: {options.out}")
     if update.verdict.result == "worse":
-        print("next: keep the old run; more new rows, or train from nothing with ucfrec train")
+        print("next: keep the old run; more new rows, or train from scratch with ucfrec train")
     else:
         print(f"next: ucfrec promote {options.out}, if `serve` follows its folder")
-
-
-def window_ms(given: str) -> int:
-    """Milliseconds of a time such as `60d` or `12h`.
-
-    Raises:
-        InputError: it is written otherwise, or is 0.
-    """
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([hd])", given.strip())
-    milliseconds = 0 if found is None else round(float(found[1]) * _DAY_MS)
-    if found is not None and found[2] == "h":
-        milliseconds //= 24
-    if not milliseconds:
-        raise InputError(f"--window {given} is no time; write e.g. 60d or 12h")
-    return milliseconds

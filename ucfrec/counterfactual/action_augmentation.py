@@ -67,7 +67,7 @@ class ActionGenerator:
     ) -> tuple[Overlay, ActionReport]:
         """Propose `count` other actions at each of the given steps, and copy what passes.
 
-        Actions are drawn with replacement; a draw of the logged action itself is no proposal.
+        Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
 
         Args:
             episodes: (M,) positions in the view.

@@ -177,7 +177,7 @@ def _optimise(
             absent = missing()
             batch = rows[torch.randint(len(rows), (batch_size,))]
             next_errors, reward_errors = pair.errors(data, batch, absent)
-            # A missing dimension's own future is no part of the rest.
+            # A missing dimension's own future is not part of the rest.
             loss = (next_errors * (1 - absent)).mean((1, 2)).sum() + reward_errors.mean(1).sum()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]

@@ -304,7 +304,7 @@ class Columns:
         if len(values) != self.record.n_episodes:
             raise self._damaged(name, f"has {len(values)} of {self.record.n_episodes} episodes")
         if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
-            raise self._damaged(name, "has numbers that are no split")
+            raise self._damaged(name, "has numbers that are not a split")
         return values
 
     def step_column(self, name: str) -> Array:

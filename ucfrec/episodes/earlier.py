@@ -84,7 +84,7 @@ class UserRows:
     def continued(self, gap_ms: float | None) -> EpisodeStore:
         """The later log, with the rows before it in the sessions that go on in it.
 
-        These rows are known but are no steps of the view: `all_steps` leaves them out.
+        These rows are known but are not steps of the view: `all_steps` leaves them out.
 
         Args:
             gap_ms: pause (ms) that ends a session; None if a session is all of a user.

@@ -73,5 +73,5 @@ class TrainingCounts:
         with damage_explained(path, REMEDY):
             for name in ("shown", "liked"):
                 if tensors[name].dtype != torch.int64 or bool((tensors[name] < 0).any()):
-                    raise ValueError(f"{name} are no counts")
+                    raise ValueError(f"{name} are not counts")
             return cls(tensors["shown"], tensors["liked"], int(numbers["episodes"]))

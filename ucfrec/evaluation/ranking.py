@@ -40,11 +40,6 @@ class Later:
     filter_seen: bool = False
     """Whether items are left out that the user has seen before the step, as in `recommend`."""
 
-    @classmethod
-    def alone(cls, store: EpisodeStore, users: Array) -> "Later":
-        """A log without earlier rows; `users` (E,) are the user identifiers of its episodes."""
-        return cls(store, UserRows.of(store, users, None))
-
     def steps(self, numbers: IntArray, filter_seen: bool) -> "Steps":
         """The steps with the given numbers (B,)."""
         episodes, steps = self.store.locate(numbers)

@@ -45,7 +45,7 @@ class PolicyRanker:
 
 @dataclass(frozen=True)
 class RewardRanker:
-    """Ranks items by the reward model that the run's decision rules reward weight by."""
+    """Ranks items by the run's reward model alone."""
 
     scorer: Scorer
     name: str = "reward model"

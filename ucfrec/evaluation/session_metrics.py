@@ -44,25 +44,11 @@ def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
     )
 
 
-def bootstrap_interval(values: Float64Array, seed: int, level: float = 0.95) -> tuple[float, float]:
-    """Percentile bootstrap interval (low, high) of the mean of `values` (N,), 2,000 resamples."""
-    ((low, high),) = ratio_intervals(values[:, None], np.ones((len(values), 1)), seed, level)
+def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:
+    """95% percentile bootstrap interval (low, high) of the mean of `values` (N,)."""
+    means = resampled_ratios(values[:, None], np.ones((len(values), 1)), seed)
+    low, high = np.nanquantile(means, [0.025, 0.975])
     return float(low), float(high)
-
-
-def ratio_intervals(
-    above: Float64Array, below: Float64Array, seed: int, level: float = 0.95
-) -> Float64Array:
-    """Percentile bootstrap intervals (C, 2) of the column ratios Σ above / Σ below.
-
-    Rows are resampled; resamples whose denominator is 0 are excluded.
-
-    Args:
-        above: (N, C) numerators.
-        below: (N, C) denominators, at least 0.
-    """
-    ratios = resampled_ratios(above, below, seed)
-    return np.asarray(np.nanquantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T)
 
 
 def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulated environment in which sessions are simulated."""
+    """A simulated environment."""
 
     summary: str
     """One line for `--help`."""
@@ -21,8 +21,8 @@ class Simulator:
     """Makes a vector environment with `AutoresetMode.SAME_STEP` from (number of parallel sessions,
     folder of weights or None)."""
     behaviors: "Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]"
-    """Built-in behavior policies by name, each made from (environment, seed): `random`, `mixture`
-    and, if it is known, `optimal`."""
+    """Built-in behavior policies by name, each made from (environment, seed): `random`, mostly
+    `mixture`, which is logged by default, and `optimal` if it is known."""
     feedback: str
     """Name of the reward column in the logs that `ucfrec collect` writes."""
 

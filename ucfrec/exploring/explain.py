@@ -100,7 +100,7 @@ def pasted_history(text: str) -> pd.DataFrame:
     last, as a frame of one user whose rows are a minute apart.
 
     Raises:
-        InputError: there are too many rows, or a reward is no number.
+        InputError: there are too many rows, or a reward is not a number.
     """
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if len(lines) > _MOST_ROWS:

@@ -159,7 +159,7 @@ def read_text(path: Path, largest: int = _LARGEST_JSON) -> str:
     """
     try:
         if not path.is_file():
-            kind = "is no regular file" if path.exists() else "does not exist"
+            kind = "is not a regular file" if path.exists() else "does not exist"
             raise InputError(f"{path} {kind}; check the path")
         if path.stat().st_size > largest:
             raise InputError(f"{path} has more than {largest:,} bytes; name another file")

@@ -37,13 +37,13 @@ def require_plausible_rows(path: Path, rows: int) -> None:
 
 
 def require_regular(path: Path) -> None:
-    """Check that a file is no pipe or device, reading which might never end; it may be missing.
+    """Check that a file is not a pipe or device, reading which might never end; it may be missing.
 
     Raises:
         InputError: it is one.
     """
     if path.exists() and not path.is_file():
-        raise InputError(f"{path} is no regular file; name or restore the file")
+        raise InputError(f"{path} is not a regular file; name or restore the file")
 
 
 def read_ids(path: Path, column: str) -> Array:

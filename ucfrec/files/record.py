@@ -152,7 +152,7 @@ def _size_fault(path: Path, size: int) -> str:
             return "is missing"
         return f"cannot be read ({error})"
     if found == size:
-        return "" if path.is_file() else "is no regular file"
+        return "" if path.is_file() else "is not a regular file"
     return f"is {'truncated' if found < size else 'grown'}: {found:,} of {size:,} bytes"
 
 
@@ -216,7 +216,7 @@ class Record(Entry):
             raise InputError(f"{folder} is not {cls.KIND}")
         value = read_json(path)
         if not isinstance(value, dict):
-            raise InputError(f"{path} is damaged: it is no JSON object; {cls.REMEDY}")
+            raise InputError(f"{path} is damaged: it is not a JSON object; {cls.REMEDY}")
         return cls.of(value, path)
 
     @classmethod

@@ -200,7 +200,7 @@ def _require_new(uri: str) -> str:
 
 
 def _send(place: Path, uri: str) -> None:
-    """Copy a file or folder to a URI, its record last: without it, a folder is no store."""
+    """Copy a file or folder to a URI, its record last: without it, a folder is not a store."""
     system, path = _opened(uri)
     files = [place]
     if place.is_dir():

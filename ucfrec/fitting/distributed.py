@@ -63,7 +63,7 @@ def joined() -> Iterator[None]:
         if any(phrase in str(error) for phrase in ("closed by peer", "Connection re", "NCCL")):
             raise InputError(
                 "another process of this training has ended; see what it printed, then start the "
-                "same command again, which goes on from the last checkpoint"
+                "same command again, which resumes from the last checkpoint"
             ) from None
         raise
     finally:

@@ -72,7 +72,7 @@ def engine(
                         connection.execute("SET memory_limit = ?", [f"{own} B"])
             except duckdb.Error:
                 raise InputError(
-                    f"memory_limit {memory_limit!r} is no size; write e.g. 2GB"
+                    f"memory_limit {memory_limit!r} is not a size; write e.g. 2GB"
                 ) from None
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])

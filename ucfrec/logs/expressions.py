@@ -157,8 +157,8 @@ def refused(what: str, given: str, over: str, reason: str) -> InputError:
     origin = f"{given.origin}: " if isinstance(given, Expression) else ""
     reason = "".join(char if char.isprintable() else " " for char in reason)
     return InputError(
-        f"{origin}{what.partition(';')[0]}: {_quote(given)} is no scalar SQL expression over the "
-        f"columns of {over}: {reason}"
+        f"{origin}{what.partition(';')[0]}: {_quote(given)} is not a scalar SQL expression over "
+        f"the columns of {over}: {reason}"
     )
 
 
@@ -353,7 +353,7 @@ def _length_of_separator(arguments: Sequence[Any]) -> int:
     given = arguments[1] if len(arguments) > 1 else {}
     literal = given["literal"] if given.get("class") == "CONSTANT" else {}
     if literal.get("kind") != "STRING":
-        raise NotScalarError("the separator of array_to_string is no quoted text; write one")
+        raise NotScalarError("the separator of array_to_string is not quoted text; write one")
     return len(literal["text"])
 
 

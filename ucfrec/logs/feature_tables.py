@@ -48,7 +48,7 @@ def load_features(
     """Read feature tables into DuckDB tables `<kind>_features_0`, …, with columns `id`, `f0`, ….
 
     The parts of a table are joined by the names of their columns, whatever their order: what a part
-    lacks is missing for its rows. A key is no feature.
+    lacks is missing for its rows. A key is not a feature.
 
     Args:
         connection: engine that may open the tables' files.

@@ -115,8 +115,8 @@ def frame_histories(
         Batches as of `read_histories`.
 
     Raises:
-        InputError: `frame` is no data frame or has no rows, a column is missing, repeated or of a
-            wrong type, or no row can be used.
+        InputError: `frame` is not a data frame or has no rows, a column is missing, repeated or of
+            a wrong type, or no row can be used.
     """
     columns = log_table(frame, HISTORIES)
     with engine_in_memory() as connection:
@@ -141,7 +141,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
         frame: one row per interaction.
 
     Raises:
-        InputError: `frame` is no data frame or has no rows, two columns have the same name, or a
+        InputError: `frame` is not a data frame or has no rows, two columns have the same name, or a
             key column has values of several types.
     """
     import pandas as pd

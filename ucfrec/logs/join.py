@@ -111,8 +111,8 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
         missing = [name for name in _EXPOSURE if name not in (*table.columns, ARM)]
         if missing:
             raise InputError(
-                f"{table.files[0]} has no column {', '.join(missing)}: it is no file of exposures; "
-                "name those that serve --exposures or recommend --exposures wrote first"
+                f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
+                "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
     rows = " UNION ALL BY NAME ".join(
         f"SELECT {_selected(table)} FROM {table.sql}" for table in tables

@@ -96,7 +96,7 @@ class LogMapping:
         known = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
         for name in self.columns:
             if name not in known:
-                raise InputError(f"{name!r} is no log column; use one of {', '.join(known)}")
+                raise InputError(f"{name!r} is not a log column; use one of {', '.join(known)}")
         if self.session_by not in (None, *SESSIONS):
             raise InputError(
                 f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}, and map a column "
@@ -110,7 +110,7 @@ class LogMapping:
         """Milliseconds of `earliest`.
 
         Raises:
-            InputError: it is no time.
+            InputError: it is not a time.
         """
         if self.earliest is None:
             return EARLIEST_MS
@@ -258,7 +258,7 @@ def _beside(mapping: Path, file: str | Path) -> Path:
     named = mapping.parent / file
     if named.exists() or not glob.has_magic(str(file)):
         return named
-    # The folder is no pattern, even if it is called "logs [1]".
+    # The folder is not a pattern, even if it is called "logs [1]".
     return Path(glob.escape(str(mapping.parent))) / file
 
 

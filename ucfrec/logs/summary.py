@@ -101,7 +101,7 @@ def _return_length_share(measures: Measures) -> float | None:
     Of the whole rest of the session; None if either does not vary.
     """
     (rest, both), (_, ahead) = measures.returns.covariance
-    # What is left of the rounding errors of equal returns is no variance.
+    # What is left of the rounding errors of equal returns is not variance.
     if rest <= 1e-24 * measures.returns.mean[0] ** 2 or not ahead:
         return None
     return float(both**2 / (rest * ahead))

@@ -59,8 +59,8 @@ class Comparison:
             lines.append(f"{self.in_both:,} users were in both arms; their rows are left out")
         first, second = self.arms
         lines.append(
-            f"{second} less {first}: {self.difference:+.4g} [{self.low:+.4g}, {self.high:+.4g}] at "
-            f"a planned end; [{self.always_low:+.4g}, {self.always_high:+.4g}] at any time"
+            f"{second} − {first}: {self.difference:+.4g} [{self.low:+.4g}, {self.high:+.4g}] at "
+            f"a planned end; [{self.always_low:+.4g}, {self.always_high:+.4g}] always valid"
         )
         return "\n".join(lines)
 
@@ -75,10 +75,8 @@ class Comparison:
         return f"no difference between {first} and {second} is shown so far"
 
 
-def always_valid(
-    difference: float, variance: float, expected: float, level: float = LEVEL
-) -> tuple[float, float]:
-    """A confidence sequence: with probability `level`, it holds the true difference at all times.
+def always_valid(difference: float, variance: float, expected: float) -> tuple[float, float]:
+    """A confidence sequence: with a probability of 95%, it holds the true difference at all times.
 
     The mixture sequential probability ratio test for normal estimates, inverted (Johari, Koomen,
     Pekelis & Walsh, Always valid inference, Operations Research 2022): the difference is mixed over
@@ -91,7 +89,7 @@ def always_valid(
             matter, the interval is shortest.
     """
     mixed = variance + expected**2
-    inside = math.log(mixed / variance) - 2 * math.log(1 - level)
+    inside = math.log(mixed / variance) - 2 * math.log(1 - LEVEL)
     radius = math.sqrt(variance * mixed / expected**2 * inside)
     return difference - radius, difference + radius
 
@@ -170,7 +168,7 @@ def _by_user(
                         f"{table.files[0]} has no column {name}; give the log of ucfrec join"
                     )
             if not is_number(table.columns[column]):
-                raise InputError(f"{table.files[0]}: {column} is no number; name another column")
+                raise InputError(f"{table.files[0]}: {column} is not a number; name another column")
         with explained(connection, tables, folder):
             rows = " UNION ALL BY NAME ".join(
                 f"SELECT CAST({schema.USER_ID} AS VARCHAR) AS who, {ARM} AS arm, "

@@ -62,7 +62,7 @@ class EstimateOptions:
     wanted_lift: Annotated[float, Field(gt=0)] | None = None
     """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
     logged return."""
-    item_clusters: Annotated[int, Field(ge=0)] = 0
+    item_groups: Annotated[int, Field(ge=0)] = 0
     """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
@@ -118,7 +118,6 @@ class EvaluatedSteps:
 
 
 def evaluate_off_policy(
-    run: Path,
     trained: TrainedPolicy,
     logged: LoggedSessions,
     *,
@@ -126,13 +125,13 @@ def evaluate_off_policy(
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> OffPolicyReport:
-    """Estimate the mean return of a session under the policy of `run`, from logs alone.
+    """Estimate the mean return of a session under a policy, from logs alone.
 
     Models of future reward are fitted on these logs; each user's sessions are predicted by models
     fitted on other users.
 
     Args:
-        run: folder of the run, named in the rows.
+        trained: its run's folder is named in the rows.
         logged: logs read with `keep_unknown`. The policy would never show an item that it does not
             know, so such a step has weight 0.
         rule: the decision rule to evaluate; None for the run's own.
@@ -166,7 +165,7 @@ def evaluate_off_policy(
     }
     read = (
         logged.store.record.fingerprint,
-        conditions(run, len(steps.first), len(steps.reward), options),
+        conditions(trained.folder, len(steps.first), len(steps.reward), options),
     )
     subject = Subject(trained, rule, seed, *read, about)
     return OffPolicyReport(
@@ -369,7 +368,7 @@ def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) ->
     """(n_items,) group of every item."""
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings.numpy()
-    wanted = options.item_clusters or default_groups(len(embeddings))
+    wanted = options.item_groups or default_groups(len(embeddings))
     if wanted == 1:
         return np.zeros(len(embeddings), dtype=np.int64)
     return group_items(embeddings, wanted, seed)

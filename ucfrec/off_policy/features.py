@@ -55,7 +55,7 @@ class StepInputs:
 def context_of(batch: ScoredSteps) -> Tensor:
     """(B, C) state, return left of the target, and last-layer features of the policy's window.
 
-    A policy that is no network of features (item-knn, crm-greedy) has the first two only.
+    A policy that is not a network of features (item-knn, crm-greedy) has the first two only.
     """
     parts = [batch.states, batch.returns_left[:, None]]
     parts += [] if batch.features is None else [batch.features]

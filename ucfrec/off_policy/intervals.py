@@ -34,9 +34,8 @@ def cluster_intervals(
     below: Float64Array,
     cluster: IntArray | None,
     seed: int,
-    level: float = 0.95,
 ) -> list[Interval | None]:
-    """Studentised bootstrap intervals of the ratios Σ above / Σ below.
+    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below.
 
     Clusters are drawn with replacement, each with all its sessions (Cameron, Gelbach & Miller,
     Review of Economics and Statistics 2008), and every resample's deviation is divided by its own
@@ -44,12 +43,12 @@ def cluster_intervals(
     value and error rise and fall together, which percentiles of the value alone miss.
 
     Args:
-        above: (S, K), a row a session, a column a number.
+        above: (S, K), one row per session, one column per estimate.
         below: (S, K).
         cluster: (S,) of each session, any integers; None where each session is its own.
 
     Returns:
-        One a column; None where nothing spreads: one cluster, all clusters equal, or so few that
+        One per column; None where nothing spreads: one cluster, all clusters equal, or so few that
         differ that more than a tenth of the resamples have no spread.
     """
     drawn = resample(above, below, cluster, seed)
@@ -60,7 +59,7 @@ def cluster_intervals(
             found.append(None)
             continue
         shift, error = drawn.shift[usable, k], drawn.errors[usable, k]
-        low_t, high_t = np.quantile(shift / error, [(1 - level) / 2, (1 + level) / 2])
+        low_t, high_t = np.quantile(shift / error, [0.025, 0.975])
         value, spread = drawn.value[k], drawn.error[k]
         found.append(
             Interval(

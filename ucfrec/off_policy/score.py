@@ -80,20 +80,19 @@ class ScoredSteps:
     returns_left: Tensor
     """(B,): target return less the session's reward before the step."""
     features: Tensor | None
-    """(B, d): last-layer features of the policy's window; None of a policy that is no network of
+    """(B, d): last-layer features of the policy's window; None of a policy that is not a network of
     features (item-knn, crm-greedy)."""
 
 
 @contextmanager
 def logged_sessions(
-    run: Path,
     trained: TrainedPolicy,
     files: Sequence[Path],
     mapping: LogMapping,
     keep_unknown: bool = False,
     memory_limit: str = "2GB",
 ) -> Iterator[LoggedSessions]:
-    """Read logs in the same way as the training logs of `run`.
+    """Read logs in the same way as the training logs of a run.
 
     The result is a context manager; the prepared logs are on disk until its block ends.
 

@@ -44,7 +44,7 @@ _ROUNDING: Final = 1e-6
 _WEIGHED: Final = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
 _NOTES: Final = (
     "from scored rows: without models of the reward there is no DR",
-    "rows of items that the run does not know are no part of scored rows; where `score` said that "
+    "rows of items that the run does not know are not part of scored rows; where `score` said that "
     "it excluded many, estimate from the logs",
 )
 

@@ -14,7 +14,7 @@ from ucfrec.policies.base import (
     TokenEmbedding,
     interleave,
 )
-from ucfrec.policies.layers import Dropout
+from ucfrec.policies.layers import Dropout, init_linear
 from ucfrec.settings import settings_table
 
 
@@ -45,10 +45,7 @@ class DCPolicy(SequencePolicy):
         self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
-        for module in self.blocks.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.normal_(module.weight, std=0.02)
-                nn.init.zeros_(module.bias)
+        init_linear(self.blocks)
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""

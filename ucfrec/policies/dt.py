@@ -15,7 +15,7 @@ from ucfrec.policies.base import (
     interleave,
     require_heads,
 )
-from ucfrec.policies.layers import Dropout, attend, visible_tokens
+from ucfrec.policies.layers import Dropout, attend, init_linear, visible_tokens
 from ucfrec.settings import settings_table
 
 
@@ -48,10 +48,7 @@ class DTPolicy(SequencePolicy):
         self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)
-        for module in self.blocks.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.normal_(module.weight, std=0.02)
-                nn.init.zeros_(module.bias)
+        init_linear(self.blocks)
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""

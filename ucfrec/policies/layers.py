@@ -79,6 +79,14 @@ def some_padding(mask: Tensor) -> Tensor | None:
     return None if known and bool(mask.all()) else mask
 
 
+def init_linear(module: nn.Module) -> None:
+    """Initialise all linear layers as GPT-2 does: weights from N(0, 0.02²), biases 0."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.normal_(layer.weight, std=0.02)
+            nn.init.zeros_(layer.bias)
+
+
 class CausalDepthwise(nn.Conv1d):
     """A depthwise convolution over the last 3 steps: the output at t depends on t − 2 to t.
 

@@ -88,7 +88,7 @@ class Batcher:
                 outcomes: Sequence[Outcome | Exception] = await loop.run_in_executor(
                     self._thread, self._answers.answers, requests
                 )
-            except Exception as error:  # a defect or a lack of memory; every caller receives it
+            except Exception as error:  # a bug, or out of memory; every caller receives it
                 outcomes = [error] * len(batch)
             self._watcher.batch(len(batch), time.perf_counter() - began)
             for each, outcome in zip(batch, outcomes, strict=True):

@@ -130,9 +130,9 @@ class ExposureLog:
         closed = False
         while not closed:
             self._wake.wait(self._seconds)
-            # Read first: what is added before the log is closed is written.
-            closed = self._closed
+            # First: a close after this wakes the next wait.
             self._wake.clear()
+            closed = self._closed
             self._flush(last=closed)
 
     def _flush(self, last: bool) -> None:

@@ -228,7 +228,7 @@ def of_some_users(batches: Iterable[Histories], users: Sequence[Any]) -> Iterato
     """The histories of the named users only, in the order of `batches`.
 
     Raises:
-        InputError: `users` is no list of ids, or one of them has no rows; once all are read.
+        InputError: `users` is not a list of ids, or one of them has no rows; once all are read.
     """
     if isinstance(users, str) or not pd.api.types.is_list_like(users) or not len(users):
         raise InputError(f"users is {users!r}; give a list of user_ids, or None for all")

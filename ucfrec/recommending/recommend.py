@@ -103,7 +103,7 @@ def require_whole(k: int) -> None:
     """Check the number of items of a user.
 
     Raises:
-        InputError: it is no whole number, or below 1.
+        InputError: it is not a whole number, or below 1.
     """
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
         raise InputError(f"k is {k!r}; give a whole number, 1 or more")

@@ -165,7 +165,7 @@ def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
         kind: `Request` or a subclass.
 
     Raises:
-        InputError: it is no such request, or too large.
+        InputError: it is not such a request, or too large.
     """
     if len(text) > limits.bytes:
         raise InputError(f"the request has more than {limits.bytes:,} bytes; send fewer rows")

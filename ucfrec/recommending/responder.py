@@ -235,7 +235,7 @@ class Responder:
         return self._best(asked, scores)
 
     def _excluded(self, asked: Sequence[_Asked]) -> Tensor | None:
-        """(B, n_items) true for items that are no candidates; None if all may be recommended."""
+        """(B, n_items) true for items that are not candidates; None if all may be recommended."""
         if all(one.allowed is None for one in asked):
             return None
         excluded = torch.zeros(len(asked), len(self._items), dtype=torch.bool)

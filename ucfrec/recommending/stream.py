@@ -12,7 +12,7 @@ from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, pa
 from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
-"""Rows that a stream remembers; whoever was heard of longest ago is forgotten first."""
+"""Rows that a stream keeps; the least recently active users are dropped first."""
 _BLOCK: Final = 2**16
 _AT_ONCE: Final = 256
 """Most requests of a forward pass."""
@@ -50,8 +50,8 @@ def answer_stream(
     """Answer every line of `source` until it ends: the nth answer is that of the nth line.
 
     What has arrived is answered with one forward pass, and each answer is written at once. A line
-    that is no request, a blank one too, is answered with `{"error": …, "line": …}`, and the stream
-    goes on.
+    that is not a request, a blank one too, is answered with `{"error": …, "line": …}`, and the
+    stream goes on.
 
     Args:
         source: lines of JSON, UTF-8; see `ucfrec.recommending.requests.StreamRequest`.

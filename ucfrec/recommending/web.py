@@ -66,7 +66,7 @@ _FAULTS: Final = {
     408: "The request's body did not arrive in time.",
     413: "The body is too large.",
     431: "Too many headers, or too long ones.",
-    500: "A defect, or no memory; the server's standard error says more.",
+    500: "A bug, or out of memory; see the server's standard error.",
     503: "Too many requests wait; try again later.",
     504: "No answer in time.",
 }
@@ -96,7 +96,7 @@ def _host(given: str) -> str:
         return f"[{IPv6Address(given.strip('[]'))}]"
     if not _HOST.fullmatch(given):
         raise InputError(
-            f"--allowed-hosts: {given!r} is no host; write names or addresses without a port, "
+            f"--allowed-hosts: {given!r} is not a host; write names or addresses without a port, "
             "*.example.org, or *"
         )
     return given
@@ -230,7 +230,7 @@ async def _answered(
         return _HUNG_UP, {"error": "the client closed the connection"}
     except Exception:
         traceback.print_exc(file=sys.stderr)
-        return 500, {"error": "the server has a defect or no memory; its log says more"}
+        return 500, {"error": "internal error (a bug, or out of memory); see the server's log"}
     if isinstance(outcome, Answer):
         if exposures is not None:
             exposures.add(request.user_id, outcome)
@@ -253,7 +253,7 @@ async def _body(http: HTTPRequest, most: int) -> bytes:
 
 
 def _response(status: int, body: Any, headers: Any = None) -> Response:
-    # One-line errors may quote text that is no Unicode; \u escapes can carry it.
+    # One-line errors may quote text that is not Unicode; \u escapes can carry it.
     return Response(json_text(body), status, headers, media_type=_JSON)
 
 

@@ -72,7 +72,8 @@ def write_report(
             `item_id`; None for none.
 
     Raises:
-        InputError: a folder is no run, a file has no such rows or features, or `out` is a folder.
+        InputError: a folder is not a run, a file has no such rows or features, or `out` is a
+            folder.
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")

@@ -173,20 +173,20 @@ def row_from_json(value: object, where: str) -> ResultRow:
         where: origin of `value` (file and line), for messages.
 
     Raises:
-        InputError: `value` is no object, or a field is missing, unknown or of a wrong type.
+        InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
     """
     if not isinstance(value, dict):
-        raise InputError(f"{where} is no result row; delete it to measure it again")
+        raise InputError(f"{where} is not a result row; delete it to measure it again")
     try:
         row = _ROWS.validate_python(value)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         place = ".".join(map(str, first["loc"]))
-        raise InputError(f"{where} is no result row: {place!r:.60}: {first['msg']}") from None
+        raise InputError(f"{where} is not a result row: {place!r:.60}: {first['msg']}") from None
     except RecursionError:
-        raise InputError(f"{where} is no result row: it is nested too deeply") from None
+        raise InputError(f"{where} is not a result row: it is nested too deeply") from None
     if row.metric not in row.metrics:
-        raise InputError(f"{where} is no result row: its metrics lack {row.metric!r:.60}")
+        raise InputError(f"{where} is not a result row: its metrics lack {row.metric!r:.60}")
     return row
 
 

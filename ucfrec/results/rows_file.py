@@ -22,7 +22,7 @@ def read_rows(path: Path) -> list[ResultRow]:
     """Read the rows of a file; none if it does not exist.
 
     Raises:
-        InputError: a line is no result row, or the file is not UTF-8 text.
+        InputError: a line is not a result row, or the file is not UTF-8 text.
     """
     return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
 
@@ -68,7 +68,7 @@ def read_lines(path: Path) -> list[tuple[int, object]]:
             values.append((number, json.loads(line)))
         except (ValueError, RecursionError):
             raise InputError(
-                f"{path}, line {number} is no result row; delete the line to measure it again"
+                f"{path}, line {number} is not a result row; delete the line to measure it again"
             ) from None
     return values
 

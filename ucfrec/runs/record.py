@@ -57,7 +57,7 @@ def _whole(value: object) -> object:
 def _levels(quantiles: dict[str, float]) -> dict[str, float]:
     for level in quantiles:
         if not 0 <= float(level) <= 1:
-            raise ValueError(f"{level:.20} is no share")
+            raise ValueError(f"{level:.20} is not a share")
     if not quantiles:
         raise ValueError("there are none")
     return quantiles
@@ -225,7 +225,7 @@ class RunRecord(TrainingRecord):
     refit_of: dict[str, Any] | None = None
     """Configuration and rule of the run that this one repeats on all rows (`ucfrec.runs.refit`)."""
     update: Update | None = None
-    """None for a run that was trained from nothing."""
+    """None for a run that was trained from scratch."""
     augmentation: AugmentationReport | None = None
     policy: Fit | None = None
     reward_model: ItemRewardReport | None = None

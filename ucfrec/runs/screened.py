@@ -59,6 +59,8 @@ def train_screened(
         InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no
             column of observed states would be left.
     """
+    if how is not None and how not in SCREENINGS:
+        raise InputError(f"screen is {how!r}; use one of {', '.join(SCREENINGS)}")
     started = read_record(out) if (out / RUN).exists() else None
     screening = None if started is None else started.screening
     before = None if screening is None else screening.how

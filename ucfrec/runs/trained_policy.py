@@ -298,7 +298,7 @@ def _returns(path: Path) -> Float32Array:
     with damage_explained(path, REMEDY):
         returns = load_tensors(path)[0]["returns"]
         if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
-            raise ValueError("returns are no vector of numbers")
+            raise ValueError("returns are not a vector of numbers")
         if not bool(torch.isfinite(returns).all()):
             raise ValueError("returns are not finite")
         return np.asarray(returns.numpy())

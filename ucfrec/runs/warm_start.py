@@ -18,7 +18,7 @@ from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SHARE: Final = 1 / 16
-"""Steps of a warm training, as a share of those of one from nothing."""
+"""Steps of a warm training, as a share of those of one from scratch."""
 _SCALES: Final = ("state_mean", "state_std", "return_scale", "lowest_return_to_go")
 """Buffers of a policy that its weights were trained with."""
 _CRM_EPOCHS: Final = 5
@@ -77,7 +77,7 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
     """The settings of a warm training.
 
     Args:
-        share: of the steps and epochs of a training from nothing.
+        share: of the steps and epochs of a training from scratch.
     """
     few = max(1, round(share * config.train.steps))
     train = replace(

@@ -87,7 +87,7 @@ def default_space(policy: str, by_value: bool) -> Space:
 
     Args:
         by_value: whether trials are measured by the estimated value. The training then searches
-            the reward weight itself in every trial, so it is no setting of the search.
+            the reward weight itself in every trial, so it is not a setting of the search.
     """
     policy_type = policy_class(policy)
     space: Space = {} if by_value else REWARD_WEIGHTS

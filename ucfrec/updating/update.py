@@ -33,7 +33,7 @@ class UpdateOptions:
     append: AppendOptions = field(default_factory=AppendOptions)
     """How the store grows."""
     share: float = SHARE
-    """Steps of the training, as a share of those of a training from nothing."""
+    """Steps of the training, as a share of those of a training from scratch."""
     seed: int | None = None
     """Of everything random; None for that of the run."""
     refit: bool = True
@@ -51,7 +51,7 @@ def update_run(
     mapping: LogMapping | None = None,
     options: UpdateOptions | None = None,
 ) -> RunRecord:
-    """Make a run that has learned from new logs, too; an interrupted update goes on.
+    """Make a run that has learned from new logs, too; an interrupted update is resumed.
 
     The settings are those of the run. Its policy and augmentation models start from its weights,
     with fewer steps; effects of the user model and the decision rule are looked for near those of
@@ -93,7 +93,7 @@ def update_run(
     about = {"update": update, "dropped_observations": trained.dropped}
     record = train_run(opened, out, config, about, initial=run)
     if record.update is None or record.update.run != trained.fingerprint:
-        raise InputError(f"{out} is no update of {run}; name another run folder")
+        raise InputError(f"{out} is not an update of {run}; name another run folder")
     if record.update.verdict is None:
         record = _compared(out, record, trained, before, opened, counts)
     if options.refit:
@@ -151,7 +151,7 @@ def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
 
 
 def _from_nothing(record: RunRecord) -> Config:
-    """The settings that a training from nothing had, of which the run is an update or refit."""
+    """The settings that a training from scratch had, of which the run is an update or refit."""
     config: Config = record.config
     if record.update is not None:
         return config_from_dict(record.update.settings_from_nothing)

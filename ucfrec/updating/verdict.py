@@ -12,6 +12,7 @@ from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
 from ucfrec.off_policy.score import scored_steps
+from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.drift import as_known
@@ -149,7 +150,7 @@ def _doubt(weights: Float64Array, user: IntArray) -> str:
                 f"the mean weight of the {name} run is {mean:.3g} ± {error:.2g} where 1 is "
                 "expected: the log lacks its choices, or propensities are wrong"
             )
-    effective = weights.sum(axis=0) ** 2 / np.maximum((weights**2).sum(axis=0), 1e-12)
-    if effective.min() < _LEAST_STEPS:
-        return f"the weights leave {effective.min():.0f} effective steps"
+    effective = min(effective_number(column) for column in weights.T)
+    if effective < _LEAST_STEPS:
+        return f"the weights leave {effective:.0f} effective steps"
     return ""

@@ -128,7 +128,7 @@ class EffectSearch:
         """Args:
         design: training rows.
         held_out: rows that choose.
-        begin: where to begin; None for a search from nothing.
+        begin: where to begin; None for a search from scratch.
         """
         self.design, self.held_out, self._begin = design, held_out, begin
         self.effects = design.mean_effect()

@@ -75,11 +75,11 @@ class BoostedTrees:
             count: number of inputs.
 
         Raises:
-            ValueError: they are no trees.
+            ValueError: they are not trees.
         """
         inputs, thresholds, leaves, base = (tensors[name] for name in _TENSORS)
         if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
-            raise ValueError("inputs are no numbers of inputs")
+            raise ValueError("inputs are not numbers of inputs")
         if bool(((inputs < 0) | (inputs >= count)).any()):
             raise ValueError("inputs are beyond the last input")
         if any(each.dtype != torch.float64 for each in (thresholds, leaves, base)):

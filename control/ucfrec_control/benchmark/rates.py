@@ -78,7 +78,7 @@ def _require_rates(path: Path, rates: Mapping[str, object]) -> None:
     for method, rate in rates.items():
         if method not in _DIFFERING or not isinstance(rate, float | int) or not 0 < rate < 1:
             raise InputError(
-                f"{path}: {method!r:.60} = {rate!r:.60} is no learning rate of a method; there "
+                f"{path}: {method!r:.60} = {rate!r:.60} is not a learning rate of a method; there "
                 f"are {', '.join(_DIFFERING)}"
             )
 

@@ -103,7 +103,7 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     kind, names = _kind_of(file, tensors)
     known = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
     if other := sorted(n for n in tensors.keys() - known if n.startswith(("actor.", "features"))):
-        raise _refused(file, f"its network has {other[0]}, which is no layer of a perceptron")
+        raise _refused(file, f"its network has {other[0]}, which is not a layer of a perceptron")
     for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
         if not _is_plain(tensors[name]):
             raise _refused(file, f"{name} is not of finite numbers stored one by one")

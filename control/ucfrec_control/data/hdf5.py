@@ -50,7 +50,7 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
         name: of the data set, which may lie in groups: `infos/final_observations`.
 
     Raises:
-        InputError: it is no data set of numbers, claims more values than the file can hold, or
+        InputError: it is not a data set of numbers, claims more values than the file can hold, or
             cannot be read.
     """
     parent = file

@@ -114,7 +114,9 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
         InputError: `identifier` is invalid or already exists, or the environment is not registered.
     """
     if _IDENTIFIER.fullmatch(identifier) is None:
-        raise InputError(f"{identifier!r} is no Minari identifier, such as mujoco/hopper/medium-v0")
+        raise InputError(
+            f"{identifier!r} is not a Minari identifier, such as mujoco/hopper/medium-v0"
+        )
     folder = _root() / identifier
     if folder.exists():
         raise InputError(f"{folder} exists already; remove it or name another dataset")
@@ -245,7 +247,7 @@ def _vectors(values: Any, source: str) -> Array:
     if isinstance(values, Mapping) and {"achieved_goal", "observation"} <= values.keys():
         values = np.concatenate([values["achieved_goal"], values["observation"]], axis=1)
     if not isinstance(values, np.ndarray) or values.ndim != 2:
-        raise InputError(f"{source}: its observations or actions are no vectors")
+        raise InputError(f"{source}: its observations or actions are not vectors")
     return values
 
 

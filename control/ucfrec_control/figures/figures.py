@@ -130,7 +130,7 @@ def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
 
 def _runs(folder: Path) -> Iterator[_Run]:
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder of runs; check the path")
+        raise InputError(f"{folder} is not a folder of runs; check the path")
     for file in sorted(folder.rglob(RUN)):
         record = read_run(file.parent)
         if "env_id" in record.data.others:

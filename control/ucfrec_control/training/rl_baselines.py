@@ -64,7 +64,7 @@ def _rl_config(value: object) -> RLConfig:
     if isinstance(value, RLConfig):
         return value
     if not isinstance(value, dict):
-        raise InputError("its settings are no table")
+        raise InputError("its settings are not a table")
     return RLConfig(**value)
 
 

@@ -11,7 +11,7 @@ PLAIN: Final = ("policy.exposure=false", "rule.choose=false")
 return."""
 SHARED: Final = ("policy.exposure=true", "rule.choose=true")
 """The shared components, which UCF has by default, for any policy of items: exposure features, and
-the decision rule chosen on the log, with the reward weight by the reward model."""
+the decision rule chosen on the log, with a reward weight."""
 BASELINES: Final[Mapping[str, Method]] = {
     "sasrec": Method("sasrec", conditioned=False),
     "bc": Method("bc", conditioned=False),

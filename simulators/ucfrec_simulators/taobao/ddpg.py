@@ -21,12 +21,12 @@ from torch import nn
 
 from ucfrec.acting.rollout import Actor, Step, rollout
 from ucfrec.acting.uniform import Memoryless, Uniform
-from ucfrec.arrays import BoolArray, Float32Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import versions
-from ucfrec_simulators.behaviors import Actions, SessionMixture, truncated_normal
+from ucfrec_simulators.behaviors import SessionMixture, truncated_normal
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
     MAX_CLICKS,
@@ -73,7 +73,7 @@ class Noisy(Memoryless):
         self._network, self._high, self._noise = network, high, noise
         self._generator = np.random.default_rng(seed)
 
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, Float32Array]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array]:
         """Draw actions (N, A); returns them and their densities (N,)."""
         mean = _forward(self._network, observations / self._high)
         return truncated_normal(mean, self._noise, self._generator)
@@ -115,7 +115,7 @@ class Training:
         """Mark that the previous sessions in `rows` have ended."""
         self._ended[rows] = True
 
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Actions, Float32Array]:
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array]:
         """Learn from the previous step, whose next observations are `observations`; then act.
 
         Returns:
@@ -135,7 +135,7 @@ class Training:
         self._taken = _Taken(scaled, np.flatnonzero(live))
         return actions, density
 
-    def observe(self, actions: Actions, rewards: Float32Array) -> None:
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Keep the step until its next observations are known."""
         assert self._taken is not None
         self._taken.actions, self._taken.rewards = actions, rewards / np.float32(MAX_CLICKS)
@@ -167,11 +167,11 @@ class _Taken:
     """(N, O), scaled."""
     rows: IntArray
     """(M,) live rows."""
-    actions: Actions = field(init=False)
+    actions: Array = field(init=False)
     rewards: Float32Array = field(init=False)
 
 
-class _Spaces(gymnasium.Env[Float32Array, Actions]):
+class _Spaces(gymnasium.Env[Float32Array, Array]):
     """The spaces that Stable-Baselines3 needs; the sessions themselves are run by `rollout`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:

@@ -104,7 +104,7 @@ def test_the_search_writes_rows_and_a_choice_once(
     assert main(arguments) == 0
     assert read_rows(out / "results.jsonl") == rows
     assert "0 of them left" in capsys.readouterr().err
-    # A rehearsal with fewer steps is no part of the search.
+    # A rehearsal with fewer steps is not part of the search.
     assert main([*arguments[:-1], "2", "--toml", str(tmp_path / "rehearsed.toml")]) == 0
     assert main(["rates", "--out", str(out), "--show-only"]) == 0
     assert "2 of them left" in (printed := capsys.readouterr()).err
@@ -133,7 +133,7 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
         "small": {"dt": 0.01, "ucf": 0.003},
     }
     for text, says in (
-        ("[small]\nnone = 0.1\n", "'none' = 0.1 is no learning rate of a method"),
+        ("[small]\nnone = 0.1\n", "'none' = 0.1 is not a learning rate of a method"),
         ("[small]\ndt = 7\n", "'dt' = 7 is no"),
         ("small = 1\n", "'small' = 1 is no"),
         ("[", "is not TOML"),
@@ -144,7 +144,7 @@ def test_a_file_of_rates_keeps_its_other_rates_and_is_checked(tmp_path: Path) ->
     with pytest.raises(InputError, match="does not exist"):
         read_rates(tmp_path / "missing.toml")
     # Untrusted rows may name methods of any text.
-    with pytest.raises(InputError, match="is no learning rate of a method"):
+    with pytest.raises(InputError, match="is not a learning rate of a method"):
         write_rates(tmp_path / "new.toml", "small", {"dt\n[full]\nx": 0.1})
     assert not (tmp_path / "new.toml").exists()
 

@@ -205,7 +205,8 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"), [("{}", "holds no list of result rows"), ("[1]", "row 1 is no result row")]
+    ("content", "says"),
+    [("{}", "holds no list of result rows"), ("[1]", "row 1 is not a result row")],
 )
 def test_json_of_something_else_is_refused(tmp_path: Path, content: str, says: str) -> None:
     (tmp_path / "x.json").write_text(content)

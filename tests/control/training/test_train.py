@@ -393,7 +393,7 @@ def test_a_benchmark_goes_on_where_it_was(
         (["--method", "nope"], "no method is called nope; there are bc, bc-10"),
         (["--seeds", "0"], "0 training seeds are requested"),
         (["--file", "nowhere"], "nowhere.hdf5 does not exist"),
-        (["--results", "{rows}"], "rows.jsonl, line 1 is no result row"),
+        (["--results", "{rows}"], "rows.jsonl, line 1 is not a result row"),
     ],
 )
 def test_what_no_benchmark_can_be_of_is_refused(

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import OneUser, Plain
+from tests.support.single_session import SingleSession
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Step, rollout
@@ -33,7 +34,6 @@ from ucfrec_simulators.behaviors import Constant
 from ucfrec_simulators.kuai.behaviors import MASK, oracle, random_mask
 from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv
 from ucfrec_simulators.kuai.logs import sessions_by_exit
-from ucfrec_simulators.session_env import SingleSession
 
 RULES = [replace(rule, sliced=sliced) for rule in EXITS.values() for sliced in (False, True)]
 

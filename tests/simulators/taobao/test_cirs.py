@@ -5,8 +5,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from tests.support.real_data import data_folder
+from tests.support.single_session import SingleSession
 from ucfrec.acting.rollout import rollout
-from ucfrec_simulators.session_env import SingleSession
 from ucfrec_simulators.taobao.cirs import SIMULATOR, CirsTaobao
 
 pytestmark = pytest.mark.realdata

@@ -1,0 +1,40 @@
+"""An environment of one session, as Gymnasium's own checks take it."""
+
+from typing import Any, SupportsFloat, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from ucfrec.arrays import Array, Float32Array
+
+
+class SingleSession(gymnasium.Env[Float32Array, Array]):
+    """A plain Gymnasium environment of a vector environment with one session."""
+
+    def __init__(self, environment: VectorEnv[Float32Array, Array, Array]) -> None:
+        self._environment = environment
+        self.observation_space = environment.single_observation_space
+        self.action_space = environment.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
+        """Start a session; returns the observation (O,) and info."""
+        super().reset(seed=seed, options=options)
+        observations, infos = self._environment.reset(seed=seed, options=options)
+        return observations[0], _first(infos)
+
+    def step(self, action: Array) -> tuple[Float32Array, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Take one action; returns observation (O,), reward, terminated, truncated and info."""
+        observations, rewards, terminated, truncated, infos = self._environment.step(
+            np.asarray(action)[None]
+        )
+        ended = bool(terminated[0] | truncated[0])
+        observation = cast(Float32Array, infos["final_obs"][0]) if ended else observations[0]
+        info = _first(infos["final_info"] if ended else infos)
+        return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+
+def _first(infos: dict[str, Any]) -> dict[str, Any]:
+    return {key: value[0] for key, value in infos.items() if not key.startswith("_")}

@@ -46,7 +46,7 @@ def test_q_is_what_is_still_to_come() -> None:
     assert np.abs(modelled.q - features[:, 2]).mean() < 0.03
     assert np.abs(modelled.reward - features[:, 1]).mean() < 0.01
     assert 4 < report.iterations < 40
-    assert report.settled
+    assert report.converged
     assert report.reward_r2 > 0.99
     assert report.td_loss < 1e-3
     assert abs(report.td_bias) < 0.01
@@ -74,6 +74,6 @@ def test_q_that_runs_away_is_stopped_and_said() -> None:
         yield logged, five
 
     report = fit_models(chunks, np.abs(reward), session, seed=0)[1]
-    assert not report.settled
+    assert not report.converged
     assert report.iterations < 400
     assert np.isfinite(report.td_loss)

@@ -139,7 +139,7 @@ def test_wrong_arrays_are_input_errors(names: list[str], terms: Float64Array, sa
 def report(steps: LoggedSteps) -> OffPolicyReport:
     verdict = conclude(steps, seed=0)
     terms = influences(session_terms(steps)["SNPDIS"])
-    models = ModelReport(reward_r2=0, td_loss=0, td_bias=0, iterations=1, settled=True)
+    models = ModelReport(reward_r2=0, td_loss=0, td_bias=0, iterations=1, converged=True)
     return OffPolicyReport([], [], verdict, models, steps.returns, None, terms)
 
 

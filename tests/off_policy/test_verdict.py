@@ -195,7 +195,7 @@ def test_users_are_never_judged_by_models_that_saw_them() -> None:
 def test_the_step_at_which_the_logs_stop_telling() -> None:
     steps, _ = logs(2000, length=20)
     diagnosis = diagnose(steps)
-    stops = diagnosis.stops_telling_at
+    stops = diagnosis.unsupported_from_step
     assert stops is not None
     assert 4 < stops < 20
     assert all(n >= 200 for n in diagnosis.effective_by_step[: stops - 1])

@@ -32,11 +32,10 @@ class ItemIndex:
     which too few candidates are left are scored exactly.
     """
 
-    def __init__(self, scorer: Scorer, kind: str, seed: int = 0) -> None:
+    def __init__(self, scorer: Scorer, kind: str) -> None:
         """
         Args:
             scorer: of a policy of items; its weights must not change afterwards.
-            seed: of the lists and of the sessions on which the recall is measured.
 
         Raises:
             InputError: faiss is not installed, or the rule or the policy need scores of all items.
@@ -57,7 +56,7 @@ class ItemIndex:
                 f"policies of kind {kind!r} score items in a way of their own under this rule; "
                 "leave --approximate out"
             )
-        self._scorer, self._rng = scorer, np.random.default_rng(seed)
+        self._scorer, self._rng = scorer, np.random.default_rng(0)
         vectors = scorer.vectors()
         size = vectors.shape[1]
         lists = max(1, round(len(vectors) ** 0.5)) if len(vectors) >= _FEWEST else 1
@@ -65,7 +64,7 @@ class ItemIndex:
         self._index = faiss.IndexIVFFlat(
             faiss.IndexFlatIP(size), size, lists, faiss.METRIC_INNER_PRODUCT
         )
-        self._index.cp.seed = seed
+        self._index.cp.seed = 0
         self._index.nprobe = max(_AT_LEAST, lists // _SHARE)
         self._index.train(vectors)
         self._index.add(vectors)

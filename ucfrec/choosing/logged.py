@@ -36,7 +36,7 @@ class LoggedScores:
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
     ) -> None:
         self._scorer, self._view, self._episodes, self._steps = scorer, view, episodes, steps
-        self._kept: dict[tuple[object, ...], _Asked] = {}
+        self._kept: dict[tuple[object, ...], _Outputs] = {}
 
     @torch.no_grad()
     def of(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
@@ -56,15 +56,15 @@ class LoggedScores:
                     key = first, rule.target, rule.minimum_target, widest.reach, weighted
                     if key not in kept:
                         known = known or logged_history(widest, self._view, *at)[0]
-                        kept[key] = _Asked.of(each, known, weighted)
-                    asked = kept[key]
+                        kept[key] = _Outputs.of(each, known, weighted)
+                    outputs = kept[key]
                     seen = seen_before(self._view, *at) if rule.exclude_seen else None
-                    scores.append(each.scores_of(asked.query, asked.history, excluded=seen))
+                    scores.append(each.scores_of(outputs.query, outputs.history, excluded=seen))
                 yield part, scores
                 bar.update(part.stop - part.start)
 
 
-class _Asked(NamedTuple):
+class _Outputs(NamedTuple):
     """What a batch of logged steps asks under one target, and what rules need besides."""
 
     query: Query
@@ -72,7 +72,7 @@ class _Asked(NamedTuple):
     """With windows of the step itself."""
 
     @classmethod
-    def of(cls, scorer: Scorer, known: History, weighted: bool) -> "_Asked":
+    def of(cls, scorer: Scorer, known: History, weighted: bool) -> "_Outputs":
         aimed = scorer.with_target(known)
         last = aimed.windows.last(1)
         # A view would keep the whole windows.

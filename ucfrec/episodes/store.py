@@ -21,6 +21,7 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import read_ids
+from ucfrec.results.table import new_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,11 +119,7 @@ class EpisodeStore(EpisodeView):
         Raises:
             InputError: matplotlib is not installed.
         """
-        try:
-            from matplotlib import pyplot
-        except ModuleNotFoundError:
-            raise InputError("a plot needs matplotlib; install ucfrec[plots]") from None
-        axes = pyplot.subplots()[1] if ax is None else ax
+        axes = new_axes() if ax is None else ax
         axes.hist(self.returns, bins=30)
         axes.set_xlabel(f"return of an episode (sum of {self.record.reward})")
         axes.set_ylabel("episodes")

@@ -38,6 +38,8 @@ RUN_RECORD: Final = "run.json"
 _BLOCK: Final = 2**19
 _THREADS: Final = 2
 _LARGEST: Final = 2**48
+_SMALL: Final = 2**26
+"""Bytes of a file that is always read to check it."""
 Text = InstanceOf[str]
 """A text; unlike pydantic's own, file names may have bytes that are not valid Unicode."""
 Count = Annotated[int, Field(strict=True, ge=0, lt=_LARGEST)]
@@ -101,15 +103,15 @@ class Sealed:
         if name in self.files and (fault := self._fault(name)):
             raise self._error(name, fault)
 
-    def require_small(self, largest: int = 2**26) -> None:
-        """Check the sizes of all files, and the content of those of at most `largest` bytes.
+    def require_small(self) -> None:
+        """Check the sizes of all files, and the content of small ones.
 
         Raises:
             InputError: the first file that is missing or has another content.
         """
         self.require_sizes()
         for name, (size, _) in self.files.items():
-            if size <= largest:
+            if size <= _SMALL:
                 self.require(name)
 
     def faults(self) -> Iterator[tuple[str, str]]:

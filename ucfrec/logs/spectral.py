@@ -50,7 +50,7 @@ class SparseRows:
 
 
 def right_singular_vectors(
-    matrix: SparseRows, by_column: Float64Array, rank: int, seed: int = 0
+    matrix: SparseRows, by_column: Float64Array, rank: int
 ) -> tuple[Float64Array, Float64Array]:
     """Largest singular values and right singular vectors of a matrix whose columns are divided.
 
@@ -69,7 +69,7 @@ def right_singular_vectors(
         beyond the rank of the matrix are 0, and so are their vectors.
     """
     m, n = matrix.shape
-    random = np.random.RandomState(seed)
+    random = np.random.RandomState(0)
     width = rank + _OVERSAMPLES
     if m < n:
         basis = np.zeros((n, width))

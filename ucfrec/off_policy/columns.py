@@ -90,7 +90,7 @@ def diagnosis_columns(diagnosis: Diagnosis) -> dict[str, Any]:
         "sessions_without_propensity": diagnosis.left_out,
         "effective_users": diagnosis.effective_users,
         "effective_by_step": list(diagnosis.effective_by_step),
-        "stops_telling_at": diagnosis.stops_telling_at,
+        "unsupported_from_step": diagnosis.unsupported_from_step,
         "weight_tests": [asdict(test) for test in diagnosis.tests],
         "mean_weight": diagnosis.mean_weight,
         "pareto_tail": diagnosis.tail,

@@ -74,7 +74,7 @@ class Diagnosis:
     lack are worth; up to the sampling error of PDIS."""
 
     @property
-    def stops_telling_at(self) -> int | None:
+    def unsupported_from_step(self) -> int | None:
         """First step (from 1) with fewer effective users than an estimate needs; None if the logs
         suffice to the end."""
         few = [n < ENOUGH_USERS for n in self.effective_by_step]

@@ -224,7 +224,7 @@ def normalised_by_step(
 
     The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it
     over all sessions. Its influence (the derivative by a session's share) stands for it in the
-    bootstrap, which so needs one number a session instead of one a session and step.
+    bootstrap, which then needs one number per session rather than one per step.
 
     Args:
         left: (N,) reward, or what the model leaves of it.
@@ -299,8 +299,8 @@ class StepValue:
             interval = f" [{self.lift.low:+.4g}, {self.lift.high:+.4g}]"
         return (
             f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
-            f"logging policy's distribution of histories: {self.lift.value:+.4g}{interval} a step "
-            f"by {BEST}; no estimate of a session's return"
+            f"logging policy's distribution of histories: {self.lift.value:+.4g}{interval} "
+            f"per step by {BEST}; not an estimate of the session return"
         )
 
 

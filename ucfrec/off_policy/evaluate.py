@@ -242,11 +242,11 @@ def _declared(evaluated: EvaluatedSteps) -> str:
 
 
 def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
-    if evaluated.models.settled:
+    if evaluated.models.converged:
         return []
     return [
-        "fitted Q evaluation ran away (its values grew beyond what so many rewards can be) and was "
-        "stopped: FQE says nothing here"
+        "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
+        "stopped: ignore FQE"
     ]
 
 
@@ -302,7 +302,7 @@ def logged_steps(
     Raises:
         InputError: propensities are not probabilities, or there is only one user.
     """
-    store, plain = logged.store, _unjudged(logged, options)
+    store, plain = logged.store, _logged_only(logged, options)
     items = store.step_values(schema.ITEM, *store.all_steps()).astype(np.int64)
     group_of = _item_groups(trained, options, seed)
     group = np.where(items >= 0, group_of[items], -1)
@@ -332,7 +332,7 @@ def logged_steps(
     return EvaluatedSteps(steps, models, behavior, estimated)
 
 
-def _unjudged(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
+def _logged_only(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
     """What the logs say, without any policy. Checks the propensities before the slow scoring."""
     store = logged.store
     episodes, places = store.all_steps()

@@ -42,18 +42,18 @@ class ModelReport:
     """Mean TD error, 0 for a right model; in units of the reward."""
     iterations: int
     """Regressions of FQE, the most of any fold."""
-    settled: bool
-    """Whether Q ended within what so many rewards can be, in every fold."""
+    converged: bool
+    """Whether Q stayed below the largest possible return, in every fold."""
 
     def columns(self) -> dict[str, Any]:
         """The numbers by name, `model_…`."""
         return {f"model_{name}": value for name, value in asdict(self).items()}
 
     def __str__(self) -> str:
-        ended = "settled" if self.settled else "stopped"
+        ended = "converged" if self.converged else "stopped"
         return (
             f"on other users, R² of the reward {self.reward_r2:.3g}; FQE {ended} after "
-            f"{self.iterations} regressions, TD error {self.td_bias:+.2g} in the mean, "
+            f"{self.iterations} iterations, TD error {self.td_bias:+.2g} in the mean, "
             f"{self.td_loss:.3g} squared"
         )
 
@@ -106,7 +106,7 @@ class _Fit:
     reward: Float64Array
     q: Float64Array
     iterations: int
-    settled: bool
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -135,20 +135,20 @@ class _Sums:
         factor = cho_factor(gram + np.diag(_penalty(self.gram.sum(axis=0), int(self.rows.sum()))))
         weights = first = cho_solve(factor, rewards, check_finite=False)
         most = horizon * max(abs(reward.min()), abs(reward.max()))
-        iterations, settled = 1, True
+        iterations, converged = 1, True
         while iterations < _ROUNDS * horizon:
             iterations += 1
             before, target = weights, rewards + discount * (follows @ weights)
             weights = cho_solve(factor, target, check_finite=False)
             size = (weights @ gram @ weights / rows) ** 0.5
             if not size <= most:
-                # Root mean square above what so many rewards could be: it runs away.
-                weights, settled = before, False
+                # Root mean square above the largest possible return: it diverges.
+                weights, converged = before, False
                 break
             change = weights - before
             if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
                 break
-        return _Fit(first, weights, iterations, settled)
+        return _Fit(first, weights, iterations, converged)
 
 
 def _sums(
@@ -223,7 +223,7 @@ def _report(
         td_loss=float((errors**2).mean()),
         td_bias=float(errors.mean()),
         iterations=max(fit.iterations for fit in fits),
-        settled=all(fit.settled for fit in fits),
+        converged=all(fit.converged for fit in fits),
     )
 
 

@@ -99,7 +99,7 @@ def resample(
     """Draw clusters with replacement, each with all its sessions.
 
     Args:
-        above: (S, K), a row a session, a column a number Σ above / Σ below.
+        above: (S, K), one row per session, one column per ratio Σ above / Σ below.
         below: (S, K).
         cluster: (S,) of each session, any integers; None where each session is its own.
     """

@@ -136,7 +136,7 @@ def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
             f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
             "propensity: estimates that weigh leave these sessions out"
         )
-    stops = diagnosis.stops_telling_at
+    stops = diagnosis.unsupported_from_step
     if stops is not None:
         said.append(
             f"from step {stops} on fewer than {ENOUGH_USERS} effective users are left: the logs "

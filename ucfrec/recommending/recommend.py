@@ -216,6 +216,17 @@ def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
     ids = np.asarray(list(candidates))
     if ids.ndim != 1 or len(ids) == 0:
         raise InputError("candidates is empty or nested; give a list of item_ids, or None for all")
+    excluded = torch.ones(len(index), dtype=torch.bool)
+    excluded[torch.from_numpy(candidate_numbers(index, ids))] = False
+    return excluded
+
+
+def candidate_numbers(index: IdLookup, ids: Array) -> IntArray:
+    """Numbers (N,) of the items that may be recommended.
+
+    Raises:
+        InputError: the policy does not know some of them.
+    """
     numbers = index.numbers(ids)
     if (numbers < 0).any():
         unknown = ids[numbers < 0].tolist()
@@ -223,9 +234,7 @@ def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
             f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
             f"({some_of(unknown)}); leave them out"
         )
-    excluded = torch.ones(len(index), dtype=torch.bool)
-    excluded[torch.from_numpy(numbers)] = False
-    return excluded
+    return numbers
 
 
 def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:

@@ -13,7 +13,14 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.recommend import best_of, sessions_of, some_of, uniforms, users_at_once
+from ucfrec.recommending.recommend import (
+    best_of,
+    candidate_numbers,
+    sessions_of,
+    some_of,
+    uniforms,
+    users_at_once,
+)
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -69,7 +76,7 @@ def exact_id(given: int | str) -> int | str:
     return str(given) if isinstance(given, int) and abs(given) > _LARGEST_EXACT else given
 
 
-class _Asked(NamedTuple):
+class _Prepared(NamedTuple):
     """A request that can be answered."""
 
     number: int
@@ -173,20 +180,20 @@ class Responder:
         """
         with self._busy:
             outcomes: list[Answer | InputError | None] = [None] * len(requests)
-            asked = []
+            prepared = []
             for number, request in enumerate(requests):
                 try:
-                    asked.append(self._asked(number, request))
+                    prepared.append(self._prepared(number, request))
                 except InputError as error:
                     outcomes[number] = error
             at_once = users_at_once(len(self._items))
-            for first in range(0, len(asked), at_once):
-                batch = asked[first : first + at_once]
+            for first in range(0, len(prepared), at_once):
+                batch = prepared[first : first + at_once]
                 for one, answer in zip(batch, self._scored(batch), strict=True):
                     outcomes[one.number] = answer
             return [outcome for outcome in outcomes if outcome is not None]
 
-    def _asked(self, number: int, request: Request) -> _Asked:
+    def _prepared(self, number: int, request: Request) -> _Prepared:
         history = self._reader.read(request.history, request.user_id)
         known = self._items.numbers(history.item_ids)
         self._rows[0] += int((known < 0).sum())
@@ -198,56 +205,50 @@ class Responder:
                 f"does not know ({some_of(unknown)}); leave them out"
             )
         seen = self._items.numbers(history.seen) if self._filter_seen else np.empty(0, np.int64)
-        allowed = None if request.candidates is None else self._candidates(request.candidates)
+        allowed = (
+            None
+            if request.candidates is None
+            else candidate_numbers(self._items, _array(request.candidates))
+        )
         k = self._k if request.k is None else request.k
         request_id = request.request_id or uuid4().hex
-        return _Asked(
+        return _Prepared(
             number, request.user_id, request_id, k, history, known, seen[seen >= 0], allowed
         )
 
-    def _candidates(self, candidates: Sequence[int | str]) -> IntArray:
-        numbers = self._items.numbers(_array(candidates))
-        if (numbers < 0).any():
-            unknown = [candidates[n] for n in np.flatnonzero(numbers < 0).tolist()]
-            raise InputError(
-                f"{len(unknown)} of {len(candidates)} candidates are items that the policy does "
-                f"not know ({some_of(unknown)}); leave them out"
-            )
-        return numbers
-
-    def _scored(self, asked: Sequence[_Asked]) -> list[Answer]:
-        latest = self._latest(asked)
+    def _scored(self, prepared: Sequence[_Prepared]) -> list[Answer]:
+        latest = self._latest(prepared)
         users = self._users.numbers(latest.users)
         self._requests[0] += int((users < 0).sum())
         self._requests[1] += len(users)
         sessions = sessions_of(self.trained, latest, users, self._scorer.length)
-        left_out = [one.left_out for one in asked]
-        rows = [np.repeat(np.arange(len(asked)), [len(each) for each in left_out])]
+        left_out = [one.left_out for one in prepared]
+        rows = [np.repeat(np.arange(len(prepared)), [len(each) for each in left_out])]
         if self.rule.exclude_seen:
             rows.append(latest.owner)
             left_out.append(latest.item_ids)
         scores = self._scorer.scores(
             sessions,
             (torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(left_out))),
-            self._excluded(asked),
+            self._excluded(prepared),
             empty=True,
         )
-        return self._best(asked, scores)
+        return self._best(prepared, scores)
 
-    def _excluded(self, asked: Sequence[_Asked]) -> Tensor | None:
+    def _excluded(self, prepared: Sequence[_Prepared]) -> Tensor | None:
         """(B, n_items) true for items that are not candidates; None if all may be recommended."""
-        if all(one.allowed is None for one in asked):
+        if all(one.allowed is None for one in prepared):
             return None
-        excluded = torch.zeros(len(asked), len(self._items), dtype=torch.bool)
-        for row, one in enumerate(asked):
+        excluded = torch.zeros(len(prepared), len(self._items), dtype=torch.bool)
+        for row, one in enumerate(prepared):
             if one.allowed is not None:
                 excluded[row] = True
                 excluded[row, one.allowed] = False
         return excluded
 
-    def _latest(self, asked: Sequence[_Asked]) -> Histories:
+    def _latest(self, prepared: Sequence[_Prepared]) -> Histories:
         """The latest sessions of the requests, with the policy's numbers of items."""
-        histories = [one.history for one in asked]
+        histories = [one.history for one in prepared]
         observations = None
         if self.trained.record.observation_size:
             observations = np.asarray([each.observation for each in histories], dtype=np.float32)
@@ -256,9 +257,9 @@ class Responder:
             flat = [each for history in histories for each in history.session_ids or ()]
             sessions = _array(flat)
         batch = Histories(
-            users=_array([one.user_id for one in asked]),
-            owner=np.repeat(np.arange(len(asked)), [len(one.known) for one in asked]),
-            item_ids=np.concatenate([one.known for one in asked]),
+            users=_array([one.user_id for one in prepared]),
+            owner=np.repeat(np.arange(len(prepared)), [len(one.known) for one in prepared]),
+            item_ids=np.concatenate([one.known for one in prepared]),
             rewards=np.concatenate([each.rewards for each in histories]),
             timestamps=np.concatenate([each.timestamps for each in histories]),
             session_ids=sessions,
@@ -271,18 +272,19 @@ class Responder:
             self.trained.record.session_gap_ms
         )
 
-    def _best(self, asked: Sequence[_Asked], scores: Tensor) -> list[Answer]:
+    def _best(self, prepared: Sequence[_Prepared], scores: Tensor) -> list[Answer]:
         n_items, drawn = scores.shape[1], None
         if self.rule.draws:
             users, requests = (
-                _array([getattr(one, name) for one in asked]) for name in ("user_id", "request_id")
+                _array([getattr(one, name) for one in prepared])
+                for name in ("user_id", "request_id")
             )
             drawn = uniforms(users, requests, n_items + 1, self._seed)
         answers: dict[int, Answer] = {}
-        sizes = [min(one.k, n_items) for one in asked]
+        sizes = [min(one.k, n_items) for one in prepared]
         for k in set(sizes):
             rows = [n for n, size in enumerate(sizes) if size == k]
-            whole = len(rows) == len(asked)
+            whole = len(rows) == len(prepared)
             of_rows = scores if whole else scores[rows]
             draws = drawn if drawn is None or whole else drawn[rows]
             found = best_of(self.rule, of_rows, k, draws)
@@ -292,8 +294,8 @@ class Responder:
             columns = (each.tolist() for each in (self._items.ids[numbers], values, chances))
             for row, count, items, logs, shares in zip(rows, counts, *columns, strict=True):
                 shown = items[:count], logs[:count], shares[:count]
-                answers[row] = Answer(*shown, asked[row].request_id, *self._source)
-        return [answers[row] for row in range(len(asked))]
+                answers[row] = Answer(*shown, prepared[row].request_id, *self._source)
+        return [answers[row] for row in range(len(prepared))]
 
 
 def _array(ids: Sequence[Any]) -> Array:

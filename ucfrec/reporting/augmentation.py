@@ -13,7 +13,7 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
     """Quality of the reward model and of the edits, one column per run (name, report)."""
     reports = [report for _, report in runs]
     models, moves = [r.reward_model for r in reports], [r.moves for r in reports]
-    asked = [r.actions for r in reports]
+    actions = [r.actions for r in reports]
     rows: list[tuple[str, list[Any]]] = [
         ("R² of the reward model, from state and action", [m.r2_without_z for m in models]),
         ("R² with the abduced z, which has seen the reward", [m.r2 for m in models]),
@@ -33,12 +33,12 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
          [f"{shown(m.effective_rank)} of {m.dimensions}" for m in moves]),
         ("median length of a move ‖Δ‖₂", [m.length_quantiles.get("0.5") for m in moves]),
     ]  # fmt: skip
-    if any(asked):
+    if any(actions):
         rows += [
-            ("other actions asked about", [a and a.proposals for a in asked]),
-            ("copies with another action", [a and a.copies for a in asked]),
-            ("mean change of their reward", [a and a.mean_change for a in asked]),
-            ("share of them with a higher reward", [a and a.earns_more for a in asked]),
+            ("other actions proposed", [a and a.proposals for a in actions]),
+            ("copies with another action", [a and a.copies for a in actions]),
+            ("mean change of their reward", [a and a.mean_change for a in actions]),
+            ("share of them with a higher reward", [a and a.earns_more for a in actions]),
         ]
     body = [(name, [shown(value) for value in values]) for name, values in rows]
     caption = (

@@ -51,16 +51,12 @@ class ResultTable:
         Raises:
             InputError: matplotlib is not installed, or no row has the metric.
         """
-        try:
-            from matplotlib import pyplot
-        except ModuleNotFoundError:
-            raise InputError("a plot needs matplotlib; install ucfrec[plots]") from None
         metric, frame = metric or self.rows[0].metric, self.to_frame()
         if metric not in frame:
             known = dict.fromkeys(name for row in self.rows for name in row.metrics)
             raise InputError(f"no row has the metric {metric!r}; they have {', '.join(known)}")
         frame = frame[frame[metric].notna()].iloc[::-1]
-        axes = pyplot.subplots()[1] if ax is None else ax
+        axes = new_axes() if ax is None else ax
         low, high = (
             frame.get(f"{metric}_{end}", frame[metric]).fillna(frame[metric])
             for end in ("low", "high")
@@ -126,3 +122,16 @@ class Ranking(Measured):
         *("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate"),
         "coverage",
     )
+
+
+def new_axes() -> "Axes":
+    """New matplotlib axes.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib import pyplot
+    except ModuleNotFoundError:
+        raise InputError("a plot needs matplotlib; install ucfrec[plots]") from None
+    return pyplot.subplots()[1]

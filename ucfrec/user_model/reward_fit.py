@@ -123,20 +123,20 @@ def fit_item_reward_model(
 
 
 def refit_item_reward_model(
-    first: Path, store: EpisodeStore, folder: Path, seed: int, max_rows: int = _MAX_ROWS
+    first: Path, store: EpisodeStore, folder: Path, seed: int
 ) -> ItemRewardModel:
     """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
 
     Args:
         first: folder of `fit_item_reward_model`.
         store: view of the episodes to fit to.
-        seed: of the rows drawn from a view with more than `max_rows`.
+        seed: of the rows drawn from a view with too many.
     """
     tensors, about = load_tensors(first / FITTED)
     report = ItemRewardReport(**about)
     model = ItemRewardModel(reward_model_sizes(store))
     lags = MEMORY if "tastes" in report.kept else model.lags
-    rows = RewardRows.of(store, lags, max_rows, seed)
+    rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
     begin, effects = Beginning.of(first / FITTED, design), design.mean_effect()

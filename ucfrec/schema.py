@@ -15,6 +15,16 @@ ACTION: Final = "action"
 OBSERVATION: Final = "observation"
 """A list of floats: what was observed just before the action."""
 
+# Columns of exposures, one row per item shown, besides those of logs.
+REQUEST_ID: Final = "request_id"
+POSITION: Final = "position"
+RUN: Final = "run"
+"""Fingerprint of the run."""
+RULE: Final = "rule"
+"""Hash of the decision rule."""
+ARM: Final = "arm"
+"""Name of the run, where several share the users."""
+
 # Episode-store columns, one row per step.
 ITEM: Final = "item"
 REWARD: Final = "reward"

@@ -36,7 +36,7 @@ def test_seeds_that_are_none_are_refused(
     with pytest.raises(SystemExit) as ended:
         main([*command, seed])
     assert ended.value.code == 2
-    assert "no whole number from 0 to 4294967295" in capsys.readouterr().err
+    assert "not a whole number from 0 to 4294967295" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("workers", ["0", "-3"])

@@ -69,7 +69,7 @@ def test_an_expression_says_what_is_liked(
         ("item_id = 3", "item_id"),
         ("reward >= (SELECT 1)", "a subquery"),
         ("read_text('x') = 'y'", "it calls 'read_text'"),
-        ("reward >", "no scalar SQL expression"),
+        ("reward >", "not a scalar SQL expression"),
         ("reward = random()", "it calls 'random'"),
     ],
 )

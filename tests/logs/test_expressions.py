@@ -357,7 +357,7 @@ def test_a_store_of_somebody_else_brings_no_program(
     before = snapshot(tmp_path)
     for command, to in (("recommend", "--out"), ("score", "--out"), ("ope", "--json")):
         assert main([command, str(tmp_path / "run"), log, to, out]) == 2
-        assert "no scalar SQL expression" in capsys.readouterr().err
+        assert "not a scalar SQL expression" in capsys.readouterr().err
         assert snapshot(tmp_path) == before
 
 
@@ -374,7 +374,7 @@ def test_python_is_no_way_in_either(trained: Path, name: str, tmp_path: Path) ->
         lambda: validate(log, LogMapping(item_features=(table,))),
         lambda: list(read_histories(log, LogMapping(), text, 5)),
     ):
-        with pytest.raises(InputError, match="no scalar SQL expression"):
+        with pytest.raises(InputError, match="not a scalar SQL expression"):
             act()
     assert list(tmp_path.iterdir()) == [tmp_path / "secret.txt"]
 

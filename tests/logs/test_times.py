@@ -161,7 +161,7 @@ def test_a_column_of_dates_in_an_expression_is_text_if_their_order_is_not_certai
     log = make_log(pd.Index(map(str, 1_700_000_000_000 + np.arange(3000))))
     log["made"] = days("2024-03-01", 11).strftime("%m/%d/%Y")
     path = write(log, tmp_path / "log.csv")
-    with pytest.raises(InputError, match="no scalar SQL expression"):
+    with pytest.raises(InputError, match="not a scalar SQL expression"):
         validate([path], LogMapping(), PrepareOptions(reward="month(made)"))
     options = PrepareOptions(reward="day(strptime(made, '%m/%d/%Y'))")
     assert validate([path], LogMapping(), options)["reward_statistics"]["max"] == 11

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,10 +18,16 @@ from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 LIKED = 0.6
 """A step counts as liked if its reward, scaled to [0, 1] as in item states, is at least this: the
 threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
+_Reward = TypeVar("_Reward", float, Tensor)
+
+
+def least_liked(low: _Reward, high: _Reward) -> _Reward:
+    """The lowest reward of a liked step, where training rewards are from `low` to `high`."""
+    return low + LIKED * (high - low)
 
 
 def liked_rewards(store: EpisodeStore, rewards: Array) -> BoolArray:
-    """Whether steps were liked: their reward, scaled as in item states, is at least `LIKED`.
+    """Whether steps were liked: their reward is at least `least_liked`.
 
     Args:
         store: a view of a store of items.
@@ -30,8 +37,7 @@ def liked_rewards(store: EpisodeStore, rewards: Array) -> BoolArray:
         (N,) bool.
     """
     states = store.item_states
-    scaled = (rewards - states.reward_low) / (states.reward_high - states.reward_low)
-    return np.asarray(scaled >= LIKED)
+    return np.asarray(rewards >= least_liked(states.reward_low, states.reward_high))
 
 
 @dataclass(frozen=True)

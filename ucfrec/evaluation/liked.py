@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_counts import LIKED, liked_rewards
+from ucfrec.episodes.item_counts import LIKED, least_liked, liked_rewards
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -38,7 +38,7 @@ class LikedByRange:
         return liked_rewards(store, rewards)
 
     def __str__(self) -> str:
-        least = self._low + LIKED * (self._high - self._low)
+        least = least_liked(self._low, self._high)
         return (
             f"reward >= {least:.4g} ({LIKED:.0%} of the way from the lowest training reward, "
             f"{self._low:.4g}, to the highest, {self._high:.4g})"

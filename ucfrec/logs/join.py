@@ -21,18 +21,17 @@ from ucfrec.logs.typed import typed_columns
 
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
-_REQUEST: Final = "request_id"
-ARM: Final = "arm"
+_REQUEST: Final = schema.REQUEST_ID
 _EXPOSURE: Final = {
     schema.USER_ID: None,
     schema.ITEM_ID: None,
     schema.TIMESTAMP: "BIGINT",
     _REQUEST: "VARCHAR",
-    "position": "INTEGER",
+    schema.POSITION: "INTEGER",
     schema.PROPENSITY: "DOUBLE",
-    "run": "VARCHAR",
-    "rule": "VARCHAR",
-    ARM: "VARCHAR",
+    schema.RUN: "VARCHAR",
+    schema.RULE: "VARCHAR",
+    schema.ARM: "VARCHAR",
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
 _KEYS: Final = {*_EXPOSURE, FEEDBACK, "row"}
@@ -108,7 +107,7 @@ def join_feedback(
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in (*table.columns, ARM)]
+        missing = [name for name in _EXPOSURE if name not in (*table.columns, schema.ARM)]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "

@@ -15,7 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import engine
-from ucfrec.logs.join import ARM, FEEDBACK
+from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import is_number, open_tables, quoted
 from ucfrec.off_policy.intervals import cluster_means
@@ -162,7 +162,7 @@ def _by_user(
     ):
         tables = tuple(open_tables(connection, files))
         for table in tables:
-            for name in (schema.USER_ID, ARM, column):
+            for name in (schema.USER_ID, schema.ARM, column):
                 if name not in table.columns:
                     raise InputError(
                         f"{table.files[0]} has no column {name}; give the log of ucfrec join"
@@ -171,7 +171,7 @@ def _by_user(
                 raise InputError(f"{table.files[0]}: {column} is not a number; name another column")
         with explained(connection, tables, folder):
             rows = " UNION ALL BY NAME ".join(
-                f"SELECT CAST({schema.USER_ID} AS VARCHAR) AS who, {ARM} AS arm, "
+                f"SELECT CAST({schema.USER_ID} AS VARCHAR) AS who, {schema.ARM} AS arm, "
                 f"CAST({quoted(column)} AS DOUBLE) AS value FROM {table.sql}"
                 for table in tables
             )
@@ -184,6 +184,6 @@ def _by_user(
             kept = connection.sql(query).fetchnumpy()
             both = "SELECT count(DISTINCT who) FROM of_users WHERE arms > 1"
             ((in_both,),) = connection.sql(both).fetchall()
-    names = np.asarray(kept["arm"], dtype=str)
+    names = np.asarray(kept[schema.ARM], dtype=str)
     pairs = np.stack([kept["value"], kept["shown"].astype(np.float64)], axis=1)
     return {str(name): pairs[names == name] for name in np.unique(names)}, int(in_both)

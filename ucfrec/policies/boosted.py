@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_counts import LIKED, TrainingCounts, liked_rewards
+from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
@@ -143,7 +143,7 @@ class BoostedPolicy(SequencePolicy):
         """
         before = windows.mask[:, :-1].float()  # (B, N)
         earlier, rewards = windows.actions[:, :-1], windows.rewards[:, :-1]
-        liked = before * (rewards >= self.reward_low + LIKED * (self.reward_high - self.reward_low))
+        liked = before * (rewards >= least_liked(self.reward_low, self.reward_high))
         shown_of, liked_of = (self.shown[items], self.liked[items]) if counts is None else counts
         count, likes = before.sum(1, keepdim=True), liked.sum(1, keepdim=True)
         cosines = self.directions[items] @ self.directions[earlier].mT  # (B, C, N)
@@ -203,7 +203,7 @@ class BoostedPolicy(SequencePolicy):
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean log loss (nats) of likes at the windows' last steps."""
-        least = self.reward_low + LIKED * (self.reward_high - self.reward_low)
+        least = least_liked(self.reward_low, self.reward_high)
         liked = (windows.rewards[:, -1] >= least).float()
         scores = self._scored(windows, windows.actions[:, -1:])[:, 0]
         return F.binary_cross_entropy_with_logits(scores, liked)

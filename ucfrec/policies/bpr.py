@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.episodes.item_counts import LIKED
+from ucfrec.episodes.item_counts import least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
@@ -57,7 +57,7 @@ class BPRPolicy(SequencePolicy):
 
     def _liked(self, windows: Windows) -> Tensor:
         """(B, K) 1 at liked steps, as of `ucfrec.episodes.item_counts`, otherwise 0."""
-        least = self.reward_low + LIKED * (self.reward_high - self.reward_low)
+        least = least_liked(self.reward_low, self.reward_high)
         return ((windows.rewards >= least) & windows.mask).float()
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:

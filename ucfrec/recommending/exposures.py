@@ -17,14 +17,10 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
-from ucfrec.recommending.recommend import RANK, REQUEST_ID
+from ucfrec.recommending.recommend import RANK
 from ucfrec.recommending.responder import Answer
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-POSITION: Final = "position"
-RUN: Final = "run"
-RULE: Final = "rule"
-ARM: Final = "arm"
 _ROWS: Final = 50_000
 _SECONDS: Final = 60.0
 _MOST_WAITING: Final = 20
@@ -40,12 +36,12 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
             (schema.USER_ID, pa.string()),
             (schema.ITEM_ID, item),
             (schema.TIMESTAMP, pa.int64()),
-            (REQUEST_ID, pa.string()),
-            (POSITION, pa.int32()),
+            (schema.REQUEST_ID, pa.string()),
+            (schema.POSITION, pa.int32()),
             (schema.PROPENSITY, pa.float64()),
-            (RUN, pa.string()),
-            (RULE, pa.string()),
-            (ARM, pa.string()),
+            (schema.RUN, pa.string()),
+            (schema.RULE, pa.string()),
+            (schema.ARM, pa.string()),
         ]
     )
 
@@ -63,9 +59,13 @@ def exposures_written(
 
     def passed() -> Iterator[pd.DataFrame]:
         for frame in frames:
-            shown = frame.rename(columns={RANK: POSITION})
-            shown[RUN], shown[RULE], shown[schema.TIMESTAMP] = trained.fingerprint, rule, now
-            shown[ARM] = ""
+            shown = frame.rename(columns={RANK: schema.POSITION})
+            shown[schema.RUN], shown[schema.RULE], shown[schema.TIMESTAMP] = (
+                trained.fingerprint,
+                rule,
+                now,
+            )
+            shown[schema.ARM] = ""
             shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
             writer.write_table(table)
@@ -164,14 +164,14 @@ class ExposureLog:
             shown = len(answer.items)
             columns[schema.ITEM_ID] += answer.items
             columns[schema.PROPENSITY] += answer.propensities
-            columns[POSITION] += range(1, shown + 1)
+            columns[schema.POSITION] += range(1, shown + 1)
             for name, value in (
                 (schema.USER_ID, user_id),
                 (schema.TIMESTAMP, now),
-                (REQUEST_ID, answer.request_id),
-                (RUN, answer.run),
-                (RULE, answer.rule),
-                (ARM, answer.arm),
+                (schema.REQUEST_ID, answer.request_id),
+                (schema.RUN, answer.run),
+                (schema.RULE, answer.rule),
+                (schema.ARM, answer.arm),
             ):
                 columns[name] += [value] * shown
         return pa.table(columns, self._schema)

@@ -22,7 +22,6 @@ from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RANK, SCORE = "rank", "score"
-REQUEST_ID: Final = "request_id"
 _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**24
@@ -143,7 +142,7 @@ class _Choice:
                 schema.ITEM_ID: item_ids[items[kept]],
                 SCORE: values[kept],
                 schema.PROPENSITY: propensities[kept],
-                REQUEST_ID: np.repeat(requests, kept.sum(1)),
+                schema.REQUEST_ID: np.repeat(requests, kept.sum(1)),
             }
         )
 

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.item_counts import LIKED
+from ucfrec.episodes.item_counts import least_liked
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 
@@ -57,7 +57,7 @@ class MainTags:
 
     def liked(self, rewards: Tensor) -> Tensor:
         """Whether the items with the rewards (...) were liked."""
-        return (rewards - self.reward_low) / (self.reward_high - self.reward_low) >= LIKED
+        return rewards >= least_liked(self.reward_low, self.reward_high)
 
     def runs(self, shown: Shown) -> Tensor:
         """In how many steps in a row, up to each earlier one, one main tag was liked, (B, N).

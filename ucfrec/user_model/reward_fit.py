@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ucfrec.episodes.item_counts import LIKED
+from ucfrec.episodes.item_counts import least_liked
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
@@ -203,7 +203,7 @@ def _report(
     scores, levels = scores_of(model, held_out)
     predicted = model.expected(scores).double().numpy()
     observed = held_out.rewards.double().numpy()
-    threshold = states.reward_low + LIKED * (states.reward_high - states.reward_low)
+    threshold = least_liked(states.reward_low, states.reward_high)
     rates = item_rates(rows, rows.rewards >= threshold, len(model.item))
     ranking = gauc_against(
         scores - levels, rates[held_out.items], held_out.rewards >= threshold, held_out.users

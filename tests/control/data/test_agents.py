@@ -126,7 +126,7 @@ def test_what_cannot_be_told_is_refused_with_the_reason(tmp_path: Path) -> None:
         tensors = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
         data = json.loads(archive.read("data"))
     for change, reason in (
-        ({"actor.mu.1.running_mean": torch.zeros(8)}, "no layer of a perceptron"),
+        ({"actor.mu.1.running_mean": torch.zeros(8)}, "not a layer of a perceptron"),
         ({name: None for name in tensors if name.startswith("actor.mu")}, "not those of a"),
     ):
         kept = {k: v for k, v in {**tensors, **change}.items() if v is not None}

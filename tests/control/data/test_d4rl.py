@@ -254,7 +254,7 @@ def test_minari_refusals(tmp_path: Path, minari_folder: Path) -> None:
     if find_spec("huggingface_hub") is None:
         with pytest.raises(InputError, match=r"install ucfrec\[minari\]"):
             read_minari("mujoco/hopper/medium-v0", download=True)
-    with pytest.raises(InputError, match="no Minari identifier"):
+    with pytest.raises(InputError, match="not a Minari identifier"):
         write_minari(trajectories, "no identifier")
     folder = write_minari(trajectories, "hopper/mine-v0")
     with pytest.raises(InputError, match="exists already"):

@@ -447,7 +447,7 @@ def test_the_lift_is_over_the_same_steps_as_logged() -> None:
     assert found.lift.value == pytest.approx(found.estimates["DR"].value - logged)
     assert found.lift.low is not None
     assert found.lift.low > 0
-    assert "no estimate of a session's return" in str(found)
+    assert "not an estimate of the session return" in str(found)
     assert found.doubt is None
 
 

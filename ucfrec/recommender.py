@@ -462,13 +462,13 @@ class Recommender:
         return self.load(out)
 
     def export(
-        self, folder: Path | str, k: int = 100, *, rule: DecisionRule | None = None
+        self, folder: Path | str, k: int | None = None, *, rule: DecisionRule | None = None
     ) -> Exported:
         """Write the policy with its rule as an ONNX graph: `ucfrec export`.
 
         Args:
             folder: folder to make.
-            k: items that the graph chooses.
+            k: items that the graph chooses; None for 100, or all if there are fewer.
             rule: the decision rule; None for the run's own.
 
         Raises:

@@ -249,11 +249,11 @@ def test_tags_of_strangers_are_bounded(tmp_path: Path, tags: Tensor, message: st
         ItemStates.load(path)
 
 
-def test_a_catalogue_has_at_most_a_thousand_tags_and_one_for_the_untagged() -> None:
+def test_a_catalogue_has_at_most_a_thousand_tags() -> None:
     plain = ItemStates(torch.zeros(2000, 2), torch.zeros(0, 0), 0.0, 1.0)
-    replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS))
-    with pytest.raises(InputError, match="are not numbers from -1 to 1000"):
-        replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS + 1))
+    replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS - 1))
+    with pytest.raises(InputError, match="are not numbers from -1 to 999"):
+        replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS))
 
 
 @pytest.mark.parametrize(

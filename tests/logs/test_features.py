@@ -61,10 +61,9 @@ def test_items_share_as_many_tags_as_their_lists_share_words(lists: Lists) -> No
         assert len(set(kept)) == len(kept), "no tag twice"
         assert row == kept + [-1] * (len(row) - len(kept)), "padding comes last"
         for other, second in enumerate(sets):
-            untagged = not first and not second
-            assert shared(tags, one, other) == (1 if untagged else len(first & second))
+            assert shared(tags, one, other) == len(first & second)
     # Numbers have no gaps: a matrix of items and tags has no empty column.
-    assert set(tags[tags >= 0].tolist()) == set(range(int(tags.max()) + 1))
+    assert set(tags[tags >= 0].tolist()) == set(range(int(tags.max(initial=-1)) + 1))
 
 
 @pytest.mark.parametrize("separate", [False, True])
@@ -78,10 +77,9 @@ def test_columns_of_lists_are_told_apart(separate: bool) -> None:
     assert shared(tags, 3, 2) == 0
 
 
-def test_items_without_a_row_share_the_tag_of_the_untagged() -> None:
+def test_items_without_tags_or_a_row_share_none() -> None:
     tags = tags_of([["a"], []], items=4)
-    assert tags.shape[0] == 4
-    assert [shared(tags, 1, other) for other in range(4)] == [0, 1, 1, 1]
+    np.testing.assert_array_equal(tags, [[0], [-1], [-1], [-1]])
 
 
 def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
@@ -101,8 +99,8 @@ def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
 def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
     lists: Lists = [[f"tag {n}" for n in range(i, i + 8)] for i in range(0, 16_000, 8)]
     tags = tags_of([*lists, None])
-    assert int(tags.max()) == DISTINCT_TAGS  # the last number is that of items without any
-    assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS + 1
+    assert int(tags.max()) == DISTINCT_TAGS - 1
+    assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS
 
 
 def test_tags_do_not_depend_on_the_order_of_lists() -> None:
@@ -110,8 +108,8 @@ def test_tags_do_not_depend_on_the_order_of_lists() -> None:
     np.testing.assert_array_equal(tags_of(lists), tags_of([["a", "b"], ["a", "c"], ["c"]]))
 
 
-def test_a_catalogue_of_empty_lists_has_one_tag() -> None:
-    np.testing.assert_array_equal(tags_of([[], None, [None]]), [[0], [0], [0]])
+def test_a_catalogue_of_empty_lists_has_no_tags() -> None:
+    assert tags_of([[], None, [None]]).shape == (3, 0)
 
 
 @pytest.mark.parametrize("column", ["tags", "price"])

@@ -410,6 +410,11 @@ FAULTS: dict[str, tuple[Change, PrepareOptions, str]] = {
         CORRECT,
         r"no row is left \(660 rows: time before 2000.*milliseconds",
     ),
+    "percentages": (
+        lambda log: log.__setitem__("propensity", 60.0),
+        CORRECT,
+        r"propensity is above 1, up to 60, in \d+ of \d+ rows.*propensity / 100",
+    ),
     "equal rewards": (
         lambda log: log.__setitem__("reward", 1.0),
         CORRECT,

@@ -15,7 +15,7 @@ import pytest
 from tests.support.logs import write
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
@@ -407,6 +407,19 @@ def test_files_are_listed_once(tmp_path: Path) -> None:
     given = [tmp_path, tmp_path / "a", tmp_path / "a" / "log.parquet"]
     assert log_files(given) == (tmp_path / "a" / "log.parquet",)
     assert os.listdir(tmp_path) == ["a"]
+
+
+def test_endings_are_read_in_any_case_and_other_tables_are_named(tmp_path: Path) -> None:
+    log = make_log()
+    log.to_parquet(tmp_path / "a.PARQUET")
+    log.to_csv(tmp_path / "b.Csv", index=False)
+    log.to_csv(tmp_path / "c.tsv", index=False, sep="\t")
+    (tmp_path / "notes.txt").write_text("not a table")
+    with pytest.warns(InputNote, match=r"c\.tsv is not read; convert it") as notes:
+        files = log_files([tmp_path])
+    assert [file.name for file in files] == ["a.PARQUET", "b.Csv"]
+    assert len(notes) == 1
+    assert validate(files, LogMapping())["rows_read"] == 2 * len(log)
 
 
 def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path) -> None:

@@ -155,7 +155,10 @@ def test_the_command_writes_it_whole_or_not_at_all(
 ) -> None:
     out = tmp_path / "out"
     assert main(["export", str(trained.folder), "--onnx", str(out), "--k", "25"]) == 2
-    assert "--k is 25; give a whole number from 1 to 24" in capsys.readouterr().err
+    assert (
+        "--k is 25; the run has 24 items: give a whole number from 1 to 24"
+        in capsys.readouterr().err
+    )
     assert not out.exists()
 
 

@@ -159,6 +159,18 @@ def test_feedback_that_is_no_reward_is_refused(reward: str, value: object) -> No
     rewards.close()
 
 
+def test_feedback_that_is_missing_in_all_rows_takes_the_default_of_the_expression() -> None:
+    rewards = RowRewards(Expression("coalesce(revenue, 0) + 1", "run.json"))
+    assert rewards.of_rows([{"revenue": None}, {"revenue": None}]) == [1.0, 1.0]
+    assert rewards.of_rows([{"revenue": None}, {"revenue": 2.5}, {}]) == [1.0, 3.5, 1.0]
+    with pytest.raises(InputError, match="has neither reward nor revenue"):
+        rewards.of_rows([{"clicks": 1}])
+    with pytest.raises(InputError, match="cannot be computed where revenue is VARCHAR") as refused:
+        rewards.of_rows([{"revenue": "three"}])
+    assert "run.json" not in str(refused.value), "a client is not told of files of the server"
+    rewards.close()
+
+
 def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> None:
     reader = HistoryReader("last", False, 2, RowRewards(Expression("reward", "run.json")))
     row = {"item_id": 1, "timestamp": 1.7e12, "reward": 0, "observation": [1, -2.5]}

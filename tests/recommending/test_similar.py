@@ -34,5 +34,7 @@ def test_similar_items_are_other_items_by_cosine(kind: str, tmp_path: Path) -> N
     assert some.groupby("item_id", sort=False).size().to_dict() == {7: 29, 3: 29}
     with pytest.raises(InputError, match="1 of 2 items are not in the training data, such as 99"):
         policy.recommend_to_items([1, 99])
+    with pytest.raises(InputError, match="items is empty"):
+        policy.recommend_to_items([])
     with pytest.raises(InputError, match="k is 0"):
         policy.recommend_to_items(k=0)

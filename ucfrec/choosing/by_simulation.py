@@ -15,10 +15,18 @@ from typing import Final
 
 import numpy as np
 
+from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array
 from ucfrec.choosing.candidates import NEAR_THE_LOG, lookaheads, near, unweighted, variants
-from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
+from ucfrec.choosing.choice import (
+    FAR_OFF,
+    Problem,
+    RuleChoice,
+    SimulatedRule,
+    ValueEstimate,
+    doubts_of,
+)
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
 from ucfrec.choosing.many_rules import Sessions, roll_out
 from ucfrec.episodes.store import EpisodeStore
@@ -40,9 +48,7 @@ _ERRORS_BEHIND: Final = 3.0
 """… which are those that are so many standard errors behind the best."""
 _SEED_OF_REST: Final = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_FAR_OFF: Final = 0.1
-"""Share of the estimated value by which it may be off and still be trusted."""
-_TELLS: Final = _FAR_OFF / 4
+_LARGEST_ERROR: Final = FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
@@ -250,7 +256,7 @@ class RuleSearch:
         """
         halves = [self._of_half(rule, number) for number in (0, 1)]
         returns = np.concatenate([each.returns for each in halves])
-        if _standard_error(returns) > _TELLS * abs(returns.mean()):
+        if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
             more = (self._of_half(rule, number, part=1) for number in (0, 1))
             halves = [one.followed_by(other) for one, other in zip(halves, more, strict=True)]
         values = _mean(halves[0].returns), _mean(halves[1].returns)
@@ -259,7 +265,8 @@ class RuleSearch:
         error = max(within, abs(values[0] - values[1]) / 2)
         checked = self.users.calibration_report
         optimism = None if checked is None else (checked.optimism, checked.optimism_error)
-        doubts = list(_doubts(value, error, self.users))
+        some = schema.PROPENSITY in self.problem.train.record.columns
+        doubts = list(doubts_of(value, error, self.users, some))
         length = max(float(each.lengths.mean()) for each in halves)
         if length > (logged := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
@@ -351,19 +358,6 @@ def _warning(search: RuleSearch, best: SimulatedRule) -> str:
             "to evaluate it"
         )
     return "".join(f"; WARNING: {each}" for each in said)
-
-
-def _doubts(value: float, error: float, users: UserModel) -> tuple[str, ...]:
-    """Why the estimated value may be off by more than a tenth."""
-    said, checked, training = [], users.calibration_report, users.training_users
-    if error > _FAR_OFF * abs(value):
-        said.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
-    if checked is not None and abs(checked.optimism) > max(_FAR_OFF, checked.optimism_error):
-        said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
-    weighted = training is not None and training.report.weighted
-    if not (weighted if checked is None else checked.weighted):
-        said.append("the log has no propensities: its policy may have known more of the users")
-    return tuple(said)
 
 
 def _with_lookahead(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:

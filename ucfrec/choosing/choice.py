@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
@@ -13,6 +13,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.settings import Count, Share, Weight, settings_table
 from ucfrec.user_model.model import UserModel
 
+FAR_OFF: Final = 0.1
+"""Share of the estimated value by which it may be off and still be trusted."""
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
@@ -131,6 +133,24 @@ class ValueEstimate:
     calibrated on, and the standard error; None where validation users are new."""
     doubts: tuple[str, ...]
     """Why it cannot be trusted; empty if it can."""
+
+
+def doubts_of(value: float, error: float, users: UserModel, some: bool) -> tuple[str, ...]:
+    """Why the estimated value may be off by more than a tenth.
+
+    Args:
+        some: whether the log has propensities, at least of some rows.
+    """
+    said, checked, training = [], users.calibration_report, users.training_users
+    if error > FAR_OFF * abs(value):
+        said.append(f"its error, {error:.2g}, is more than {FAR_OFF:.0%} of it")
+    if checked is not None and abs(checked.optimism) > max(FAR_OFF, checked.optimism_error):
+        said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
+    weighted = training is not None and training.report.weighted
+    if not (weighted if checked is None else checked.weighted):
+        lack = "some rows of the log have" if some else "the log has"
+        said.append(f"{lack} no propensities: its policy may have known more of the users")
+    return tuple(said)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--onnx", type=Path, required=True, metavar="OUT", help="folder to make, with the graph"
     )
     parser.add_argument(
-        "--k", type=int, default=100, help="items that the graph chooses (default: 100)"
+        "--k", type=int, help="items that the graph chooses (default: 100, or all if fewer)"
     )
     rule_options(parser)
 

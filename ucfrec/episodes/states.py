@@ -60,9 +60,8 @@ class ItemStates:
                 f"tags of item states are {tags.shape[1]} of {tags.dtype} an item; give whole "
                 f"numbers, at most {TAGS_PER_ITEM}"
             )
-        # Tags are numbered without gaps, so that no number exceeds their count. One more number is
-        # for items without tags.
-        most = min(tags.numel() - 1, DISTINCT_TAGS)
+        # Tags are numbered without gaps, so that no number exceeds their count.
+        most = min(tags.numel(), DISTINCT_TAGS) - 1
         if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
             raise InputError(f"tags of item states are not numbers from -1 to {most}")
         if type(self.window) is not int or not 1 <= self.window <= 10_000:

@@ -54,16 +54,15 @@ def item_tags(
 ) -> Array:
     """Number the tags of items; row i belongs to the id with `number` i in the table `ids`.
 
-    The tags are the values of all columns of lists, the `DISTINCT_TAGS` most frequent ones. Where
-    there are such columns, items without any of them share one of their own, as they would share
-    the category of a missing value.
+    The tags are the values of all columns of lists, the `DISTINCT_TAGS` most frequent ones. An item
+    without any shares none.
 
     Args:
         names: feature tables of `load_features`.
         ids: table with `number` and the ids.
 
     Returns:
-        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without columns of lists.
+        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without tags.
     """
     ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
     cases = [
@@ -87,10 +86,8 @@ def item_tags(
         FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
     """).fetchnumpy()
     numbers, places = found["number"].astype(np.int64), found["place"].astype(np.int64)
-    tags = np.full((count, int(places.max(initial=0)) + 1), -1, dtype=np.int64)
+    tags = np.full((count, int(places.max(initial=-1)) + 1), -1, dtype=np.int64)
     tags[numbers, places] = found["tag_number"]
-    untagged = tags[:, 0] < 0
-    tags[untagged, 0] = tags.max() + 1
     return tags
 
 

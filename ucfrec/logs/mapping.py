@@ -1,6 +1,7 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
 import glob
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -9,11 +10,17 @@ from typing import Final
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import read_toml
 from ucfrec.logs.expressions import Expression
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
+_OTHER_TABLES: Final = (
+    *(".tsv", ".pq", ".jsonl", ".ndjson", ".orc", ".avro", ".feather", ".arrow", ".xlsx"),
+    *(".csv.bz2", ".csv.zip", ".csv.zst", ".csv.xz", ".tar.gz", ".zip"),
+)
+"""Endings of files beside logs that may be meant to be read."""
+_CONVERT: Final = "convert it to Parquet or CSV, or give it one of the endings that are read"
 KEY_COLUMNS: Final = (schema.USER_ID, schema.ITEM_ID, schema.ACTION, schema.TIMESTAMP)
 OPTIONAL_COLUMNS: Final = (
     schema.OBSERVATION,
@@ -300,7 +307,7 @@ def _matches(path: Path) -> list[Path]:
         return _tables(path)
     if path.is_file():
         if not is_table(path):
-            raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; convert it first")
+            raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; {_CONVERT}")
         return [path]
     if not glob.has_magic(str(path)):
         raise InputError(f"{path} does not exist; check the path")
@@ -316,6 +323,8 @@ def _tables(path: Path, above: tuple[Path, ...] = ()) -> list[Path]:
         above: the folders that it lies in, without links: a link may lead back to one of them.
     """
     if not path.is_dir():
+        if path.name.lower().endswith(_OTHER_TABLES):
+            warnings.warn(f"{path} is not read; {_CONVERT}", InputNote, stacklevel=4)
         return [path] if is_table(path) else []
     if (real := path.resolve()) in above:
         return []
@@ -331,4 +340,4 @@ def _tables(path: Path, above: tuple[Path, ...] = ()) -> list[Path]:
 
 def is_table(path: Path) -> bool:
     """Whether `path` is a file with a suffix that `prepare` reads."""
-    return path.is_file() and path.name.endswith(SUFFIXES)
+    return path.is_file() and path.name.lower().endswith(SUFFIXES)

@@ -116,6 +116,9 @@ class Measures:
     first_ms: int = 0
     last_ms: int = 0
     unknown_propensities: int = 0
+    above_1: int = 0
+    """Propensities of items above 1."""
+    highest_propensity: float = 0.0
     splits: IntArray = field(default_factory=lambda: np.zeros((3, 2), dtype=np.int64))
     """Episodes and steps of each split."""
     rewards: Moments = field(default_factory=lambda: Moments(1))
@@ -228,8 +231,12 @@ def _count_steps(measures: Measures, found: Episodes, spool: Spool) -> None:
         measures.item_steps += np.bincount(choice, minlength=items)
         measures.item_train_steps += np.bincount(choice[training], minlength=items)
     if schema.PROPENSITY in spool.names:
-        unknown = np.isnan(found.column(spool, schema.PROPENSITY))
-        measures.unknown_propensities += int(np.count_nonzero(unknown))
+        propensities = found.column(spool, schema.PROPENSITY)
+        measures.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
+        if schema.ITEM in spool.names and (above := propensities > 1).any():
+            measures.above_1 += int(np.count_nonzero(above))
+            highest = float(propensities[above].max())
+            measures.highest_propensity = max(measures.highest_propensity, highest)
 
 
 def sampled_rewards(spool: Spool, cut: Cut, log_end: int, steps: int) -> Array:

@@ -297,6 +297,7 @@ def prepared_log(
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
+                _require_probabilities(log, measures)
                 note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
@@ -364,6 +365,16 @@ def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
 
 def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
     return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
+
+
+def _require_probabilities(log: TypedLog, measures: Measures) -> None:
+    if measures.above_1:
+        raise InputError(
+            f"{log.name}: {schema.PROPENSITY} is above 1, up to {measures.highest_propensity:.6g}, "
+            f"in {measures.above_1:,} of {measures.steps:,} rows; give the probability that the "
+            "item was shown: of a percentage with --column propensity='propensity / 100', or "
+            "ignore the column with --column propensity="
+        )
 
 
 def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:

@@ -129,7 +129,8 @@ def format_report(report: Mapping[str, Any]) -> str:
     if "items" in report:
         lines.append(("items", f"{report['items']:,}"))
     if report.get("unknown_propensities"):
-        lines.append(("  unknown propensity", f"{report['unknown_propensities']:,}"))
+        text = f"{report['unknown_propensities']:,}  missing, or not above 0"
+        lines.append(("  unknown propensity", text))
     lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
     if report["sessions_cut"]:
         lines.append(("  cut at a split", f"{report['sessions_cut']:,}"))

@@ -66,7 +66,7 @@ class Table:
     @property
     def columnar(self) -> bool:
         """Whether reading a column again is cheap, because text need not be parsed."""
-        return self.files[0].suffix == ".parquet"
+        return self.files[0].suffix.lower() == ".parquet"
 
     def of(self, used: Iterable[str], raw: Iterable[str] = ()) -> "Table":
         """The same table with some of its columns, so that others cost nothing."""
@@ -268,7 +268,7 @@ def _columns(
     connection: duckdb.DuckDBPyConnection, file: Path
 ) -> tuple[tuple[str, str], ...] | None:
     """(name, DuckDB type) of the columns of a file; None if it has no rows."""
-    is_parquet = file.suffix == ".parquet"
+    is_parquet = file.suffix.lower() == ".parquet"
     if file.stat().st_size == 0:
         if not is_parquet:
             return None
@@ -314,7 +314,7 @@ def _require_distinct(file: Path, columns: Sequence[str]) -> None:
 
 def _written_names(file: Path) -> list[str]:
     """Names of the columns as the file has them."""
-    if file.suffix == ".parquet":
+    if file.suffix.lower() == ".parquet":
         return list(pq.read_schema(file).names)
     kind = gzip.open if file.suffix == ".gz" else open
     with kind(file, "rt", encoding="utf-8-sig") as lines:

@@ -44,7 +44,7 @@ class Exported:
 
 
 def export(
-    trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int = 100
+    trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
     """Write a folder with the graph (`model.onnx`, its weights beside it) and `model.json`.
 

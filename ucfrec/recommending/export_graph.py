@@ -27,6 +27,7 @@ OUTPUTS: Final = ("scores", "top_items", "top_scores")
 TOLERANCE: Final = 1e-5
 """Largest difference of a score to torch's, relative to the larger of 1 and the score."""
 _OPSET: Final = 20
+_DEFAULT_K: Final = 100
 _CHUNK: Final = 2**16
 """Items among which the best are looked for at once."""
 _COMPARED: Final = 16
@@ -39,8 +40,11 @@ _REMEDY: Final = "use --engine torch"
 class RuleGraph(nn.Module):
     """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
 
-    def __init__(self, scorer: Scorer, kind: str, k: int) -> None:
+    def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
         """
+        Args:
+            k: None for 100, or all items if there are fewer.
+
         Raises:
             InputError: the policy has vector actions, or scores items in a way of its own.
         """
@@ -54,9 +58,13 @@ class RuleGraph(nn.Module):
                 f"policies of kind {kind!r} score items in a way of their own, which "
                 "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc"
             )
-        most = min(len(scorer.states.embeddings), _CHUNK)
+        items = len(scorer.states.embeddings)
+        most = min(items, _CHUNK)
+        k = min(_DEFAULT_K, items) if k is None else k
         if not 1 <= k <= most:
-            raise InputError(f"--k is {k}; give a whole number from 1 to {most:,}")
+            raise InputError(
+                f"--k is {k}; the run has {items:,} items: give a whole number from 1 to {most:,}"
+            )
         self.scorer, self.k = scorer, k
         self._parts = _modules(scorer)
 

@@ -74,7 +74,7 @@ class RowRewards:
         for name in names:
             key = given.get(name.casefold(), name)
             values = [row.get(key) for row in rows]
-            if all(value is None for value in values):
+            if not any(key in row for row in rows):
                 raise InputError(
                     f"history has neither {schema.REWARD} nor {name}, which the run's reward "
                     f"({self._expression}) needs; give one of them"
@@ -91,12 +91,21 @@ class RowRewards:
         try:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
-            with explained(connection, (table,), source):
-                sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
-                if not (is_number(kind) or kind == "BOOLEAN"):
-                    raise InputError(f"history: the run's reward is {kind} here; give numbers")
-                query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
-                return [row[0] for row in connection.sql(query).fetchall()]
+            try:
+                with explained(connection, (table,), source):
+                    sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
+                    query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
+                    values = [row[0] for row in connection.sql(query).fetchall()]
+            except InputError:
+                # Its text names files of the server.
+                types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
+                raise InputError(
+                    f"history: the run's reward ({self._expression}) cannot be computed where "
+                    f"{types}; give values of the types that the training log has"
+                ) from None
+            if not (is_number(kind) or kind == "BOOLEAN"):
+                raise InputError(f"history: the run's reward is {kind} here; give numbers")
+            return values
         finally:
             connection.unregister(_ROWS)
 

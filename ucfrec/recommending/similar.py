@@ -41,6 +41,8 @@ def similar_items(
     vectors = F.normalize(_vectors(trained), dim=1)
     ids = trained.item_ids
     assert ids is not None
+    if items is not None and len(items) == 0:
+        raise InputError("items is empty; give a list of item_ids, or None for all")
     wanted = np.arange(len(ids)) if items is None else trained.items.numbers(np.asarray(items))
     if (wanted < 0).any():
         first = np.asarray(items)[wanted < 0][0]

@@ -1,7 +1,7 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
@@ -16,9 +16,10 @@ from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.tables import Table, is_number, open_tables, quoted, raw_name, text
+from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
 from ucfrec.logs.typed import typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -38,9 +39,6 @@ _EXPOSURE: Final = {
 """Columns of exposures and their DuckDB types; those of ids are kept."""
 _ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
 """Columns that together only exposures have, and logs that were made of them."""
-_NUMBER_LIKE: Final = r"[-+]?[$€£]?(\d+|\d{1,3}([., ']\d{3})+)([.,]\d+)?\s*[%$€£]?"
-"""Text that means a number, though it may not be written as one."""
-_TRUTH_LIKE: Final = "('true', 'false', 'yes', 'no')"
 _SAME_KEY: Final = (
     "CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
     "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
@@ -91,15 +89,15 @@ def join_feedback(
     the log has the largest value of every column that is a number or a truth value; where there is
     none, 0.
 
+    An `InputNote` says which columns of feedback are left out although their text seems to mean
+    numbers, and what may be wrong where no row of feedback matches.
+
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
         out: Parquet file: the columns of the exposures, `feedback` and those of the feedback.
         mapping: log columns to the columns of the feedback.
         memory_limit: of the engine; rows spill to disk.
-
-    An `InputNote` says which columns of feedback are left out although their text seems to mean
-    numbers, and what may be wrong where no row of feedback matches.
 
     Raises:
         InputError: a file or column is missing, or of a wrong type; or a file of feedback is one of
@@ -126,7 +124,7 @@ def join_feedback(
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in {*_names(table), schema.ARM}]
+        missing = [name for name in _EXPOSURE if name not in {*names_of(table), schema.ARM}]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
@@ -146,7 +144,7 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
 def _require_feedback(tables: Sequence[Table]) -> None:
     """Refuse exposures as feedback, which a pattern that the shell expands makes of them."""
     for table in tables:
-        if _names(table).keys() >= {*_ONLY_SHOWN}:
+        if names_of(table).keys() >= {*_ONLY_SHOWN}:
             raise InputError(
                 f"{table.files[0]} is not feedback: it has the columns of exposures "
                 f"({', '.join(_ONLY_SHOWN)}), as a log of join has; name the exposures once, by "
@@ -155,16 +153,11 @@ def _require_feedback(tables: Sequence[Table]) -> None:
             )
 
 
-def _names(table: Table) -> dict[str, str]:
-    """Column names in lower case to those of the files: case does not matter."""
-    return {name.casefold(): name for name in table.columns}
-
-
 def _selected(table: Table) -> str:
     """The columns of exposures, with their types; the arm is empty where there is none."""
     columns = []
     for name, kind in _EXPOSURE.items():
-        value = quoted(name) if name in _names(table) else "''"
+        value = quoted(name) if name in names_of(table) else "''"
         value = value if kind is None else f"CAST({value} AS {kind})"
         columns.append(f"{value} AS {quoted(name)}")
     return ", ".join(columns)
@@ -180,10 +173,10 @@ def _make_feedback(
     typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
     used = {*_EXPOSURE, FEEDBACK}
     used |= {name.casefold() for table in typed.tables for name in table.used or ()}
-    columns = _feedback_columns(connection, tables, used)
+    columns = feedback_columns(connection, tables, used, FEEDBACK)
     selects = []
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
-        names = _names(whole)
+        names = names_of(whole)
         has = [
             (n, names[key]) for n, name in enumerate(columns) if (key := name.casefold()) in names
         ]
@@ -210,121 +203,8 @@ def _value(n: int) -> str:
 
 def _as_number(name: str, kind: str) -> str:
     """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
-    value = quoted(name) if _counts_as_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
+    value = quoted(name) if holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
     return f"CAST({value} AS DOUBLE)"
-
-
-def _counts_as_feedback(kind: str) -> bool:
-    return is_number(kind) or kind == "BOOLEAN"
-
-
-def _feedback_columns(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], used: Collection[str]
-) -> tuple[str, ...]:
-    """Columns of numbers and truth values, each once, with a note on others that may be meant.
-
-    Args:
-        used: names in lower case that are none of feedback.
-
-    Raises:
-        InputError: a column has numbers in one file, and something else in another.
-    """
-    columns: dict[str, tuple[str, Table]] = {}
-    for table in tables:
-        for key, name in _names(table).items():
-            if key not in used and _counts_as_feedback(table.columns[name]):
-                columns.setdefault(key, (name, table))
-    for table in tables:
-        others = []
-        for key, name in _names(table).items():
-            kind = table.columns[name]
-            if _counts_as_feedback(kind):
-                if key == FEEDBACK:
-                    why = "the log has its own, the number of rows; rename it"
-                    _note_left_out(table, name, why)
-            elif key not in used and (key in columns or kind == "VARCHAR"):
-                others.append(name)
-        for words in _Words.of(connection, table, others):
-            if words.name.casefold() in columns:
-                _require_numbers(words, columns[words.name.casefold()][1])
-            elif words.mean_numbers:
-                _note_left_out(table, words.name, f"it is text, {words}; {_WRITE_NUMBERS}")
-    return tuple(name for name, _ in columns.values())
-
-
-_WRITE_NUMBERS: Final = (
-    "write numbers as 12.50, truth values as true and false, and nothing where there is none"
-)
-
-
-def _note_left_out(table: Table, name: str, why: str) -> None:
-    more = f" and {len(table.files) - 1} more" if len(table.files) > 1 else ""
-    warnings.warn(
-        f"{table.files[0]}{more}: column {name} is left out: {why}", InputNote, stacklevel=5
-    )
-
-
-@dataclass(frozen=True)
-class _Words:
-    """What a column that does not hold numbers holds instead."""
-
-    table: Table
-    name: str
-    values: int
-    """That are not missing."""
-    others: int
-    """Of these, the ones that are not numbers."""
-    alike: int
-    """Values that are numbers or truth values, or seem to mean one."""
-    sample: str | None
-    """A value that is not a number, preferably one that does not seem to mean one either."""
-    one_word: bool
-    """Whether all values that do not seem to mean a number are the same, such as n/a."""
-
-    @classmethod
-    def of(
-        cls, connection: duckdb.DuckDBPyConnection, table: Table, names: Sequence[str]
-    ) -> "list[_Words]":
-        """Those of each of some columns, read at once."""
-        if not names:
-            return []
-        columns = [f"trim(CAST({quoted(name)} AS VARCHAR)) AS x{n}" for n, name in enumerate(names)]
-        asked = []
-        for n in range(len(names)):
-            number = f"coalesce(isfinite(TRY_CAST(x{n} AS DOUBLE)), false)"
-            alike = f"({number} OR regexp_full_match(x{n}, {text(_NUMBER_LIKE)}) "
-            alike += f"OR lower(x{n}) IN {_TRUTH_LIKE})"
-            least, most = (f"{each}(x{n}) FILTER (NOT {alike})" for each in ("min", "max"))
-            asked.append(
-                f"[count(x{n}), count_if(x{n} IS NOT NULL AND NOT {number}), count_if({alike})], "
-                f"coalesce({least}, min(x{n}) FILTER (NOT {number})), "
-                f"coalesce({least} = {most}, false)"
-            )
-        (row,) = connection.sql(
-            f"SELECT {', '.join(asked)} FROM "
-            f"(SELECT {', '.join(columns)} FROM {table.of(names).sql})"
-        ).fetchall()
-        found = zip(names, row[::3], row[1::3], row[2::3], strict=True)
-        return [cls(table, name, *counts, *more) for name, counts, *more in found]
-
-    @property
-    def mean_numbers(self) -> bool:
-        """Whether the column seems to be one of feedback: half of it, or all but one word."""
-        return self.alike > 0 and (2 * self.alike >= self.values or self.one_word)
-
-    def __str__(self) -> str:
-        if not self.others:
-            return f"though all {self.values:,} are numbers"
-        return f"{self.others:,} of {self.values:,} are not numbers (such as {self.sample!r:.60})"
-
-
-def _require_numbers(words: _Words, numbers: Table) -> None:
-    """Refuse a column that has numbers in other files only: its values would count as 0."""
-    if words.others:
-        raise InputError(
-            f"{words.table.files[0]}: column {words.name} has numbers in {numbers.files[0]}, but "
-            f"here {words}; {_WRITE_NUMBERS}"
-        )
 
 
 def _keys_of(mapping: LogMapping) -> LogMapping:

@@ -1,5 +1,7 @@
 """Exposures joined with feedback: every row of feedback counts once, for what it is about."""
 
+import re
+import warnings
 from pathlib import Path
 
 import pandas as pd
@@ -7,8 +9,8 @@ import pytest
 
 from tests.support.killed import kills
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
-from ucfrec.logs.join import join_feedback
+from ucfrec.errors import InputError, InputNote
+from ucfrec.logs.join import Joined, join_feedback
 from ucfrec.logs.mapping import LogMapping
 
 START = 1_700_000_000_000
@@ -105,6 +107,196 @@ def test_a_log_is_not_taken_for_exposures(tmp_path: Path) -> None:
             LogMapping(),
         )
     assert not (tmp_path / "out.parquet").exists()
+
+
+def joined_files(folder: Path, *feedback: str | pd.DataFrame) -> tuple[Joined, pd.DataFrame]:
+    """Exposures joined with files of feedback: text as CSV, frames as Parquet."""
+    files = []
+    for n, given in enumerate(feedback):
+        files.append(folder / f"{n}.{'csv' if isinstance(given, str) else 'parquet'}")
+        if isinstance(given, str):
+            files[-1].write_text(given)
+        else:
+            given.to_parquet(files[-1])
+    log = folder / "log.parquet"
+    report = join_feedback([exposures(folder / "shown")], files, log, 30 * MINUTE)
+    return report, pd.read_parquet(log)
+
+
+def csv(column: str, *values: str) -> str:
+    """Feedback of user 1 on item 10, at a time that matches."""
+    rows = [f"1,10,{START + 7 * MINUTE},{value}" for value in values]
+    return "\n".join([f"user_id,item_id,timestamp,{column}", *rows, ""])
+
+
+def test_exposures_are_not_taken_for_feedback(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = exposures(tmp_path / "shown")
+    (tmp_path / "clicks.csv").write_text(csv("click", "1"))
+    expanded = [str(path) for path in sorted(shown.glob("*.parquet"))]
+    out = ["--within", "30m", "--out", str(tmp_path / "log.parquet")]
+    assert main(["join", *expanded, str(tmp_path / "clicks.csv"), *out]) == 2
+    message = capsys.readouterr().err
+    assert f"{shown / 'two.parquet'} is not feedback" in message
+    assert "by their folder or as a pattern in quotes" in message
+    assert not (tmp_path / "log.parquet").exists()
+    quoted = str(shown / "*.parquet")
+    assert main(["join", quoted, str(tmp_path / "clicks.csv"), *out]) == 0
+    again = ["--within", "30m", "--out", str(tmp_path / "again.parquet")]
+    assert main(["join", str(shown), str(tmp_path / "log.parquet"), *again]) == 2
+    assert "log.parquet is not feedback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("part", ["request_id", "timestamp"])
+def test_exposures_are_known_by_their_columns_in_any_case(tmp_path: Path, part: str) -> None:
+    frame = pd.read_parquet(exposures(tmp_path / "of"))
+    frame = frame.rename(columns=str.upper)
+    if part == "request_id":
+        frame = frame.drop(columns=part.upper())
+    with pytest.raises(InputError, match=r"0\.parquet is not feedback"):
+        joined_files(tmp_path, frame)
+
+
+def test_feedback_may_have_some_columns_of_exposures(tmp_path: Path) -> None:
+    given = feedback([(1, 10, 7, 1, 9, 0.9)], "position", "propensity")
+    report, log = joined_files(tmp_path, given)
+    assert report.matched == 1
+    assert log.position.tolist() == [1, 2, 1, 1]
+    assert log.propensity.tolist() == [0.5, 0.25, 0.4, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (["5", "n/a", "2.5"], "1 of 3 are not numbers (such as 'n/a')"),
+        (["-", "-", "-", "4"], "3 of 4 are not numbers (such as '-')"),
+        (['"12,50"', '"3,00"'], "2 of 2 are not numbers (such as '12,50')"),
+        (['"1.234,50"', "7"], "1 of 2 are not numbers (such as '1.234,50')"),
+        (["$5", "12 %", "7"], "2 of 3 are not numbers (such as '$5')"),
+        (["true", "false", "?"], "3 of 3 are not numbers (such as '?')"),
+    ],
+)
+def test_numbers_that_are_text_are_not_left_out_without_a_word(
+    tmp_path: Path, values: list[str], told: str
+) -> None:
+    note = re.escape(f"0.csv: column Amount is left out: it is text, {told}; write numbers as")
+    with pytest.warns(InputNote, match=note):
+        report, log = joined_files(tmp_path, csv("Amount", *values))
+    assert report.columns == ()
+    assert log.feedback.tolist() == [0, 0, len(values), 0]
+
+
+def test_numbers_in_a_parquet_column_of_text_are_not_left_out_without_a_word(
+    tmp_path: Path,
+) -> None:
+    given = feedback([(1, 10, 7, "1"), (1, 10, 7, None)])
+    with pytest.warns(InputNote, match="column click is left out: .* all 1 are numbers"):
+        joined_files(tmp_path, given)
+
+
+@pytest.mark.parametrize("values", [["DE", "FR"], ["a7", "b", "12"], ["view", "view"], ["", ""]])
+def test_words_are_left_out_without_a_note(tmp_path: Path, values: list[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        report, _ = joined_files(tmp_path, csv("word,click", *(f"{word},1" for word in values)))
+    assert report.columns == ("click",)
+
+
+def test_a_column_with_numbers_in_one_file_and_words_in_another_is_refused(tmp_path: Path) -> None:
+    wanted = r"1\.csv: column CLICK has numbers in .*0\.csv, but here 1 of 2 are not numbers"
+    with pytest.raises(InputError, match=wanted):
+        joined_files(tmp_path, csv("click", "1"), csv("CLICK", "1", "n/a"))
+
+
+def test_a_column_may_be_text_of_numbers_or_empty_in_some_files(tmp_path: Path) -> None:
+    text = feedback([(1, 11, 7, "5"), (1, 11, 7, None)])
+    dates = feedback([(2, 10, 7, pd.NaT)])
+    _, log = joined_files(tmp_path, csv("click", "true"), text, dates, csv("click", ""))
+    assert log.click.tolist() == [0, 5, 1, 0]
+    assert log.feedback.tolist() == [0, 2, 2, 1]
+
+
+def test_names_of_feedback_columns_match_whatever_their_case(tmp_path: Path) -> None:
+    second = feedback([(1, 11, 7, 2)]).rename(columns=str.upper)
+    third = feedback([(2, 10, 7, True, 4)], "like").rename(columns={"click": "cliCK"})
+    report, log = joined_files(tmp_path, csv("Click", "1"), second, third)
+    assert report.columns == ("Click", "like")
+    assert log.Click.tolist() == [0, 2, 1, 1]
+    assert log.like.tolist() == [0, 0, 0, 4]
+
+
+@pytest.mark.parametrize("name", ["reward", "Reward", "row", "value_0", "session", 'a "b"', "e"])
+def test_a_feedback_column_may_have_any_name(tmp_path: Path, name: str) -> None:
+    given = feedback([(1, 10, 7, 3, 4)], "more").rename(columns={"click": name})
+    report, log = joined_files(tmp_path, given)
+    assert report.columns == (name, "more")
+    assert log[name].tolist() == [0, 0, 3, 0]
+    assert log.more.tolist() == [0, 0, 4, 0]
+
+
+def test_a_feedback_column_that_the_log_has_itself_is_left_out_with_a_note(tmp_path: Path) -> None:
+    given = feedback([(1, 10, 7, 3)]).rename(columns={"click": "Feedback"})
+    with pytest.warns(InputNote, match=r"0\.parquet: column Feedback is left out: .*; rename it"):
+        _, log = joined_files(tmp_path, given)
+    assert log.feedback.tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("name", ["request_id", "Request_ID"])
+def test_a_request_id_is_the_text_of_the_file(tmp_path: Path, name: str) -> None:
+    shown = pd.read_parquet(exposures(tmp_path / "of"))
+    shown["request_id"] = shown.request_id.replace({"a": "007", "b": "7"})
+    shown.to_parquet(tmp_path / "shown.parquet")
+    (tmp_path / "clicks.csv").write_text(csv(f"{name},click", "007,1"))
+    files = [tmp_path / "shown.parquet"], [tmp_path / "clicks.csv"]
+    join_feedback(*files, tmp_path / "log.parquet", 30 * MINUTE)
+    log = pd.read_parquet(tmp_path / "log.parquet")
+    assert log[log.click == 1].request_id.tolist() == ["007"]
+
+
+@pytest.mark.parametrize(
+    ("time", "told"),
+    [
+        (f"{START // 1000}", "feedback from 1970-01-20 16:13:20 to 1970-01-20 16:13:20"),
+        (f"{START}000", "feedback from 55840-"),
+        (f"{START}000000", f"feedback from {START}000000 to"),
+        ("2023-11-14", "dates have no time of day and count as midnight"),
+        ("", "feedback from (none) to (none)"),
+    ],
+)
+def test_feedback_at_other_times_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], time: str, told: str
+) -> None:
+    clicks = f"user_id,item_id,timestamp,click\n1,10,{time},1\n1,11,{time},1\n"
+    (tmp_path / "clicks.csv").write_text(clicks)
+    given = [str(exposures(tmp_path / "shown")), str(tmp_path / "clicks.csv")]
+    assert main(["join", *given, "--within", "30m", "--out", str(tmp_path / "log.parquet")]) == 0
+    (note,) = capsys.readouterr().err.splitlines()
+    assert "note: none of the 2 rows of feedback matches an exposure" in note
+    assert "exposures are from 2023-11-14 22:13:20 to 2023-11-14 22:18:20" in note
+    assert "read as milliseconds: seconds need --column timestamp='COLUMN * 1000'" in note
+    assert told in note
+    assert "request_id" not in note
+    assert "none of its users" not in note
+
+
+@pytest.mark.parametrize("scale", ["* 1000", "/ 1000"])
+def test_the_remedy_for_times_in_other_units_works(tmp_path: Path, scale: str) -> None:
+    time = START // 1000 if "*" in scale else START * 1000
+    (tmp_path / "clicks.csv").write_text(f"user_id,item_id,time,click\n1,10,{time},1\n")
+    given = [str(exposures(tmp_path / "shown")), str(tmp_path / "clicks.csv")]
+    out = ["--within", "30m", "--out", str(tmp_path / "log.parquet")]
+    assert main(["join", *given, *out, "--column", f"timestamp=time {scale}"]) == 0
+    assert pd.read_parquet(tmp_path / "log.parquet").click.tolist() == [1, 0, 0, 0]
+
+
+def test_feedback_of_other_requests_or_users_is_told(tmp_path: Path) -> None:
+    given = feedback([(1, 10, 7, 1, "y"), (1, 10, 7, 1, "z")], "request_id")
+    with pytest.warns(InputNote, match=r"none of its 2 values of request_id \(such as 'y'\)"):
+        joined_files(tmp_path, given)
+    (tmp_path / "users").mkdir()
+    with pytest.warns(InputNote, match="none of its users was shown any of their items"):
+        joined_files(tmp_path / "users", feedback([(3, 10, 7, 1)]))
 
 
 @pytest.mark.slow

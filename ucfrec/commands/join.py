@@ -13,7 +13,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "exposures",
         type=uri_or_path(Input, str),
         metavar="EXPOSURES",
-        help="file, folder or glob that serve --exposures or recommend --exposures wrote",
+        help="file, folder or quoted glob that serve or recommend --exposures wrote",
     )
     log_options(parser).metavar = "FEEDBACK"
     parser.add_argument(

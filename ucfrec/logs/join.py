@@ -1,22 +1,25 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Final
+from typing import Any, Final
 
 import duckdb
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
+from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.tables import Table, is_number, open_tables, quoted
+from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
 from ucfrec.logs.typed import typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -34,7 +37,13 @@ _EXPOSURE: Final = {
     schema.ARM: "VARCHAR",
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
-_KEYS: Final = {*_EXPOSURE, FEEDBACK, "row"}
+_ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
+"""Columns that together only exposures have, and logs that were made of them."""
+_SAME_KEY: Final = (
+    "CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
+    "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
+)
+"""Whether feedback `f` and exposure `e` are of the same user and item."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,9 @@ def join_feedback(
     the log has the largest value of every column that is a number or a truth value; where there is
     none, 0.
 
+    An `InputNote` says which columns of feedback are left out although their text seems to mean
+    numbers, and what may be wrong where no row of feedback matches.
+
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
@@ -88,7 +100,8 @@ def join_feedback(
         memory_limit: of the engine; rows spill to disk.
 
     Raises:
-        InputError: a file or column is missing, or of a wrong type.
+        InputError: a file or column is missing, or of a wrong type; or a file of feedback is one of
+            exposures.
     """
     files = log_files(exposures), log_files(feedback)
     with (
@@ -98,16 +111,20 @@ def join_feedback(
         shown, given = (tuple(open_tables(connection, each)) for each in files)
         with explained(connection, (*shown, *given), folder):
             _make_exposures(connection, shown)
+            _require_feedback(given)
             columns = _make_feedback(connection, given, mapping or LogMapping())
             _match(connection, within_ms)
             _write(connection, columns, out)
-            return _counts(connection, columns)
+            joined = _counts(connection, columns)
+            if not joined.matched:
+                warnings.warn(_why_unmatched(connection, joined), InputNote, stacklevel=2)
+            return joined
 
 
 def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in (*table.columns, schema.ARM)]
+        missing = [name for name in _EXPOSURE if name not in {*names_of(table), schema.ARM}]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
@@ -124,11 +141,23 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
     )
 
 
+def _require_feedback(tables: Sequence[Table]) -> None:
+    """Refuse exposures as feedback, which a pattern that the shell expands makes of them."""
+    for table in tables:
+        if names_of(table).keys() >= {*_ONLY_SHOWN}:
+            raise InputError(
+                f"{table.files[0]} is not feedback: it has the columns of exposures "
+                f"({', '.join(_ONLY_SHOWN)}), as a log of join has; name the exposures once, by "
+                "their folder or as a pattern in quotes that the shell does not expand, and then "
+                "files of feedback"
+            )
+
+
 def _selected(table: Table) -> str:
     """The columns of exposures, with their types; the arm is empty where there is none."""
     columns = []
     for name, kind in _EXPOSURE.items():
-        value = quoted(name) if name in table.columns else "''"
+        value = quoted(name) if name in names_of(table) else "''"
         value = value if kind is None else f"CAST({value} AS {kind})"
         columns.append(f"{value} AS {quoted(name)}")
     return ", ".join(columns)
@@ -137,29 +166,45 @@ def _selected(table: Table) -> str:
 def _make_feedback(
     connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...], mapping: LogMapping
 ) -> tuple[str, ...]:
-    """Create the table `feedback` with its `row`; returns its columns of feedback."""
+    """Create the table `feedback` with its `row`; returns its columns of feedback.
+
+    Their values are its columns `_value(0)`, …, so that any name is possible.
+    """
     typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
-    used = {name.casefold() for name in _KEYS}
+    used = {*_EXPOSURE, FEEDBACK}
     used |= {name.casefold() for table in typed.tables for name in table.used or ()}
-    columns = dict.fromkeys(
-        name
-        for table in tables
-        for name, kind in table.columns.items()
-        if name.casefold() not in used and (is_number(kind) or kind == "BOOLEAN")
-    )
+    columns = feedback_columns(connection, tables, used, FEEDBACK)
     selects = []
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
-        has = [name for name in columns if name in whole.columns]
-        request = _REQUEST in whole.columns
-        read = narrow.of([*(narrow.used or ()), *has, *[_REQUEST] * request], narrow.raw)
-        values = [f"CAST({quoted(name)} AS DOUBLE) AS {quoted(name)}" for name in has]
-        values.append(f"CAST({_REQUEST if request else 'NULL'} AS VARCHAR) AS {_REQUEST}")
-        selects.append(f"SELECT {select}, {', '.join(values)} FROM {read.sql}")
+        names = names_of(whole)
+        has = [
+            (n, names[key]) for n, name in enumerate(columns) if (key := name.casefold()) in names
+        ]
+        read, request = [name for _, name in has], "NULL"
+        raw = list(narrow.raw)
+        if (name := names.get(_REQUEST)) is not None:
+            # The text of a CSV file is what its identifiers are: 007 is not 7.
+            (read if whole.columnar else raw).append(name)
+            request = quoted(name if whole.columnar else raw_name(name))
+        values = [f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in has]
+        values.append(f"CAST({request} AS VARCHAR) AS {_REQUEST}")
+        source = narrow.of([*(narrow.used or ()), *read], raw)
+        selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
     connection.execute(
         f"CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row FROM ({rows})"
     )
-    return tuple(columns)
+    return columns
+
+
+def _value(n: int) -> str:
+    return f"value_{n}"
+
+
+def _as_number(name: str, kind: str) -> str:
+    """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
+    value = quoted(name) if holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
+    return f"CAST({value} AS DOUBLE)"
 
 
 def _keys_of(mapping: LogMapping) -> LogMapping:
@@ -172,8 +217,7 @@ def _match(connection: duckdb.DuckDBPyConnection, within_ms: int) -> None:
     """Create the table `matches`, feedback row to exposure row."""
     connection.execute(
         "CREATE TABLE matches AS SELECT f.row AS feedback_row, e.row AS row FROM feedback f "
-        "JOIN exposures e ON CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
-        "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR) "
+        f"JOIN exposures e ON {_SAME_KEY} "
         f"AND (f.{_REQUEST} IS NULL OR f.{_REQUEST} = e.{_REQUEST}) "
         f"AND f.timestamp BETWEEN e.timestamp AND e.timestamp + {int(within_ms)} "
         "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
@@ -182,15 +226,17 @@ def _match(connection: duckdb.DuckDBPyConnection, within_ms: int) -> None:
 
 def _write(connection: duckdb.DuckDBPyConnection, columns: Sequence[str], out: Path) -> None:
     """Write the log, users as numbers if the feedback has numbers."""
-    values = [f"max({quoted(name)}) AS {quoted(name)}" for name in columns]
-    found = ", ".join(["m.row AS row", f"count(*) AS {FEEDBACK}", *values])
-    filled = ", ".join(f"coalesce({quoted(name)}, 0) AS {quoted(name)}" for name in columns)
+    values = [_value(n) for n in range(len(columns))]
+    found = ", ".join(
+        ["m.row AS row", f"count(*) AS {FEEDBACK}", *(f"max({each}) AS {each}" for each in values)]
+    )
+    named = zip((FEEDBACK, *values), (FEEDBACK, *columns), strict=True)
+    filled = ", ".join(f"coalesce({each}, 0) AS {quoted(name)}" for each, name in named)
     user = "CAST(user_id AS BIGINT) AS user_id" if _whole_users(connection) else "user_id"
     query = (
-        f"SELECT {user}, * EXCLUDE (user_id, row, {', '.join((FEEDBACK, *map(quoted, columns)))}), "
-        f"coalesce({FEEDBACK}, 0) AS {FEEDBACK}{', ' if filled else ''}{filled} FROM exposures "
-        f"LEFT JOIN (SELECT {found} FROM matches m JOIN feedback f ON f.row = m.feedback_row "
-        "GROUP BY m.row) USING (row) ORDER BY row"
+        f"SELECT {user}, * EXCLUDE (user_id, row, {', '.join((FEEDBACK, *values))}), {filled} "
+        f"FROM exposures LEFT JOIN (SELECT {found} FROM matches m JOIN feedback f "
+        "ON f.row = m.feedback_row GROUP BY m.row) USING (row) ORDER BY exposures.row"
     )
     with atomic_file(out) as scratch:
         batches = connection.sql(query).to_arrow_reader(BATCH_ROWS)
@@ -226,3 +272,53 @@ def _counts(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> 
         unmatched=count("*) FROM feedback") - matched,
         columns=columns,
     )
+
+
+def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:
+    """What may be wrong with feedback of which no row matches."""
+
+    def one(sql: str) -> tuple[Any, ...]:
+        row: tuple[Any, ...] = connection.sql(sql).fetchall()[0]
+        return row
+
+    reasons = []
+    requests, known, sample, wanted = one(
+        f"SELECT count({_REQUEST}), count_if({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
+        f"min({_REQUEST}), (SELECT min({_REQUEST}) FROM exposures) FROM feedback"
+    )
+    if requests and not known:
+        reasons.append(
+            f"none of its {requests:,} values of {_REQUEST} (such as {sample!r:.60}) is one of the "
+            f"exposures (such as {wanted!r:.60}), log the one that was served or omit the column"
+        )
+    if not one(f"SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}")[0]:
+        reasons.append(
+            "none of its users was shown any of their items, check --column user_id and item_id"
+        )
+    reasons.append(
+        f"exposures are from {_time_range(connection, 'exposures')} and feedback from "
+        f"{_time_range(connection, 'feedback')} (UTC), where numbers are read as milliseconds: "
+        "seconds need --column timestamp='COLUMN * 1000', microseconds "
+        "--column timestamp='COLUMN / 1000', and later feedback a larger --within"
+    )
+    if one(f"SELECT coalesce(bool_and(timestamp % {DAY_MS} = 0), false) FROM feedback")[0]:
+        reasons.append(
+            "its dates have no time of day and count as midnight, before what was shown on that "
+            "day: log the time, too"
+        )
+    rows = joined.unmatched
+    return f"none of the {rows:,} rows of feedback matches an exposure; {'; '.join(reasons)}"
+
+
+def _time_range(connection: duckdb.DuckDBPyConnection, rows: str) -> str:
+    """The first and the last time of a table, in UTC; as a number where no calendar has it."""
+    first, last = (
+        f"coalesce(strftime(TRY(make_timestamp_ms({each})), '%Y-%m-%d %H:%M:%S'), "
+        f"CAST({each} AS VARCHAR), '(none)')"
+        for each in ("first", "last")
+    )
+    ((told,),) = connection.sql(
+        f"SELECT {first} || ' to ' || {last} FROM "
+        f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
+    ).fetchall()
+    return str(told)

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -331,7 +332,8 @@ def test_messages_say_where_the_expression_is_and_what_is_allowed(
     assert told("prepare", log, "--out", out, "--reward", "read_text('x')") == (
         "ucfrec prepare: --reward: for the reward: \"read_text('x')\" is not a scalar SQL "
         f"expression over the columns of {log}: it calls 'read_text'; allowed are columns, "
-        "literals, operators, casts, CASE, and the functions of ucfrec.logs.expressions"
+        "literals, operators, casts, CASE, and the functions that docs/log-format.md "
+        "lists"
     )
     by_column = told("prepare", log, "--out", out, "--column", "user_id=1; SELECT 2")
     assert "--column: for user_id: '1; SELECT 2' is not a scalar SQL" in by_column
@@ -511,3 +513,11 @@ def test_text_cannot_grow_without_bound(text: str) -> None:
 def test_what_shops_write_is_not_taken_for_growth(text: str) -> None:
     with engine_in_memory() as connection:
         assert "a" in columns_of(connection, text)
+
+
+def test_the_documentation_lists_every_function() -> None:
+    page = Path("docs/log-format.md").read_text(encoding="utf-8")
+    section = page.partition("these functions of DuckDB are allowed:")[2].partition("\n## ")[0]
+    named = {each for each in FUNCTIONS if each[0].isalpha() and not each.endswith("_escape")}
+    named -= {"xor"}  # an operator
+    assert set(re.findall(r"[a-z]\w*(?=[,\n])", section)) == named

@@ -409,6 +409,27 @@ def test_files_are_listed_once(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a"]
 
 
+FAULTS = {
+    "too many fields": (
+        lambda lines: [*lines[:20], lines[20] + ",1"],
+        r"line 21 has 5 fields, the",
+    ),
+    "too few fields": (lambda lines: [*lines[:20], "1,2"], r"line 21 has 2 fields, the header 4;"),
+    "no header": (lambda lines: lines[1:], r"line 1 has values \(\d+, .*instead of the names"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_csv_lines_of_other_lengths_and_a_missing_header_are_refused(
+    tmp_path: Path, fault: str
+) -> None:
+    change, message = FAULTS[fault]
+    lines = make_log()[["user_id", "item_id", "timestamp", "reward"]].to_csv(index=False)
+    (tmp_path / "log.csv").write_text("\n".join(change(lines.splitlines()[:40])) + "\n")
+    with pytest.raises(InputError, match=rf"log\.csv, {message}"):
+        validate([tmp_path / "log.csv"], LogMapping())
+
+
 def test_endings_are_read_in_any_case_and_other_tables_are_named(tmp_path: Path) -> None:
     log = make_log()
     log.to_parquet(tmp_path / "a.PARQUET")

@@ -115,8 +115,8 @@ _TEXTS_AND_LISTS: Final = frozenset(
 _SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
 _WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
 _ALLOWED: Final = (
-    "allowed are columns, literals, operators, casts, CASE, and the functions of "
-    "ucfrec.logs.expressions"
+    "allowed are columns, literals, operators, casts, CASE, and the functions that "
+    "docs/log-format.md lists"
 )
 
 

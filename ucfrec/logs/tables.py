@@ -4,12 +4,13 @@ No column comes from the name of a folder unless it is requested, parts of one t
 columns in any order, and text that looks like a number stays available as text (`Table.raw`).
 """
 
+import csv
 import gzip
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO, cast
 
 import duckdb
 import pyarrow.parquet as pq
@@ -277,7 +278,7 @@ def _columns(
         raise InputError(
             f"{file} cannot be read: its path has a backslash and [, * or ?; rename it"
         )
-    if file.suffix == ".gz":
+    if file.suffix.lower() == ".gz":
         require_plausible_size(file)
     if not is_parquet:
         require_short_lines(file)
@@ -297,11 +298,44 @@ def _columns(
         raise InputError(
             f"{file} cannot be read, it may be truncated ({first_line(error)}); fetch it again"
         ) from None
+    columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
+    names = [name for name, _ in columns]
+    if not is_parquet:
+        _require_header(file, names)
     if not first_row:
         return None
-    columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
-    _require_distinct(file, [name for name, _ in columns])
+    _require_distinct(file, names)
     return columns if is_parquet else _of_all_rows(connection, file, columns)
+
+
+def _require_header(file: Path, columns: Sequence[str]) -> None:
+    """Refuse a CSV file whose first line is no header, or whose lines have other numbers of fields:
+    DuckDB reads such a file as one column, or skips lines."""
+    first = _written_names(file)
+    numbers = sum(re.fullmatch(r"[-+]?\d+(\.\d+)?", name) is not None for name in first)
+    if 2 * numbers >= len(first):
+        raise InputError(
+            f"{file}, line 1 has values ({', '.join(first):.60}) instead of the names of the "
+            "columns; add a line with these"
+        )
+    if len(columns) == len(first):
+        return
+    with _opened(file) as lines:
+        separator = max(",;\t|", key=lines.readline().count)
+        lines.seek(0)
+        rows = csv.reader(lines, delimiter=separator)
+        header = next(rows)
+        for number, row in enumerate(rows, start=2):
+            if row and len(row) != len(header):
+                raise InputError(
+                    f"{file}, line {number} has {len(row)} fields, the header {len(header)}; fix "
+                    "or remove the line"
+                )
+
+
+def _opened(file: Path) -> TextIO:
+    kind = gzip.open if file.suffix.lower() == ".gz" else open
+    return cast(TextIO, kind(file, "rt", encoding="utf-8-sig"))
 
 
 def _require_distinct(file: Path, columns: Sequence[str]) -> None:
@@ -316,8 +350,7 @@ def _written_names(file: Path) -> list[str]:
     """Names of the columns as the file has them."""
     if file.suffix.lower() == ".parquet":
         return list(pq.read_schema(file).names)
-    kind = gzip.open if file.suffix == ".gz" else open
-    with kind(file, "rt", encoding="utf-8-sig") as lines:
+    with _opened(file) as lines:
         return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
 
 

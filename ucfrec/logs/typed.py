@@ -321,7 +321,8 @@ def _select(
     }
     sql, kind, *_ = of_reward
     if not (is_number(kind) or kind in ("BOOLEAN", NOTHING)):
-        raise wrong_type(table, "reward", reward, kind, "use a numeric or boolean expression")
+        wanted = "use a number or truth value, such as try_cast(COLUMN AS DOUBLE) or COLUMN = 'yes'"
+        raise wrong_type(table, "reward", reward, kind, wanted)
     # An error in one row (division by zero, a cast) makes only that row's reward undefined.
     values[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
     if mapping.where is not None:
@@ -389,8 +390,11 @@ def _typed(
         if is_number(kind):
             wanted += ", if all are whole numbers of at most 15 digits: others would be rounded"
     elif name == schema.TIMESTAMP:
-        if is_number(kind):
+        if is_number(kind) and time_format is None:
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
+        if is_number(kind):
+            digits = f"CAST(TRY_CAST({sql} AS BIGINT) AS VARCHAR)"
+            return text_time(connection, table, digits, given, time_format), "BIGINT"
         if time := as_timestamp(sql, kind):
             return f"TRY(epoch_ms({time}))", "BIGINT"
         if kind == "VARCHAR":

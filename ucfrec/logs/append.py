@@ -98,7 +98,7 @@ def append_logs(
             files, mapping, _prepare_options(old, store, options), out.parent, None, onto=store
         ) as found,
     ):
-        _require_held_out(found)
+        _require_held_out(found.rows.log.name, found.report)
         _note_new_ids(found, store)
         return _Grown(store, old, found, options.window_ms).write(folder, made_of)
 
@@ -129,17 +129,19 @@ def _made_of(
     }
 
 
-def _require_held_out(found: PreparedLog) -> None:
+def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
     """Check, before the store is written, that there are rows to choose a rule and compare on.
+
+    Args:
+        name: of the logs, for the message.
 
     Raises:
         InputError: there are none.
     """
-    report = found.report
     for split in ("validation", "test"):
         if not report["splits"][split]["episodes"]:
             raise InputError(
-                f"{found.rows.log.name}: the new rows ({report['steps']:,}, in "
+                f"{name}: the new rows ({report['steps']:,}, in "
                 f"{report['sessions']:,} session(s)) leave no {split} rows, to choose a rule and "
                 "compare the runs on; give more rows, or another --split"
             )
@@ -166,7 +168,9 @@ def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
         raise InputError(
             f"{out} is a store of other logs, or of another window; name another folder"
         )
-    return dict(others["appended"])
+    report = dict(others["appended"])
+    _require_held_out(str(out), report)
+    return report
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A grown store has all rows of its logs once, with the old numbers, and reads no old log."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.later import NEW, later_log, later_mapping
-from tests.support.tagged import ITEMS, USERS, tagged_log, tagged_store
+from tests.support.logs import store_of
+from tests.support.tagged import ITEMS, USERS, tagged_log, tagged_mapping, tagged_store
 from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.append import AppendOptions, append_logs
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 
 
-def rows_of(path: Path) -> list[tuple[int, int, int, float]]:
+def rows_of(path: Path) -> list[tuple[int | str, int | str, int, float]]:
     """All rows of a store, with the identifiers of its users and items, sorted."""
     store = EpisodeStore.open(path)
     users, items = (
@@ -37,7 +37,7 @@ def rows_of(path: Path) -> list[tuple[int, int, int, float]]:
     return sorted(zip(*(column.tolist() for column in columns), strict=True))
 
 
-def rows_in(*logs: pd.DataFrame) -> list[tuple[int, int, int, float]]:
+def rows_in(*logs: pd.DataFrame) -> list[tuple[int | str, int | str, int, float]]:
     frame = pd.concat(logs)[["user_id", "item_id", "timestamp", "reward"]]
     return sorted(frame.itertuples(index=False, name=None))
 
@@ -136,11 +136,57 @@ def test_propensities_may_begin_with_the_new_logs(grown: Path, tmp_path: Path) -
     assert known.sum() == 300
 
 
-def test_text_and_numbers_are_not_mixed(tmp_path: Path) -> None:
-    log = tagged_log().assign(item_id=lambda frame: frame.item_id.astype(str) + "x")
-    log.to_parquet(tmp_path / "log.parquet")
-    prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", PrepareOptions())
-    later_log().to_parquet(tmp_path / "later.parquet")
-    with pytest.raises(InputError, match="item_id is a number"):
-        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
-    assert not (tmp_path / "grown").exists()
+def test_logs_that_are_all_old_are_refused(grown: Path, tmp_path: Path) -> None:
+    out, log = tmp_path / "again", later_log()
+    with pytest.raises(
+        InputError,
+        match=r"all 300 rows are not newer than .*grown, whose last row is of 2023-.*UTC",
+    ):
+        append_logs(grown / "grown", [grown / "later.parquet"], out)
+    seconds = log.assign(timestamp=log.timestamp // 1000)
+    seconds.to_parquet(tmp_path / "seconds.parquet")
+    with pytest.raises(InputError, match="is the time in milliseconds"):
+        append_logs(grown / "grown", [tmp_path / "seconds.parquet"], out)
+    assert not out.exists()
+
+
+def test_a_log_too_short_to_be_split_leaves_no_store(grown: Path, tmp_path: Path) -> None:
+    later_log().head(1).to_parquet(tmp_path / "one.parquet")
+    out = tmp_path / "grown"
+    with pytest.raises(InputError, match=r"\(1, in 1 session\(s\)\) leave no validation rows"):
+        append_logs(grown / "store", [tmp_path / "one.parquet"], out)
+    assert not out.exists()
+    append_logs(grown / "store", [grown / "later.parquet"], out, later_mapping(grown))
+    assert rows_of(out) == rows_in(tagged_log(), later_log())
+
+
+@pytest.mark.parametrize("name", ["user_id", "item_id"])
+def test_logs_of_only_new_ids_are_noted(grown: Path, tmp_path: Path, name: str) -> None:
+    log = later_log()
+    log.assign(**{name: log[name] + 10_000}).to_parquet(tmp_path / "strange.parquet")
+    count = log[name].nunique()
+    noted = f"{count} of {count} {name[:4]}s are not among those of .*how {name} is written"
+    with pytest.warns(InputNote, match=noted):
+        append_logs(grown / "store", [tmp_path / "strange.parquet"], tmp_path / "grown")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        append_logs(grown / "store", [grown / "later.parquet"], tmp_path / "usual")
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv"])
+def test_integers_follow_text_as_their_text(tmp_path: Path, suffix: str) -> None:
+    old, new = tagged_log(), later_log()
+    in_text = [
+        log.assign(user_id=log.user_id.map(str), item_id=log.item_id.map(str)) for log in (old, new)
+    ]
+    in_text[0].loc[0, "user_id"] = "guest"
+    options = {"reward": "reward", "session_by": "gap", "gap_minutes": 120, "embedding_size": 6}
+    store_of(in_text[0], tmp_path, tagged_mapping(tmp_path), **options)
+    file = tmp_path / f"later.{suffix}"
+    if suffix == "csv":
+        new.to_csv(file, index=False)
+    else:
+        new.to_parquet(file)
+    report = append_logs(tmp_path / "store", [file], tmp_path / "grown", later_mapping(tmp_path))
+    assert (report["new_users"], report["new_items"]) == (NEW, NEW)
+    assert rows_of(tmp_path / "grown") == rows_in(*in_text)

@@ -103,6 +103,16 @@ def test_unknown_items_are_left_alone() -> None:
     assert model.share == 1
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_one_user_with_known_items_is_predicted_by_equal_shares() -> None:
+    states, item = behavior()[0][:80], np.arange(80) % 9
+    item[40:] = -1
+    session = np.arange(80) // 40
+    model = fit_behavior(lambda: iter([states]), item, GROUP_OF[item], session, 0)
+    np.testing.assert_allclose(model.group[:40], 1 / 3)
+    np.testing.assert_array_equal(model.group[40:], 1.0)
+
+
 def test_one_group_is_certain() -> None:
     states, _ = behavior()
     item = np.arange(STEPS) % 9

@@ -1,5 +1,6 @@
 """Scores of logged choices: probabilities, and what the policy would see when acting."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 
 from tests.support.replay import replayed
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import logged_steps, step_features
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
@@ -187,6 +188,30 @@ def test_logs_of_another_catalogue_are_refused(
         logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
     ):
         pass
+
+
+def test_logs_of_users_the_run_does_not_know_are_noted(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    users = log.user_id.nunique()
+    padded = log.assign(user_id=log.user_id.map("{:07}".format))
+    # Fewer than 20 users, or a tenth of known ones, say nothing.
+    few = padded[padded.user_id.isin(padded.user_id.unique()[:19])]
+    known = log.user_id.unique()[: users // 8]
+    some = padded.assign(
+        user_id=padded.user_id.where(~log.user_id.isin(known), log.user_id.map(str))
+    )
+    for each, noted in ((padded, True), (few, False), (some, False)):
+        each.to_parquet(tmp_path / "log.parquet")
+        with (
+            warnings.catch_warnings(record=True) as said,
+            logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
+        ):
+            pass
+        found = [str(note.message) for note in said if note.category is InputNote]
+        assert len(found) == noted
+        assert all(f"{users} of {users} users are not among those the run" in s for s in found)
 
 
 def test_ids_may_be_text_where_the_run_has_integers(

@@ -123,9 +123,20 @@ def test_augmentation_models_start_warm(folder: Path, tmp_path: Path) -> None:
 
 def test_logs_that_leave_nothing_to_compare_on_are_refused(folder: Path, tmp_path: Path) -> None:
     options = UpdateOptions(AppendOptions(split=(0.5, 0.5, 0.0)))
-    with pytest.raises(InputError, match="no test rows"):
+    with pytest.raises(InputError, match="leave no test rows"):
         update_run(folder / "run", [folder / "later.parquet"], tmp_path / "run2", options=options)
-    assert not (tmp_path / "run2").exists()
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_no_update_is_refused_before_a_store_is_written(
+    folder: Path, tmp_path: Path
+) -> None:
+    trained_run(tmp_path)
+    (tmp_path / "other").mkdir()
+    for name, fault in (("run", "is not an update of"), ("other", "is no run")):
+        with pytest.raises(InputError, match=fault):
+            update_run(folder / "run", [folder / "later.parquet"], tmp_path / name)
+        assert not (tmp_path / f"{name}-store").exists()
 
 
 def test_a_seed_and_a_share_of_the_steps_may_be_given(folder: Path, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
+from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import PreparedLog, PrepareOptions, prepared_log
 from ucfrec.progress import progress
@@ -74,7 +75,8 @@ def append_logs(
         `new_user_steps` and `new_item_steps` (steps that have them), and `expired_steps`.
 
     Raises:
-        InputError: the logs cannot be used, or `out` is another store.
+        InputError: the logs cannot be used or leave nothing to validate or test on, or `out` is
+            another store.
     """
     options, mapping = options or AppendOptions(), mapping or LogMapping()
     files, old = log_files(paths), StoreRecord.read(store)
@@ -96,6 +98,8 @@ def append_logs(
             files, mapping, _prepare_options(old, store, options), out.parent, None, onto=store
         ) as found,
     ):
+        _require_held_out(found.rows.log.name, found.report)
+        _note_new_ids(found, store)
         return _Grown(store, old, found, options.window_ms).write(folder, made_of)
 
 
@@ -125,6 +129,38 @@ def _made_of(
     }
 
 
+def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
+    """Check, before the store is written, that there are rows to choose a rule and compare on.
+
+    Args:
+        name: of the logs, for the message.
+
+    Raises:
+        InputError: there are none.
+    """
+    for split in ("validation", "test"):
+        if not report["splits"][split]["episodes"]:
+            raise InputError(
+                f"{name}: the new rows ({report['steps']:,}, in "
+                f"{report['sessions']:,} session(s)) leave no {split} rows, to choose a rule and "
+                "compare the runs on; give more rows, or another --split"
+            )
+
+
+def _note_new_ids(found: PreparedLog, store: Path) -> None:
+    """Warn of logs that share no user, or no item, with the store."""
+    log = found.rows.log
+    for name, table, file in ID_TABLES:
+        before = pq.read_metadata(store / file).num_rows
+        ids, new = log.one(
+            f"SELECT count(*), count_if(number >= {before}) FROM kept_{table} "
+            f"JOIN {table} USING ({name})"
+        )
+        # New ids are usual here; only logs without any old one may be written in another way.
+        if new == ids:
+            note_unknown(log.name, name, new, ids, f"of {store}")
+
+
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     """The report on a store that is there already."""
     others = StoreRecord.read(out).source.others
@@ -132,7 +168,9 @@ def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
         raise InputError(
             f"{out} is a store of other logs, or of another window; name another folder"
         )
-    return dict(others["appended"])
+    report = dict(others["appended"])
+    _require_held_out(str(out), report)
+    return report
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.writer import StoreWriter
-from ucfrec.errors import InputError
 from ucfrec.logs.engine import BATCH_ROWS, as_arrow, as_numpy
 from ucfrec.logs.measures import Measures
 from ucfrec.logs.sessions import Episodes
@@ -53,9 +52,6 @@ def number_ids(
         like: a store whose numbers are reused instead (without `train_count`); None for none.
         onto: a store whose ids keep their numbers, while others follow in sorted order; their
             `train_count` is added to the log's. None for none.
-
-    Raises:
-        InputError: ids are text in the store `onto` and numbers in the log.
     """
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -86,15 +82,23 @@ def number_ids(
         """)
 
 
+def text_ids(store: Path | None) -> tuple[str, ...]:
+    """Id columns that are text in a store; none without one."""
+    if store is None:
+        return ()
+    return tuple(
+        name
+        for name, _, file in ID_TABLES
+        if not pa.types.is_integer(pq.read_schema(store / file).field(name).type)
+    )
+
+
 def _add_ids(log: TypedLog, name: str, table: str, file: Path, ids: str) -> None:
-    """Create a table of the ids in the file of a store, and then those that `ids` selects."""
-    if log.id_type(name) == "BIGINT" and not pa.types.is_integer(
-        pq.read_schema(file).field(name).type
-    ):
-        raise InputError(
-            f"{log.name}: {name} is a number, {file} has text; read it as text too, with --column "
-            f"{name}='CAST({name} AS VARCHAR)'"
-        )
+    """Create a table of the ids in the file of a store, and then those that `ids` selects.
+
+    Args:
+        log: its ids are text where those of the store are, see `text_ids`.
+    """
     options = "file_row_number = true, hive_partitioning = false"
     log.connection.execute(f"""
         CREATE TABLE {table} AS

@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -21,8 +22,9 @@ import xxhash
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.errors import InputError, InputNote
+from ucfrec.logs.mapping import EARLIEST_MS
 from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, text
-from ucfrec.logs.typed import WANTED, TypedLog, not_finite
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
 
 DUPLICATES: Final = {
     "highest": "has the highest",
@@ -58,6 +60,10 @@ REASONS: Final = {
 }
 """Reason to its description; a row is dropped for the first reason that applies."""
 _FINE: Final = ("duplicate", "left_out")
+FEW_IDS: Final = 20
+MOST_UNKNOWN: Final = 0.9
+"""Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
+warning that they are unknown."""
 CLOCK_HINT: Final = (
     "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000'; "
     "for older times, say --earliest 1990-01-01, or earliest in the mapping"
@@ -289,19 +295,66 @@ def note_dropped(
     )
 
 
+def note_unknown(name: str, column: str, unknown: int, total: int, known: str) -> None:
+    """Warn where nearly all users or items of a log are unknown, as if written in another way.
+
+    Args:
+        name: of the log, for the message.
+        column: `user_id` or `item_id`.
+        unknown: number of its ids that are not known.
+        total: number of its ids; few say nothing.
+        known: whose ids are known, after "those".
+    """
+    if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
+        return
+    ids = column.removesuffix("_id") + "s"
+    warnings.warn(
+        f"{name}: {unknown:,} of {total:,} {ids} are not among those {known}; if they should be, "
+        f"compare how {column} is written",
+        InputNote,
+        stacklevel=3,
+    )
+
+
 class NoRowsError(InputError):
     """No row of a log can be used."""
 
 
-def require_rows(log: TypedLog, kept: int, dropped: Mapping[str, int]) -> None:
+def require_rows(
+    log: TypedLog, kept: int, dropped: Mapping[str, int], onto: Path | None = None
+) -> None:
     """Check that a row is left.
+
+    Args:
+        onto: a store that the log is added to, whose end is the earliest time; None for none.
 
     Raises:
         NoRowsError: none is.
     """
     if kept == 0:
+        if onto is not None:
+            _require_newer(log, dropped, onto)
         reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
         hint = f"; {CLOCK_HINT}" if dropped["clock_out_of_range"] else ""
         raise NoRowsError(
             f"{log.name}: no row is left ({reasons}{hint}); correct the mapping or the log"
+        )
+
+
+def _require_newer(log: TypedLog, dropped: Mapping[str, int], onto: Path) -> None:
+    """Check that the rows of a log, none of which is left, are not just those of the store again.
+
+    Raises:
+        NoRowsError: all rows that are wanted have a sound time, which is not after the store.
+    """
+    wanted = sum(dropped.values()) - dropped["left_out"]
+    if not wanted or dropped["clock_out_of_range"] < wanted:
+        return
+    (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
+    # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
+    if EARLIEST_MS <= latest < log.earliest_ms:
+        last = datetime.fromtimestamp((log.earliest_ms - 1) / 1000, UTC)
+        raise NoRowsError(
+            f"{log.name}: all {wanted:,} rows are not newer than {onto}, whose last row is of "
+            f"{last:%Y-%m-%d %H:%M:%S} UTC; give newer logs"
         )

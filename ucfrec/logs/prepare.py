@@ -32,6 +32,7 @@ from ucfrec.logs.ids import (
     StepNumbers,
     number_ids,
     popularity,
+    text_ids,
     write_episode_users,
     write_ids,
     write_steps,
@@ -283,12 +284,12 @@ def prepared_log(
 
                 log, batches = sorted_with_spark(*typed, known, scratch, options.spark_master)
             else:
-                log = typed_log(*typed, spill)
+                log = typed_log(*typed, spill, text_ids(onto))
                 with explained(connection, log.tables, spill):
                     batches = sorted_batches(log, known, scratch)
             with explained(connection, log.tables, spill):
                 rows = check_sorted(log, batches, options.duplicates, scratch)
-                require_rows(log, len(rows.clean), rows.dropped)
+                require_rows(log, len(rows.clean), rows.dropped, onto)
                 note_losses(rows, reward, mapping.where)
                 if like is None and onto is None:
                     require_variety(rows)

@@ -1,7 +1,7 @@
 """A log as one relation of typed rows: its files, its columns, its reward."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -118,6 +118,7 @@ def typed_columns(
     mapping: LogMapping,
     reward: str,
     session_by: str | None,
+    as_text: Collection[str] = (),
 ) -> TypedColumns:
     """Resolve the columns and the reward of a log; the arguments are those of `typed_log`.
 
@@ -131,7 +132,7 @@ def typed_columns(
     found = [_select(connection, table, mapping, columns, reward) for table in tables]
     for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
         if name in columns:
-            _unify_ids(connection, found, name)
+            _unify_ids(connection, found, name, name in as_text)
     return TypedColumns(
         columns,
         tuple(
@@ -160,6 +161,7 @@ def typed_log(
     reward: str,
     session_by: str | None,
     folder: Path,
+    as_text: Collection[str] = (),
 ) -> TypedLog:
     """Create `read` from tables that are open.
 
@@ -169,12 +171,13 @@ def typed_log(
         reward: scalar SQL expression over the files' columns.
         session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
         folder: folder named when its disk is full.
+        as_text: id columns that are text even if all of them are integers.
 
     Raises:
         InputError: a file, column or type makes the log unusable, or an observation is missing or
             not finite.
     """
-    typed = typed_columns(connection, tables, mapping, reward, session_by)
+    typed = typed_columns(connection, tables, mapping, reward, session_by, as_text)
     with explained(connection, tables, folder):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
         columnar = all(table.columnar for table in tables)
@@ -419,13 +422,15 @@ def _typed(
     raise wrong_type(table, name, given, kind, wanted)
 
 
-def _unify_ids(connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str) -> None:
-    """Cast ids to BIGINT if every file has integers that fit, else to text.
+def _unify_ids(
+    connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str, as_text: bool
+) -> None:
+    """Cast ids to BIGINT if every file has integers that fit, else or with `as_text` to text.
 
     Text of a CSV file is an integer only if it is written as the integer is: 007, 7.0 and 1e1 are
     not.
     """
-    whole = all(
+    whole = not as_text and all(
         kind == NOTHING
         or (is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT"))
         or _are_integers(connection, each.table, sql)

@@ -137,11 +137,12 @@ class _Groups:
         from sklearn.linear_model import LogisticRegression
 
         self.shares = shares
-        self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
-        self._spread[self._spread == 0] = 1.0
         self._present = np.unique(group)
         self._model = None
+        # There may be no row at all, where all other users were shown unknown items.
         if len(self._present) > 1:
+            self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
+            self._spread[self._spread == 0] = 1.0
             require_blas_memory()
             self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
             self._model.fit(self._scaled(states), group)

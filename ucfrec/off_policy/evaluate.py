@@ -15,6 +15,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
 from ucfrec.off_policy.behavior_model import (
     BehaviorModel,
     default_groups,
@@ -303,6 +304,7 @@ def logged_steps(
         InputError: propensities are not probabilities, or there is only one user.
     """
     store, plain = logged.store, _logged_only(logged, options)
+    _require_two_users(logged, plain)
     items = store.step_values(schema.ITEM, *store.all_steps()).astype(np.int64)
     group_of = _item_groups(trained, options, seed)
     group = np.where(items >= 0, group_of[items], -1)
@@ -347,6 +349,23 @@ def _logged_only(logged: LoggedSessions, options: EstimateOptions) -> LoggedStep
         user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
         discount=options.discount,
     )
+
+
+def _require_two_users(logged: LoggedSessions, plain: LoggedSteps) -> None:
+    """Check, before the slow scoring, that a model of other users can predict each user.
+
+    Raises:
+        InputError: there is only one user.
+    """
+    sessions = len(plain.first)
+    users = sessions if plain.user is None else len(np.unique(plain.user))
+    if users < 2:
+        name = logged.report.get("files", [logged.store.path])[0]
+        raise InputError(
+            f"{name}: the logs have {sessions:,} session{'s' * (sessions > 1)} of one user; at "
+            "least two users are needed, as each is predicted by models of the others; give logs "
+            "of more users"
+        )
 
 
 def _weighed_by_model(

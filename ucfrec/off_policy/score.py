@@ -24,6 +24,7 @@ from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import EPISODE_USERS
+from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.progress import progress
@@ -158,6 +159,7 @@ def prepared_sessions(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
                 "give logs of the same catalogue"
             )
+        _note_unknown_users(str(files[0]), store, report["users"], trained)
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         yield _with_history(trained, LoggedSessions(store, users, report, unknown), _store(trained))
@@ -192,6 +194,14 @@ def _unknown_items(store: EpisodeStore) -> int:
     )
     items = (store.step_values(schema.ITEM, *store.locate(each)) for each in steps)
     return sum(int((each < 0).sum()) for each in items)
+
+
+def _note_unknown_users(name: str, store: EpisodeStore, users: int, trained: TrainedPolicy) -> None:
+    """Warn of logs hardly any of whose users the run knows; nothing where it knows no users."""
+    if len(trained.user_ids):
+        numbers = np.unique(store.episode_values(schema.USER))
+        unknown = users - int((numbers >= 0).sum())
+        note_unknown(name, schema.USER_ID, unknown, users, "the run was trained on")
 
 
 def _as_seen(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:

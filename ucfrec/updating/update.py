@@ -1,5 +1,6 @@
 """Update a run with new logs: grow its store, train on from its weights, compare both runs."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
 from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.record import RunRecord, Update, store_of
+from ucfrec.runs.record import RUN, RunRecord, Update, store_of
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -75,10 +76,13 @@ def update_run(
     """
     options, trained = options or UpdateOptions(), TrainedPolicy.load(run, split=True)
     before = _store_before(run, trained)
+    _require_update(out, run, trained)
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = _opened(grown, trained)
+    opened = EpisodeStore.open(grown)
+    if trained.dropped:
+        opened = opened.without_observation_dimensions(trained.dropped)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:
@@ -92,8 +96,7 @@ def update_run(
     )
     about = {"update": update, "dropped_observations": trained.dropped}
     record = train_run(opened, out, config, about, initial=run)
-    if record.update is None or record.update.run != trained.fingerprint:
-        raise InputError(f"{out} is not an update of {run}; name another run folder")
+    assert record.update is not None
     if record.update.verdict is None:
         record = _compared(out, record, trained, before, opened, counts)
     if options.refit:
@@ -120,20 +123,18 @@ def _compared(
     return record.with_entries(update=update).written(out)
 
 
-def _opened(path: Path, trained: TrainedPolicy) -> EpisodeStore:
-    """A store as the run sees it, with rows to choose a rule and to compare on.
+def _require_update(out: Path, run: Path, trained: TrainedPolicy) -> None:
+    """Check, before the store grows, that an update can begin, or go on, in the folder `out`.
 
     Raises:
-        InputError: there are none.
+        InputError: `out` is something else.
     """
-    store = EpisodeStore.open(path)
-    for split in ("validation", "test"):
-        if not store.split(split).n_episodes:
-            raise InputError(
-                f"the new logs leave no {split} rows, to choose a rule and compare the runs on; "
-                "give more rows, or another --split and --store"
-            )
-    return store.without_observation_dimensions(trained.dropped) if trained.dropped else store
+    if (out / RUN).is_file():
+        update = RunRecord.read(out).update
+        if update is None or update.run != trained.fingerprint:
+            raise InputError(f"{out} is not an update of {run}; name another run folder")
+    elif os.path.lexists(out):
+        raise InputError(f"{out} exists already and is no run; name another run folder")
 
 
 def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:

@@ -27,7 +27,7 @@ def make_log(rows: int, text: bool, seed: int) -> pd.DataFrame:
             "seconds": START // 1000 + generator.integers(300, size=rows) * 60,
             "played": generator.choice([0, 1, 2, np.nan, np.inf], rows),
             "length": generator.integers(3, size=rows),
-            "propensity": generator.choice([0.25, 0.5, 1.5, np.nan], rows),
+            "propensity": generator.choice([0.25, 0.5, 1.0, np.nan], rows),
             "is_random": generator.integers(2, size=rows),
             "session_id": generator.integers(6, size=rows),
         }

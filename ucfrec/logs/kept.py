@@ -65,8 +65,10 @@ MOST_UNKNOWN: Final = 0.9
 """Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
 warning that they are unknown."""
 CLOCK_HINT: Final = (
-    "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000'; "
-    "for older times, say --earliest 1990-01-01, or earliest in the mapping"
+    "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000', "
+    "microseconds with 'COLUMN / 1000', nanoseconds with 'COLUMN / 1000000', times such as "
+    "20260131 with --time-format; for older times, say --earliest 1990-01-01, or earliest in the "
+    "mapping"
 )
 
 

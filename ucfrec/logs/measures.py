@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -185,8 +186,10 @@ def _require_training(measures: Measures, cut: Cut, rows: int) -> None:
             f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
         )
     if measures.splits[0, 1] == 0:
+        ends = datetime.fromtimestamp(cut.bounds[0] / 1000, UTC)
         raise InputError(
-            f"no row is in the training split (before {cut.bounds[0]} ms); choose a later split"
+            f"no row is in the training split, before {ends:%Y-%m-%d %H:%M:%S} UTC: all are of "
+            "that time or later; log finer times, or choose a later split"
         )
 
 

@@ -403,7 +403,9 @@ def test_score_and_ope_refuse_what_they_cannot_use(
     log.assign(item_id=log.item_id + 10_000).to_parquet(other)
     log.drop(columns="observation").to_parquet(blind)
     out = str(tmp_path / "out")
-    assert "propensity is above 1, up to 1.5, in" in refused(["ope", run, density, "--json", out], capsys)
+    assert "propensity is above 1, up to 1.5, in" in refused(
+        ["ope", run, density, "--json", out], capsys
+    )
     vectors = str(tmp_path / "vectors")
     store = str(folder / "synthetic-taobao-store")
     assert main(["train", store, "--out", vectors, "--policy", "bc", *settings()]) == 0

@@ -1,11 +1,12 @@
 """Ids of feature tables: those of the log in another type are found, others are refused."""
 
+import warnings
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
@@ -57,4 +58,16 @@ def test_features_of_nothing_in_the_log_are_refused(
 ) -> None:
     mapping = mapping_of(tmp_path, ids, keys)
     with pytest.raises(InputError, match=rf"features\.parquet: no row belongs to .*{message}"):
+        validate([tmp_path / "log.parquet"], mapping, OPTIONS)
+
+
+def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:
+    mapping = mapping_of(tmp_path, [1, 2, 3, 4], [1, 2])
+    with pytest.warns(
+        InputNote, match=r"features\.parquet: 2 of 4 item_ids of the log have no row"
+    ):
+        validate([tmp_path / "log.parquet"], mapping, OPTIONS)
+    mapping = mapping_of(tmp_path, [*range(10)], [*range(9)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
         validate([tmp_path / "log.parquet"], mapping, OPTIONS)

@@ -1,6 +1,7 @@
 """Read the features of items and users into DuckDB tables."""
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -8,7 +9,7 @@ from typing import Final
 import duckdb
 import numpy as np
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.binding import Bound, bind, explained, wrong_type
 from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.mapping import FeatureTable, log_files
@@ -26,6 +27,9 @@ from ucfrec.logs.tables import (
 
 _WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
 """DuckDB type of reals to the bound below which it holds every whole number."""
+
+_MANY_LACKING: Final = 0.2
+"""Share of the ids without a row above which a note says so."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,7 @@ def require_known_ids(
     kind: str,
     kept: str,
 ) -> None:
-    """Check that each feature table has a feature of an id of the log.
+    """Check that each feature table has a row of an id of the log; note if many ids have none.
 
     Args:
         names: of `load_features`, for each of them.
@@ -192,13 +196,23 @@ def require_known_ids(
         InputError: none of the ids of a table occurs in the log.
     """
     for table, name in zip(tables, names, strict=True):
-        found = connection.sql(f"SELECT 1 FROM {name} JOIN {kept} ON id = {kind} LIMIT 1")
-        if not found.fetchall():
+        ((every, having),) = connection.sql(
+            f"SELECT count(*), count(id) FROM {kept} LEFT JOIN {name} ON id = {kind}"
+        ).fetchall()
+        files = ", ".join(map(str, table.files))
+        if 0 < having < (1 - _MANY_LACKING) * every:
+            warnings.warn(
+                f"{files}: {every - having:,} of {every:,} {kind}s of the log have no row; their "
+                "features count as missing",
+                InputNote,
+                stacklevel=3,
+            )
+        if not having:
             ids = connection.sql(f"SELECT id FROM {name} ORDER BY id").limit(3).fetchall()
             known = connection.sql(f"SELECT {kind} FROM {kept} ORDER BY {kind}").limit(3).fetchall()
             theirs = f"is {_listed(ids)}" if ids else "is never such an id"
             raise InputError(
-                f"{', '.join(map(str, table.files))}: no row belongs to a {kind} of the log, which "
+                f"{files}: no row belongs to a {kind} of the log, which "
                 f"are {_listed(known)}, and {table.key} {theirs}; let the key be an expression "
                 "that gives the same ids, or leave the file out"
             )

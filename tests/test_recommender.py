@@ -347,5 +347,5 @@ def test_new_logs_bring_it_up_to_date(log: pd.DataFrame, tmp_path: Path) -> None
     assert update.verdict is not None
     assert new.run == tmp_path / "new"
     assert new.recommend(log, k=2).groupby("user_id").size().max() == 2
-    with pytest.raises(InputError, match=r"gone|no row"):
+    with pytest.raises(InputError, match=r"gone|are not newer than"):
         Recommender.load(tmp_path / "new").update(log[:10], tmp_path / "third")

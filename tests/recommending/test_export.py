@@ -110,10 +110,9 @@ RULES = {
 }
 TAGGED = ("run", "full", "everything")
 CASES = [
-    ("tags", False, "run"),
     # Tastes move what the reward model says; without its weight they would move nothing.
     ("tags", True, "everything"),
-    ("no tags", True, "ahead"),
+    ("no tags", False, "ahead"),
     ("observations", True, "weighted"),
 ]
 """Run, whether sessions show tastes, rule."""

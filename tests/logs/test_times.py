@@ -134,6 +134,13 @@ def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
     assert range_of(zoned, mapping) == ["2024-02-29", "2024-03-11"]
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
+    times = days("2024-03-01", 11).strftime("%Y%m%d%H%M").astype("int64")
+    path = write(make_log(times), tmp_path / f"log{suffix}")
+    assert range_of(path, LogMapping(time_format="%Y%m%d%H%M")) == ["2024-03-01", "2024-03-11"]
+
+
 def test_times_before_2000_are_read_when_asked_for(tmp_path: Path) -> None:
     path = write(make_log(days("1997-09-01", 200)), tmp_path / "log.parquet")
     with pytest.raises(InputError, match=r"no row is left .* say --earliest 1990-01-01"):

@@ -20,7 +20,7 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.export import DESCRIPTION, GRAPH, export
-from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, _best
+from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, RuleGraph, _best
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -147,6 +147,10 @@ def test_the_graph_recommends_what_the_policy_does(
         found = ranked(tmp_path / "out", given, some, MAPPING[run])
         expected = expected[[*found.columns]]  # a graph says nothing of draws
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+
+
+def test_by_default_all_items_of_a_small_catalogue_are_chosen(trained: TrainedPolicy) -> None:
+    assert RuleGraph(trained.scorer(), trained.name, None).k == 24
 
 
 def test_the_command_writes_it_whole_or_not_at_all(

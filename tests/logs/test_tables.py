@@ -430,6 +430,13 @@ def test_csv_lines_of_other_lengths_and_a_missing_header_are_refused(
         validate([tmp_path / "log.csv"], LogMapping())
 
 
+@pytest.mark.parametrize("title", ["# exported by the shop", ""])
+def test_a_title_above_the_header_is_skipped(tmp_path: Path, title: str) -> None:
+    log = make_log()
+    (tmp_path / "log.csv").write_text(f"{title}\n{log.to_csv(index=False)}")
+    assert validate([tmp_path / "log.csv"], LogMapping())["rows_read"] == len(log)
+
+
 def test_endings_are_read_in_any_case_and_other_tables_are_named(tmp_path: Path) -> None:
     log = make_log()
     log.to_parquet(tmp_path / "a.PARQUET")

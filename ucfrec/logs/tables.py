@@ -4,6 +4,7 @@ No column comes from the name of a folder unless it is requested, parts of one t
 columns in any order, and text that looks like a number stays available as text (`Table.raw`).
 """
 
+import contextlib
 import csv
 import gzip
 import re
@@ -320,13 +321,14 @@ def _require_header(file: Path, columns: Sequence[str]) -> None:
         )
     if len(columns) == len(first):
         return
-    with _opened(file) as lines:
+    with _opened(file) as lines, contextlib.suppress(csv.Error):
         separator = max(",;\t|", key=lines.readline().count)
         lines.seek(0)
         rows = csv.reader(lines, delimiter=separator)
-        header = next(rows)
+        header = next(rows, [])
         for number, row in enumerate(rows, start=2):
-            if row and len(row) != len(header):
+            # A first line of one field is a title or comment, which DuckDB skips.
+            if row and len(row) != len(header) > 1:
                 raise InputError(
                     f"{file}, line {number} has {len(row)} fields, the header {len(header)}; fix "
                     "or remove the line"
@@ -335,7 +337,7 @@ def _require_header(file: Path, columns: Sequence[str]) -> None:
 
 def _opened(file: Path) -> TextIO:
     kind = gzip.open if file.suffix.lower() == ".gz" else open
-    return cast(TextIO, kind(file, "rt", encoding="utf-8-sig"))
+    return cast(TextIO, kind(file, "rt", encoding="utf-8-sig", errors="replace"))
 
 
 def _require_distinct(file: Path, columns: Sequence[str]) -> None:

@@ -251,8 +251,8 @@ class RuleSearch:
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it.
 
-        Either half of the users is simulated with the calibration of its own rows, in twice the
-        sessions where the first ones do not tell the return well.
+        Either half of the users is simulated with the calibration of its own rows. More sessions
+        follow where the standard error of the first ones is large.
         """
         halves = [self._of_half(rule, number) for number in (0, 1)]
         returns = np.concatenate([each.returns for each in halves])

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import duration_ms, log_options, logs_given, memory_option
+from ucfrec.commands.durations import duration_ms
+from ucfrec.commands.options import log_options, logs_given, memory_option
 from ucfrec.files.remote import Input, Output, origin, uri_or_path
 
 

@@ -1,12 +1,11 @@
 """Options that several commands share, and the objects made from them."""
 
 import argparse
-import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, uri_or_path
@@ -19,21 +18,6 @@ if TYPE_CHECKING:
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
-
-_UNITS_MS: Final = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
-
-
-def duration_ms(option: str, given: str) -> int:
-    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`.
-
-    Raises:
-        InputError: it is written otherwise, or is 0.
-    """
-    found = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", given.strip())
-    milliseconds = 0 if found is None else round(float(found[1]) * _UNITS_MS[found[2]])
-    if not milliseconds:
-        raise InputError(f"{option} {given} is not a duration; write e.g. 90s, 30m, 12h or 60d")
-    return milliseconds
 
 
 def environment_options(parser: argparse.ArgumentParser) -> None:

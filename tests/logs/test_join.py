@@ -317,3 +317,21 @@ def test_a_join_killed_at_any_moment_ends_as_if_left_alone(tmp_path: Path) -> No
     assert sorted(path.name for path in tmp_path.glob("*.parquet")) == [
         "feedback.parquet", "joined.parquet"
     ]  # fmt: skip
+
+
+def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
+    given = feedback([(1, 10, 7, 1, "app"), (1, 11, 2, 1, "bot"), (2, 10, 6, 1, "bot")], "source")
+    for day, rows in {"01": given[:2], "02": given[2:]}.items():
+        (tmp_path / f"day={day}").mkdir()
+        rows.to_parquet(tmp_path / f"day={day}" / "rows.parquet")
+    shown, files = exposures(tmp_path / "shown"), [str(tmp_path / "day=*")]
+
+    def clicks(mapping: LogMapping) -> list[float]:
+        join_feedback([shown], files, tmp_path / "log.parquet", 30 * MINUTE, mapping)
+        log = pd.read_parquet(tmp_path / "log.parquet")
+        return log.sort_values(["timestamp", "user_id", "position"]).click.tolist()
+
+    assert clicks(LogMapping()) == [0, 1, 1, 1]
+    assert clicks(LogMapping(where="source = 'app' AND click = 1")) == [0, 0, 1, 0]
+    assert clicks(LogMapping(where="day = '02'", partitions=True)) == [0, 0, 0, 1]
+    assert clicks(LogMapping(earliest="2023-11-14T22:20:20")) == [0, 0, 1, 0]

@@ -1,7 +1,9 @@
 """What is in a file is what counts: folders, parts, text that looks like a number, empty parts."""
 
+import itertools
 import os
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,9 +89,9 @@ def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     for user, part in log.groupby("user_id"):
         write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
     given = LogMapping(partitions=True)
-    assert validate([tmp_path], given)["users"] == log["user_id"].nunique()
+    assert validate(log_files([tmp_path]), given)["users"] == log["user_id"].nunique()
     with pytest.raises(InputError, match="has no column 'user_id'"):
-        validate([tmp_path], LogMapping())
+        validate(log_files([tmp_path]), LogMapping())
     (batch,) = read_histories([tmp_path], given, "reward", 1000)
     assert batch.column("user_id").to_pylist() == sorted(log["user_id"].unique())
 
@@ -106,10 +108,10 @@ def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
 def test_a_folder_that_contradicts_its_file_is_refused(tmp_path: Path, suffix: str) -> None:
     log = make_log()
     write(log.assign(user_id=7), tmp_path / "user_id=7" / f"log{suffix}")
-    assert validate([tmp_path], LogMapping(partitions=True))["users"] == 1
+    assert validate(log_files([tmp_path]), LogMapping(partitions=True))["users"] == 1
     write(log, tmp_path / "user_id=8" / f"log{suffix}")
     with pytest.raises(InputError, match="in the file, but its folder says another value"):
-        validate([tmp_path], LogMapping(partitions=True))
+        validate(log_files([tmp_path]), LogMapping(partitions=True))
 
 
 # Parts
@@ -283,6 +285,31 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
     assert max(expected) > 0
 
 
+@pytest.mark.parametrize("parts", [["7,8", "7.0"], ["7,7.0,8"]])
+def test_ids_with_and_without_decimals_are_noted_and_can_be_made_one(
+    tmp_path: Path, parts: list[str]
+) -> None:
+    times = itertools.count(START)
+    for n, users in enumerate(parts):
+        lines = [f"{user},1,{next(times)},{user[0]}" for user in users.split(",")]
+        (tmp_path / f"{n}.csv").write_text("\n".join(["user_id,item_id,timestamp,reward", *lines]))
+    with pytest.warns(InputNote, match=r"user_id is written .* 7 and 7\.0 are two ids; .*::BIGINT"):
+        apart = validate(log_files([tmp_path]), LogMapping())["users"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        one = LogMapping({"user_id": "user_id::BIGINT"})
+        assert validate(log_files([tmp_path]), one)["users"] == apart - 1
+
+
+def test_text_without_a_character_is_no_id(tmp_path: Path) -> None:
+    log = make_log().astype({"user_id": str, "item_id": str})
+    log.loc[:1, "user_id"] = ""
+    log.loc[2:2, "item_id"] = ""
+    log.to_parquet(tmp_path / "log.parquet")
+    report = validate([tmp_path / "log.parquet"], LogMapping())
+    assert report["dropped"]["null_key"] == 3
+
+
 def test_keys_of_features_in_a_csv_file_are_their_text(tmp_path: Path) -> None:
     write(make_log(), tmp_path / "log.parquet")
     keys = [f"{n:03d}" for n in range(100)]
@@ -305,7 +332,7 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
     write(log[:700].assign(propensity=nulls), tmp_path / "a.parquet")
     write(log[700:].assign(propensity=0.05), tmp_path / "b.parquet")
     write(log[:0].assign(propensity=0.05), tmp_path / "c.parquet")
-    report = validate([tmp_path], LogMapping())
+    report = validate(log_files([tmp_path]), LogMapping())
     assert (report["steps"], report["unknown_propensities"]) == (1500, 700)
 
 
@@ -337,9 +364,9 @@ def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     )
     if name == "observation":
         with pytest.raises(InputError, match=r"observation is missing .* in 100 of 200 rows"):
-            validate([tmp_path], LogMapping(), options)
+            validate(log_files([tmp_path]), LogMapping(), options)
         return
-    report = validate([tmp_path], LogMapping(), options)
+    report = validate(log_files([tmp_path]), LogMapping(), options)
     missing = 100 if name == "session_id" else 0
     assert (report["steps"], report["dropped"]["null_key"]) == (200 - missing, missing)
 
@@ -349,7 +376,7 @@ def test_a_log_without_any_row_is_refused(tmp_path: Path, suffix: str) -> None:
     write(make_log()[:0], tmp_path / f"a{suffix}")
     write(make_log()[:0], tmp_path / f"b{suffix}")
     with pytest.raises(InputError, match=rf"a{suffix} and 1 more is empty \(0 rows\)"):
-        validate([tmp_path], LogMapping())
+        validate(log_files([tmp_path]), LogMapping())
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,8 @@ def _conclusion(rows: "list[ResultRow]", trained: "list[TrainedPolicy]") -> str:
     if 0 not in rated:
         return "\nno step was liked; next: name what counts as liked with --liked"
     best = max(rated, key=lambda n: rated[n])
+    if not rated[best]:
+        return "\nno method lists an item that was liked; next: a larger --k, or --keep-seen"
     own = f"; {trained[0].name} has {rated[0]:.3f}" if best else ""
     return (
         f"\n{rows[best].method} finds most liked items ({rated[best]:.3f} of them among its "

@@ -14,13 +14,13 @@ from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained
+from ucfrec.logs.binding import bind, explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
 from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
-from ucfrec.logs.typed import typed_columns
+from ucfrec.logs.typed import WANTED, typed_columns
 
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
@@ -96,7 +96,7 @@ def join_feedback(
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
         out: Parquet file: the columns of the exposures, `feedback` and those of the feedback.
-        mapping: log columns to the columns of the feedback.
+        mapping: log columns to the columns of the feedback, and which of its rows count.
         memory_limit: of the engine; rows spill to disk.
 
     Raises:
@@ -108,11 +108,13 @@ def join_feedback(
         scratch_folder(Path(gettempdir()), "join") as folder,
         engine([*files[0], *files[1]], folder, memory_limit, shared=True) as connection,
     ):
-        shown, given = (tuple(open_tables(connection, each)) for each in files)
+        mapping = mapping or LogMapping()
+        shown = tuple(open_tables(connection, files[0]))
+        given = tuple(open_tables(connection, files[1], mapping.partitions))
         with explained(connection, (*shown, *given), folder):
             _make_exposures(connection, shown)
             _require_feedback(given)
-            columns = _make_feedback(connection, given, mapping or LogMapping())
+            columns = _make_feedback(connection, given, mapping)
             _match(connection, within_ms)
             _write(connection, columns, out)
             joined = _counts(connection, columns)
@@ -171,8 +173,7 @@ def _make_feedback(
     Their values are its columns `_value(0)`, …, so that any name is possible.
     """
     typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
-    used = {*_EXPOSURE, FEEDBACK}
-    used |= {name.casefold() for table in typed.tables for name in table.used or ()}
+    used = {*_EXPOSURE, FEEDBACK, *_keys_read(connection, tables, mapping)}
     columns = feedback_columns(connection, tables, used, FEEDBACK)
     selects = []
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
@@ -191,8 +192,10 @@ def _make_feedback(
         source = narrow.of([*(narrow.used or ()), *read], raw)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
+    wanted = "" if mapping.where is None else f" AND {WANTED}"
     connection.execute(
-        f"CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row FROM ({rows})"
+        f"CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row FROM ({rows}) "
+        f"WHERE coalesce(timestamp >= {int(mapping.earliest_ms)}, true){wanted}"
     )
     return columns
 
@@ -210,7 +213,18 @@ def _as_number(name: str, kind: str) -> str:
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
     absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
-    return replace(mapping, columns={**mapping.columns, **absent}, where=None)
+    return replace(mapping, columns={**mapping.columns, **absent})
+
+
+def _keys_read(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], mapping: LogMapping
+) -> set[str]:
+    """Columns, in lower case, that user, item and time are read from, and those of folders."""
+    keys = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+    given = [(table, name, mapping.columns.get(name) or name) for table in tables for name in keys]
+    read = (bind(connection, table, f"for {name}", each) for table, name, each in given)
+    folders = {name.casefold() for table in tables for name, _ in table.partitions}
+    return folders | {column.casefold() for bound in read for column in bound.columns}
 
 
 def _match(connection: duckdb.DuckDBPyConnection, within_ms: int) -> None:

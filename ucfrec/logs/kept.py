@@ -24,7 +24,8 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.mapping import EARLIEST_MS
 from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, text
-from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog
+from ucfrec.logs.vectors import not_finite
 
 DUPLICATES: Final = {
     "highest": "has the highest",

@@ -38,9 +38,11 @@ from ucfrec.logs.typed import (
     ROWS,
     TypedLog,
     numbered_rows,
+    typed_columns,
+)
+from ucfrec.logs.vectors import (
     observation_counts,
     require_observations,
-    typed_columns,
     vector_counts,
     vector_sizes,
     vectors,

@@ -1,7 +1,7 @@
 """A log as one relation of typed rows: its files, its columns, its reward."""
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +26,13 @@ from ucfrec.logs.tables import (
     raw_name,
 )
 from ucfrec.logs.times import text_time
+from ucfrec.logs.vectors import (
+    observation_counts,
+    require_observations,
+    vector_counts,
+    vector_sizes,
+    vectors,
+)
 
 ROWS: Final = "read"
 """Relation of `TypedLog`."""
@@ -184,56 +191,15 @@ def typed_log(
         rows = numbered_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
         connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
         counts = {
-            name: dict(connection.sql(vector_counts(name)).fetchall())
+            name: dict(connection.sql(vector_counts(name, ROWS)).fetchall())
             for name in vectors(typed.names)
         }
         bad, n_rows = 0, 0
         if schema.OBSERVATION in counts:
-            bad, n_rows = connection.sql(observation_counts()).fetchall()[0]
+            bad, n_rows = connection.sql(observation_counts(ROWS)).fetchall()[0]
     sizes = vector_sizes(counts)
     require_observations(tables, bad, n_rows)
     return typed.log(connection, sizes, mapping)
-
-
-def vectors(columns: Iterable[str]) -> tuple[str, ...]:
-    """Those of some log columns that are vectors."""
-    return tuple(name for name in columns if name in (schema.ACTION, schema.OBSERVATION))
-
-
-def vector_counts(name: str, rows: str = ROWS) -> str:
-    """SQL of how many vectors of each size a column has, missing ones excluded."""
-    return (
-        f"SELECT len({name}) AS size, count(*) AS n FROM {rows} WHERE {name} IS NOT NULL "
-        "GROUP BY size"
-    )
-
-
-def observation_counts(rows: str = ROWS) -> str:
-    """SQL of the number of observations that are missing or not finite, and of rows."""
-    return f"SELECT count_if({not_finite(schema.OBSERVATION)}), count(*) FROM {rows}"
-
-
-def require_observations(tables: Sequence[Table], bad: int, rows: int) -> None:
-    """Check that a log has a finite observation in every row.
-
-    Args:
-        bad: number of rows without one.
-
-    Raises:
-        InputError: there are rows without one.
-    """
-    if bad:
-        raise InputError(
-            f"{tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
-            f"in {bad:,} of {rows:,} rows; fill them in, leave those rows out, or ignore the "
-            f"column with --column {schema.OBSERVATION}="
-        )
-
-
-def not_finite(vector: str) -> str:
-    """SQL that says whether a vector is missing or has a number that is not finite."""
-    finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
-    return f"{vector} IS NULL OR NOT {finite}"
 
 
 def _present(
@@ -362,6 +328,8 @@ def _empty_words(connection: duckdb.DuckDBPyConnection, table: Table, given: str
     return {name for name, count in zip(words, row, strict=True) if not count}
 
 
+_NOT_AN_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS DISTINCT FROM x"
+"""SQL of whether a text `x` is not as the integer that it means is written."""
 _IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
 _TYPES: Final = {
     **dict.fromkeys(_IDS, "VARCHAR"),
@@ -437,41 +405,52 @@ def _unify_ids(
         for each in found
         for sql, kind in [each.values[name]]
     )
+    if not whole:
+        _note_decimals(connection, found, name)
     for each in found:
         sql, _ = each.values[name]
-        each.values[name] = (f"CAST({sql} AS {'BIGINT' if whole else 'VARCHAR'})", "")
+        # Text without a character is missing, as in a CSV file.
+        typed = f"CAST({sql} AS BIGINT)" if whole else f"nullif(CAST({sql} AS VARCHAR), '')"
+        each.values[name] = (typed, "")
 
 
 def _are_integers(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> bool:
     """Whether a column is text of a CSV file, and all of it is written as integers are."""
-    if not table.raw or sql not in {quoted(raw_name(column)) for column in table.raw}:
+    if _csv_type(table, sql) is None:
         return False
     with explained(connection, (table,), table.files[0].parent):
         ((others,),) = connection.sql(
-            f"SELECT bool_or(CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS DISTINCT FROM x) "
-            f"FROM (SELECT {sql} AS x FROM {table.sql}) WHERE x IS NOT NULL"
+            f"SELECT bool_or({_NOT_AN_INTEGER}) FROM (SELECT {sql} AS x FROM {table.sql}) "
+            "WHERE x IS NOT NULL"
         ).fetchall()
     return not others
 
 
-def vector_sizes(counts: Mapping[str, Mapping[int, int]]) -> dict[str, int]:
-    """Dimensions of each vector column.
+def _csv_type(table: Table, sql: str) -> str | None:
+    """The type that DuckDB inferred for a column whose text is read; None for other columns."""
+    kinds = dict(table.types)
+    return next((kinds[name] for name in table.raw if quoted(raw_name(name)) == sql), None)
 
-    Args:
-        counts: column to the number of its vectors by size, missing ones excluded.
 
-    Raises:
-        InputError: a column has vectors of unequal or no size.
-    """
-    sizes: dict[str, int] = {}
-    for name, found in counts.items():
-        ordered = sorted(found.items(), key=lambda pair: (-pair[1], pair[0]))
-        if len(ordered) > 1:
-            lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
-            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
-        if not ordered or ordered[0][0] == 0:
-            raise InputError(
-                f"{name} is empty in every row; map another column or --column {name}="
-            )
-        sizes[name] = int(ordered[0][0])
-    return sizes
+def _note_decimals(connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str) -> None:
+    """Warn of ids that are written as 7 and as 7.0, which are two ids."""
+    decimal: list[Table] = []
+    whole = False
+    for each in found:
+        sql, kind = each.values[name]
+        kind = _csv_type(each.table, sql) or kind
+        whole |= is_integer(kind)
+        if kind == "DOUBLE":
+            decimal.append(each.table)
+            ((some,),) = connection.sql(
+                f"SELECT coalesce(bool_or(NOT ({_NOT_AN_INTEGER})), false) "
+                f"FROM (SELECT {sql} AS x FROM {each.table.sql})"
+            ).fetchall()
+            whole |= some
+    if whole and decimal:
+        warnings.warn(
+            f"{name} is written as whole numbers and, in {decimal[0].files[0]}, with decimals: 7 "
+            f"and 7.0 are two ids; to make them one, say --column {name}='COLUMN::BIGINT'",
+            InputNote,
+            stacklevel=5,
+        )

@@ -192,10 +192,12 @@ def _make_feedback(
         source = narrow.of([*(narrow.used or ()), *read], raw)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
-    wanted = "" if mapping.where is None else f" AND {WANTED}"
+    conditions = ["true"] if mapping.where is None else [WANTED]
+    if mapping.earliest is not None:
+        conditions.append(f"timestamp >= {int(mapping.earliest_ms)}")
     connection.execute(
         f"CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row FROM ({rows}) "
-        f"WHERE coalesce(timestamp >= {int(mapping.earliest_ms)}, true){wanted}"
+        f"WHERE {' AND '.join(conditions)}"
     )
     return columns
 

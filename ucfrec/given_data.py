@@ -142,10 +142,11 @@ def histories_given(
     Raises:
         InputError: the frame cannot be used, the store is gone, or a user has no rows.
     """
+    stored = frame is None
     if frame is None:
         frame = _stored(trained, users)
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
-    histories = histories_of_frame(trained, frame, mapping or LogMapping())
+    histories = histories_of_frame(trained, frame, mapping or LogMapping(), stored)
     return histories if users is None else of_some_users(histories, users)
 
 

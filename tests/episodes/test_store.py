@@ -891,7 +891,8 @@ def test_the_frame_has_the_rows_of_the_log(tmp_path: Path) -> None:
     found = frame[keys].sort_values(keys, ignore_index=True)
     expected = log[keys].sort_values(keys, ignore_index=True)
     pd.testing.assert_frame_equal(found, expected, check_dtype=False)
-    assert frame.session_id.nunique() == len(store)
+    pauses = frame.sort_values(keys).groupby("user_id").timestamp.diff().gt(60 * 60_000)
+    assert frame.session_id.nunique() == frame.user_id.nunique() + pauses.sum()
     assert frame.groupby("session_id").timestamp.apply(lambda t: t.is_monotonic_increasing).all()
     test = store.split("test").to_frame()
     assert set(test.split) == {"test"}

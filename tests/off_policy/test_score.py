@@ -1,7 +1,7 @@
 """Scores of logged choices: probabilities, and what the policy would see when acting."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -227,3 +227,20 @@ def test_ids_may_be_text_where_the_run_has_integers(
         assert len(there) == len(log)
         assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))
         assert other.users[-1] == "somebody"
+
+
+@pytest.mark.parametrize(("duplicates", "kept"), [("lowest", min), ("highest", max)])
+def test_rows_that_repeat_count_as_in_the_training_log(
+    folder: Path,
+    trained: TrainedPolicy,
+    tmp_path: Path,
+    duplicates: str,
+    kept: Callable[..., float],
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    twice = pd.concat([log, log.assign(reward=kept(-1.0, 2.0)), log.assign(reward=0.5)])
+    twice.to_parquet(tmp_path / "twice.parquet")
+    data = trained.record.data.model_copy(update={"duplicates": duplicates})
+    alike = replace(trained, record=trained.record.with_entries(data=data))
+    with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
+        assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}

@@ -324,6 +324,16 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         lambda log: log.assign(user_id=[1, "b", *log.user_id[2:]]),
         "user_id holds values of several types",
     ),
+    "durations for times": (
+        lambda log: log.assign(timestamp=pd.to_timedelta(log.timestamp, unit="ms")),
+        r"timestamp holds durations; convert them with .dt.total_seconds\(\)",
+    ),
+    "periods for times": (
+        lambda log: log.assign(
+            timestamp=pd.to_datetime(log.timestamp, unit="ms").dt.to_period("h")
+        ),
+        r"timestamp holds periods; convert them with .dt.to_timestamp\(\)",
+    ),
     "two columns of a name": (
         lambda log: pd.concat([log, log.item_id], axis=1),
         "two columns are called item_id",
@@ -442,3 +452,37 @@ def test_later_rows_draw_again_and_a_replay_is_exact(log: pd.DataFrame) -> None:
     assert ((first.propensity > 0) & (first.propensity <= 1)).all()
     assert (first[first["rank"] == 1].propensity < 1).all()
     assert (policy.recommend(log, k=4, rule=replace(rule, temperature=0.0)).propensity == 1).all()
+
+
+@pytest.mark.parametrize("session_by", ["session_id", "user"])
+def test_frames_files_and_the_store_have_the_same_histories(
+    log: pd.DataFrame, tmp_path: Path, session_by: str
+) -> None:
+    """The reward is computed from a column `reward`, and split boundaries cut sessions."""
+    place = log.groupby("user_id").cumcount()
+    log = log.assign(reward=5.0 * log.reward, session_id=100 * log.user_id + place // 7)
+    log.to_parquet(tmp_path / "log.parquet")
+    policy = Recommender("dt", settings=SMALL).fit(
+        tmp_path / "log.parquet", tmp_path / "run", reward="1 - reward / 5", session_by=session_by
+    )
+    command = ["recommend", *map(str, (tmp_path / "run", tmp_path / "log.parquet")), "--keep-seen"]
+    assert main([*command, "--k", "3", "--out", str(tmp_path / "found.parquet")]) == 0
+    found = pd.read_parquet(tmp_path / "found.parquet")
+    for given in (log, None):
+        same = policy.recommend(given, k=3, filter_seen=False)
+        pd.testing.assert_frame_equal(same[[*found]], found, check_dtype=False)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (lambda n: [1, "a", *[0] * (n - 2)], "values of several types"),
+        (lambda n: pd.to_timedelta(range(n), unit="s"), "durations"),
+    ],
+)
+def test_a_column_that_is_left_out_is_told(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, values: Callable[[int], object], said: str
+) -> None:
+    with pytest.warns(InputNote, match=f"column clicks is left out: it holds {said}"):
+        found = fitted[0].recommend(log.assign(clicks=values(len(log))), k=2)
+    pd.testing.assert_frame_equal(found, fitted[0].recommend(log, k=2))

@@ -171,6 +171,14 @@ def test_feedback_that_is_missing_in_all_rows_takes_the_default_of_the_expressio
     rewards.close()
 
 
+def test_a_reward_that_is_computed_from_a_column_of_that_name_is_computed() -> None:
+    rewards = RowRewards(Expression("1 - reward / 5", "run.json"))
+    assert rewards.of_rows([{"reward": 5.0}, {"reward": 0.0}]) == [0.0, 1.0]
+    with pytest.raises(InputError, match=r"history has no reward, which .* needs; give it"):
+        rewards.of_rows([{"clicks": 1}])
+    rewards.close()
+
+
 def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> None:
     reader = HistoryReader("last", False, 2, RowRewards(Expression("reward", "run.json")))
     row = {"item_id": 1, "timestamp": 1.7e12, "reward": 0, "observation": [1, -2.5]}

@@ -3,6 +3,7 @@
 import json
 import re
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,18 @@ def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> No
     assert trained.policy.lowest_return_to_go == returns_to_go.min()
     assert trained.target_return(1.0) == pytest.approx(view.returns.max())
     assert trained.target_return(0.5) == pytest.approx(np.median(view.returns), rel=1e-5)
+
+
+def test_a_run_that_goes_on_remembers_where_its_store_lies_now(
+    store: Path, left_alone: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(store, tmp_path / "moved")
+    shutil.copytree(left_alone, tmp_path / "run")
+    killed_run.train(tmp_path / "moved", tmp_path / "run")
+    before, record = RunRecord.read(left_alone), RunRecord.read(tmp_path / "run")
+    assert record.store == str((tmp_path / "moved").resolve())
+    assert record.store_from_run == "../moved"
+    assert record.policy == before.policy
 
 
 def test_without_copies_no_reward_model_is_trained(store: Path, tmp_path: Path) -> None:

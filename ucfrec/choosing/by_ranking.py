@@ -122,7 +122,9 @@ class _Tried:
     def levels_with(self, other: "_Tried") -> bool:
         """Whether the rate is not below that of another rule by more than a standard error."""
         below = other.rates - self.rates
-        return bool(below.sum() <= _error_of_sum(below - below.mean(), self.users))
+        return not len(below) or bool(
+            below.sum() <= _error_of_sum(below - below.mean(), self.users)
+        )
 
 
 def _error_of_sum(values: Float64Array, users: IntArray) -> float:

@@ -290,7 +290,8 @@ def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict
 
 def store_frame(store: EpisodeStore) -> "pd.DataFrame":
     """One row per step, session by session: `user_id`, `session_id` (the number of the session in
-    the store), `item_id` or `action`, the other columns of the log that the store has, and `split`.
+    the store; one for all episodes of a session that a split boundary cuts), `item_id` or `action`,
+    the other columns of the log that the store has, and `split`.
 
     Raises:
         InputError: the view has augmented episodes, or a file of the store is damaged.
@@ -304,7 +305,7 @@ def store_frame(store: EpisodeStore) -> "pd.DataFrame":
     if store.has_users:
         users = store.episode_values(schema.USER)[episodes]
         columns[schema.USER_ID] = _named(store, schema.USER_ID, users)
-    columns[schema.SESSION_ID] = store.episode_ids[episodes]
+    columns[schema.SESSION_ID] = _sessions(store)[episodes]
     if store.has_items:
         items = store.step_values(schema.ITEM, episodes, steps)
         columns[schema.ITEM_ID] = _named(store, schema.ITEM_ID, items)
@@ -317,6 +318,21 @@ def store_frame(store: EpisodeStore) -> "pd.DataFrame":
     splits = store.episode_values(schema.SPLIT)[episodes]
     columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
     return pd.DataFrame(columns)
+
+
+def _sessions(store: EpisodeStore) -> IntArray:
+    """(E,) number of each episode's session, which is that of its first episode."""
+    numbers = store.episode_ids
+    has_ends = store._columns.has_episode_column(schema.TERMINATED)
+    if not (store.has_users and has_ends) or len(store) < 2:
+        return numbers
+    users, splits, ended = (
+        store.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
+    )
+    goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
+    goes_on &= np.diff(numbers) == 1
+    first = np.concatenate([[True], ~goes_on])
+    return np.asarray(numbers[first][np.cumsum(first) - 1])
 
 
 def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from ucfrec import schema
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -141,6 +142,13 @@ class Expression(str):
         expression = super().__new__(cls, text)
         expression.origin = origin
         return expression
+
+
+def computes_with_reward(given: str) -> bool:
+    """Whether an expression is more than the column `reward` but reads it, so that rewards have to
+    be computed from a column of this name."""
+    text = given.strip().casefold()
+    return text != schema.REWARD and schema.REWARD in re.findall(r"\w+", text)
 
 
 class NotScalarError(Exception):

@@ -1,18 +1,19 @@
 """The item history of each user of a log, from files or from a data frame."""
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, settled
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
@@ -135,14 +136,14 @@ def frame_histories(
 
 
 def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
-    """Convert a data frame to Arrow, leaving out columns of mixed Python objects.
+    """Convert a data frame to Arrow, leaving out, with a note, columns that it cannot hold.
 
     Args:
         frame: one row per interaction.
 
     Raises:
         InputError: `frame` is not a data frame or has no rows, two columns have the same name, or a
-            key column has values of several types.
+            key column has values of several types, durations or periods.
     """
     import pandas as pd
 
@@ -161,15 +162,38 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     columns = {}
     for column in frame.columns:
         try:
-            columns[str(column)] = pa.Array.from_pandas(frame[column])
-        except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+            columns[str(column)] = _as_array(frame[column])
+        except _UnusableError as error:
             if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
-                reason = str(error).splitlines()[0]
-                raise InputError(
-                    f"{name}: {column} holds values of several types ({reason}); make them one"
-                ) from None
-            # A reward expression cannot use another column of mixed Python objects.
+                raise InputError(f"{name}: {column} {error}") from None
+            warnings.warn(
+                f"{name}: column {column} is left out: it {error}", InputNote, stacklevel=4
+            )
     return pa.table(columns)
+
+
+class _UnusableError(Exception):
+    """A column cannot be read; the message says why, and what to do."""
+
+
+def _as_array(values: "pd.Series[Any]") -> pa.Array:
+    """A column of a data frame.
+
+    Raises:
+        _UnusableError: it has mixed Python objects, durations or periods.
+    """
+    import pandas as pd
+
+    if isinstance(values.dtype, pd.PeriodDtype):
+        raise _UnusableError("holds periods; convert them with .dt.to_timestamp()")
+    try:
+        array = pa.Array.from_pandas(values)
+    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise _UnusableError(f"holds values of several types ({reason}); make them one") from None
+    if pa.types.is_duration(array.type):
+        raise _UnusableError("holds durations; convert them with .dt.total_seconds()")
+    return array
 
 
 def _require_items(log: TypedLog) -> None:

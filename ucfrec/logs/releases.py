@@ -5,6 +5,7 @@ import tarfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from textwrap import shorten
 from typing import Final
 
 from ucfrec.errors import InputError
@@ -92,7 +93,9 @@ def _download(name: str, release: Release, archive: Path) -> None:
         if "does not match the known hash" in str(error):
             raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{name} cannot be downloaded ({reason:.120}); {by_hand}") from None
+        raise InputError(
+            f"{name} cannot be downloaded ({shorten(reason, 200, placeholder=' …')}); {by_hand}"
+        ) from None
 
 
 def _require_checksum(release: Release, archive: Path) -> None:

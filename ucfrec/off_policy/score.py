@@ -133,7 +133,12 @@ def as_trained(
     if not trained.logged_observation_size:
         mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
     reward = Expression(record.reward, source)
-    options = PrepareOptions(reward, record.session_by, memory_limit=memory_limit)
+    options = PrepareOptions(
+        reward,
+        record.session_by,
+        duplicates=record.data.duplicates,
+        memory_limit=memory_limit,
+    )
     if record.session_gap_ms is not None:
         options = replace(options, gap_minutes=record.session_gap_ms / 60_000)
     return mapping, options

@@ -16,7 +16,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
-from ucfrec.logs.expressions import Expression
+from ucfrec.logs.expressions import Expression, computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
@@ -192,27 +192,30 @@ def histories_of_files(
 
 
 def histories_of_frame(
-    trained: TrainedPolicy, frame: pd.DataFrame, mapping: LogMapping
+    trained: TrainedPolicy, frame: pd.DataFrame, mapping: LogMapping, stored: bool = False
 ) -> Iterator[Histories]:
     """Read histories from a frame in batches of users, users in sorted order.
 
-    Rewards are the frame's column `reward`, or else the run's reward expression over its columns.
+    Rewards are the frame's column `reward`, unless the run's reward expression computes with a
+    column of that name; otherwise that expression over the frame's columns.
 
     Args:
         trained: policy whose reward expression, session rule and observations apply.
         frame: one row per interaction.
         mapping: names of the columns; what it leaves open is as in the training log.
+        stored: whether the frame is of a store, whose column `reward` is what was computed.
 
     Raises:
         InputError: a column is missing, or has values that cannot be used.
     """
     by_id = session_by(trained) == schema.SESSION_ID
+    computed = not stored and computes_with_reward(trained.record.reward)
     plain_names = mapping == LogMapping() and not _concerned(trained, frame)
-    if not trained.record.observation_size and plain_names:
+    if not (trained.record.observation_size or computed) and plain_names:
         plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
         if plain is not None:
             return iter((plain,))
-    has_rewards = schema.REWARD in getattr(frame, "columns", ())
+    has_rewards = not computed and schema.REWARD in getattr(frame, "columns", ())
     batches = frame_histories(
         frame,
         columns_used(trained, mapping),

@@ -13,7 +13,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.binding import bind, explained
 from ucfrec.logs.engine import engine_in_memory
-from ucfrec.logs.expressions import Expression, columns_of
+from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.tables import is_number
 from ucfrec.runs.trained_policy import RUN, TrainedPolicy
@@ -28,13 +28,13 @@ _NAME: Final = re.compile(r"[A-Za-z_]\w*")
 class RowRewards:
     """Computes the rewards of rows, one request after the other; not for several threads at once.
 
-    A row's `reward` counts. Rows without one have feedback, from which the run's reward expression
-    makes it: at once if the expression is the name of a column, otherwise by the engine, which
-    takes some milliseconds.
+    A row's `reward` counts, unless the run's reward expression computes with a column of that name.
+    Rows without one have feedback, from which that expression makes it: at once if it is the name
+    of a column, otherwise by the engine, which takes some milliseconds.
     """
 
     def __init__(self, expression: Expression) -> None:
-        self._expression = expression
+        self._expression, self._computed = expression, computes_with_reward(expression)
         self._stack = ExitStack()
         self._connection: duckdb.DuckDBPyConnection | None = None
 
@@ -56,7 +56,7 @@ class RowRewards:
         if not rows:
             return []
         given = [row.get(schema.REWARD) for row in rows]
-        if any(value is not None for value in given):
+        if not self._computed and any(value is not None for value in given):
             return _checked(given, f"no {schema.REWARD}, as other rows have")
         name = str(self._expression)
         if _NAME.fullmatch(name):
@@ -75,9 +75,12 @@ class RowRewards:
             key = given.get(name.casefold(), name)
             values = [row.get(key) for row in rows]
             if not any(key in row for row in rows):
+                lacking, remedy = f"no {name}", "it"
+                if not self._computed:
+                    lacking, remedy = f"neither {schema.REWARD} nor {name}", "one of them"
                 raise InputError(
-                    f"history has neither {schema.REWARD} nor {name}, which the run's reward "
-                    f"({self._expression}) needs; give one of them"
+                    f"history has {lacking}, which the run's reward ({self._expression}) needs; "
+                    f"give {remedy}"
                 )
             try:
                 columns[name] = pa.array(values)

@@ -362,12 +362,16 @@ def read_augmentation(path: Path) -> AugmentationReport:
         return TypeAdapter(AugmentationReport).validate_python(read_json(path))
 
 
-def store_from(run: Path, store: Path) -> str | None:
-    """The folder of a store as seen from that of a run; None on another drive of Windows."""
+def place_of(store: Path, run: Path) -> dict[str, str | None]:
+    """Entries of the record of a run: where its store lies, and as seen from the run.
+
+    There is no path from a run to a store on another drive of Windows.
+    """
     try:
-        return os.path.relpath(store.resolve(), run.resolve())
+        seen_from_run = os.path.relpath(store.resolve(), run.resolve())
     except ValueError:
-        return None
+        seen_from_run = None
+    return {"store": str(store.resolve()), "store_from_run": seen_from_run}
 
 
 def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:

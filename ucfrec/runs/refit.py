@@ -10,7 +10,7 @@ from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import REFIT, RUN, RunRecord, refit_of_run, store_from
+from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.model import SESSIONS
@@ -50,7 +50,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         "augmentation": trained.record.augmentation,
     }
     if out == first / REFIT:
-        about["store_from_run"] = store_from(first, store.path)
+        about |= place_of(store.path, first)
     if trained.dropped:
         store = store.without_observation_dimensions(trained.dropped)
     record = train_run(store, out, _settings(trained), about, refit_of=first)

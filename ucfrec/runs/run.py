@@ -33,7 +33,14 @@ from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.record import RUN, RuleRecord, RunRecord, read_augmentation, read_record
+from ucfrec.runs.record import (
+    RUN,
+    RuleRecord,
+    RunRecord,
+    place_of,
+    read_augmentation,
+    read_record,
+)
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import begin, new_policy, require_startable, training_views
@@ -162,7 +169,9 @@ def _prepare_inputs(
         distributed.wait()  # the others wait at the beginning of the command
     else:
         record = RunRecord.read(out)
-    record = record.with_entries(config=config)
+    # The store may have been moved, or prepared again.
+    place = {name: about.get(name, at) for name, at in place_of(store.path, out).items()}
+    record = record.with_entries(config=config, **place)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:

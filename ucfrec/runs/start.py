@@ -27,7 +27,7 @@ from ucfrec.policies.registry import policy_class
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import RUN, RunRecord, store_from
+from ucfrec.runs.record import RUN, RunRecord, place_of
 from ucfrec.runs.trained_policy import COUNTS, ITEMS, RETURNS, RULE, USERS
 from ucfrec.user_model.reward_fit import reward_model_sizes
 
@@ -120,8 +120,7 @@ def begin(
         "command": command_line(),
         "config": config,
         "seed": config.seed,
-        "store": str(store.path.resolve()),
-        "store_from_run": store_from(out, store.path),
+        **place_of(store.path, out),
         "fingerprint": store.record.fingerprint,
         "reward": store.record.reward,
         "session_by": source.session_by,

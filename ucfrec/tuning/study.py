@@ -30,6 +30,7 @@ from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
 from ucfrec.runs.shared_stages import SharedStages
+from ucfrec.runs.start import returns_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -45,6 +46,7 @@ METRICS: Final = {
     "validation rows",
 }
 _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
+_OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 _NAME: Final = "ucfrec"
 _COMPARED: Final = 4
@@ -81,12 +83,23 @@ def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -
     return float(np.sum(above) / np.sum(below))
 
 
+def _require_values(search: Search, store: EpisodeStore) -> None:
+    """Check that the user model estimates the value of every policy that is searched."""
+    for policy in search.policies:
+        config = search.config(policy, {})
+        if not (store.has_items and config.rule.choose and returns_of(store, config).per_session):
+            raise InputError(
+                f"{store.path}: {policy} has no estimated value there, because its decision rule "
+                f"is not selected in simulated sessions; {_OTHER_METRICS}"
+            )
+
+
 def _value(record: RunRecord) -> float:
     value = None if record.rule is None else record.rule.simulated
     if value is None:
         raise InputError(
-            "the decision rule of this training is not selected in the user model, so there is no "
-            "estimated value; use --metric ndcg or gauc"
+            "the decision rule of this training is not selected in simulated sessions, so there is "
+            f"no estimated value; {_OTHER_METRICS}"
         )
     return value[0]
 
@@ -122,7 +135,8 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
 
     Raises:
         InputError: Optuna is not installed, the folder holds another search, the metric or the
-            numbers are out of range, or no trial could be measured.
+            numbers are out of range, the policies have no such metric on this store, or no trial
+            could be measured.
     """
     optuna = _optuna()
     if plan.metric not in METRICS:
@@ -130,6 +144,8 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
     store = EpisodeStore.open(plan.store)
+    if plan.metric == VALUE:
+        _require_values(plan.search, store)
     with claimed(plan.out, "tuned"):
         plan.out.mkdir(parents=True, exist_ok=True)
         study: Study = optuna.create_study(
@@ -161,7 +177,7 @@ def _optuna() -> Any:
         import optuna
     except ModuleNotFoundError:
         raise InputError("a search needs Optuna; install ucfrec[tune]") from None
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     return optuna
 

@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from tests.support.replay import replayed
+from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping
-from ucfrec.off_policy.evaluate import logged_steps, step_features
+from ucfrec.off_policy.evaluate import EstimateOptions, logged_steps, step_features
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -244,3 +245,29 @@ def test_rows_that_repeat_count_as_in_the_training_log(
     alike = replace(trained, record=trained.record.with_entries(data=data))
     with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
+
+
+def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    """Two rounds of serving: what was seen is in the store of the run, or in the scored log."""
+    rule = DecisionRule(trained.rule.target, temperature=1.0)
+    before, served = pd.read_parquet(folder / "train.parquet"), []
+    before = before[before.groupby("user_id").item_id.transform("nunique") < 28]
+    for _ in range(2):
+        found = Recommender.load(folder / "run").recommend(before, k=1, rule=rule)
+        last = before.groupby("user_id").timestamp.max()
+        rows = found[["user_id", "item_id", "propensity"]].assign(reward=0.0)
+        served.append(rows.assign(timestamp=rows.user_id.map(last) + 60_000))
+        before = pd.concat([before, served[-1]])
+    log = pd.concat(served).sort_values(["user_id", "timestamp"])
+    log.to_parquet(tmp_path / "served.parquet")
+    with logged_sessions(trained, [tmp_path / "served.parquet"], LogMapping()) as logged:
+        whole, filtered = (
+            pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
+        )
+        steps = logged_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True)).steps
+    np.testing.assert_allclose(filtered.probability, log.propensity, rtol=1e-4)
+    np.testing.assert_allclose(steps.target, log.propensity, rtol=1e-4)
+    assert (whole.probability < 0.99 * log.propensity.to_numpy()).any()
+    assert (whole.probability <= 1.0001 * log.propensity.to_numpy()).all()

@@ -1,6 +1,7 @@
 """The verdict finds a better and a worse run, and doubts what the log cannot tell."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,7 @@ import pytest
 from tests.support.logs import store_of
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -87,3 +89,22 @@ def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
     assert (found.result, found.decided_by) == ("no significant difference", "reward per step")
     assert "where 1 is expected" in found.differences[-1].doubt
     assert "not reliable" in describe(found)
+
+
+def test_what_was_served_without_seen_items_is_compared_without_them(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    rng, users = np.random.default_rng(0), 400
+    log = pd.DataFrame({"user_id": np.repeat(np.arange(users), 5)})
+    log["item_id"] = np.concatenate([rng.permutation(ITEMS)[:5] for _ in range(users)])
+    log["timestamp"] = 1_700_000_000_000 + np.arange(len(log)) * 1000
+    log["reward"] = (rng.random(len(log)) < 0.8 - 0.06 * log.item_id) * 1.0
+    log["propensity"] = 1 / (ITEMS - log.groupby("user_id").cumcount())
+    store_of(log, tmp_path, split=(0.2, 0.2, 0.6))
+    store = EpisodeStore.open(tmp_path / "store")
+    rows, others = store.split("test"), store.split("train")
+    uniform = replace(trained, rule=DecisionRule(trained.rule.target, temperature=1e6))
+    seen = UserRows.of(rows, rows.episode_values("user"), others)
+    wrong, right = (compare_runs(uniform, uniform, rows, 0, each) for each in (None, seen))
+    assert "update with --filter-seen" in describe(wrong)
+    assert "mean weight" not in describe(right)

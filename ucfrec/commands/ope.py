@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ucfrec.commands.options import (
+    filter_seen_option,
     log_options,
     logs_given,
     memory_option,
@@ -31,6 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log_options(parser)
     memory_option(parser)
     rule_options(parser)
+    filter_seen_option(parser)
     parser.add_argument(
         "--targets",
         metavar="RETURN,…",
@@ -113,6 +115,7 @@ def _estimates_given(options: argparse.Namespace) -> "EstimateOptions":
         wanted_lift=options.lift,
         item_groups=options.item_groups,
         estimate_propensities=options.estimate_propensities,
+        filter_seen=options.filter_seen,
     )
 
 

@@ -245,6 +245,16 @@ def keep_seen_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def filter_seen_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option to exclude items that users have seen from what the policy could choose."""
+    parser.add_argument(
+        "--filter-seen",
+        action="store_true",
+        help="exclude items that the user was shown before, as serve and recommend do without "
+        "--keep-seen: for logs of what they showed",
+    )
+
+
 def item_options(parser: argparse.ArgumentParser) -> None:
     """Add the options on items that users have seen and on items that the run does not know."""
     keep_seen_option(parser)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.options import (
+    filter_seen_option,
     log_options,
     logs_given,
     memory_option,
@@ -21,6 +22,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log_options(parser)
     memory_option(parser)
     rule_options(parser)
+    filter_seen_option(parser)
     parser.add_argument(
         "--out",
         type=uri_or_path(Output, Path),
@@ -59,6 +61,7 @@ def run(options: argparse.Namespace) -> None:
             master,
             checkpoint=options.checkpoint,
             rule=rule_given(options, trained),
+            filter_seen=options.filter_seen,
             memory_limit=options.memory_limit,
         )
         print(f"{origin(options.out)}: {sessions:,} sessions")
@@ -68,6 +71,6 @@ def run(options: argparse.Namespace) -> None:
     with logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))
         rule = rule_given(options, trained)
-        frames = score(trained, logged, rule)
+        frames = score(trained, logged, rule, options.filter_seen)
         rows = write_frames(options.out, frames, about_scores(trained, rule))
     print(f"\n{origin(options.out)}: {rows:,} rows")

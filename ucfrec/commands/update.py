@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.durations import duration_ms
-from ucfrec.commands.options import log_options, logs_given, memory_option
+from ucfrec.commands.options import filter_seen_option, log_options, logs_given, memory_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="once the runs are compared, do not go on learning from the validation and test rows "
         "(default: RUN2 acts by the weights that learned from all rows)",
     )
+    filter_seen_option(parser)
     parser.add_argument("--seed", type=int, help="of everything random (default: that of RUN)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
     memory_option(parser)
@@ -84,7 +85,12 @@ def run(options: argparse.Namespace) -> None:
         options.out,
         store=options.store,
         mapping=mapping,
-        options=UpdateOptions(append, seed=options.seed, refit=not options.no_refit),
+        options=UpdateOptions(
+            append,
+            seed=options.seed,
+            refit=not options.no_refit,
+            filter_seen=options.filter_seen,
+        ),
     )
     write_card(options.out)
     update = record.update

@@ -68,6 +68,10 @@ class EstimateOptions:
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
 
+    filter_seen: bool = False
+    """Exclude items that the user was shown before a step, in earlier rows too, as `recommend` and
+    `serve` do by default; then their logs have to be evaluated so."""
+
     def __post_init__(self) -> None:
         """Check that the range is in order."""
         low, high = self.reward_range or (0.0, 0.0)
@@ -187,6 +191,7 @@ def conditions(run: Path, sessions: int, steps: int, options: EstimateOptions) -
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
+        "filter_seen": options.filter_seen,
         "sessions": sessions,
         "steps": steps,
     }
@@ -312,7 +317,8 @@ def logged_steps(
     target, shown = np.empty(len(items)), array_on_disk((len(items), one_hot.shape[1]))
     done, behavior = 0, None
     with InputsFile() as inputs:
-        for batch in scored_steps(trained, store, rule):
+        shown_before = logged.rows if options.filter_seen else None
+        for batch in scored_steps(trained, store, rule, shown_before):
             rows = slice(done, done + len(batch.steps))
             target[rows], probabilities, seen = step_features(trained, batch)
             shown[rows] = (probabilities @ one_hot).numpy()

@@ -222,26 +222,34 @@ def _as_seen(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
 
 
 def scored_steps(
-    trained: TrainedPolicy, store: EpisodeStore, rule: DecisionRule | None = None
+    trained: TrainedPolicy,
+    store: EpisodeStore,
+    rule: DecisionRule | None = None,
+    seen: UserRows | None = None,
 ) -> Iterator[ScoredSteps]:
     """Compute the policy's probabilities at every step of `store`, in order and in batches.
 
     Args:
         rule: the decision rule; None for the run's own.
+        seen: rows of the users; items that a user was shown before a step are excluded there, as
+            `recommend` and `serve` exclude them by default. None to exclude none.
 
     Yields:
         Batches of scored steps.
     """
     assert trained.item_ids is not None
-    at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // len(trained.item_ids)))
+    n_items = len(trained.item_ids)
+    at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
     total, scorer = store.n_steps, trained.scorer(rule)
     with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
-            episodes, steps = store.locate(np.arange(begin, min(begin + at_once, total)))
-            known, seen = logged_history(scorer, store, episodes, steps)
+            numbers = np.arange(begin, min(begin + at_once, total))
+            episodes, steps = store.locate(numbers)
+            known, shown = logged_history(scorer, store, episodes, steps)
             history = scorer.with_target(known)
             query = scorer.query(history)
-            scores = scorer.scores_of(query, history, excluded=seen)
+            left_out = None if seen is None else _seen_items(seen, numbers, n_items)
+            scores = scorer.scores_of(query, history, left_out, shown)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
                 episodes,
@@ -256,14 +264,28 @@ def scored_steps(
             bar.update(len(steps))
 
 
+def _seen_items(seen: UserRows, steps: IntArray, n_items: int) -> tuple[Tensor, Tensor]:
+    """Rows (M,) and items (M,) of what users were shown before steps; none of a row in which no
+    item would be left."""
+    rows, items = seen.seen(steps)
+    known = items < n_items
+    rows, items = np.divmod(np.unique(rows[known] * n_items + items[known]), n_items)
+    some_left = np.bincount(rows, minlength=len(steps))[rows] < n_items
+    return torch.from_numpy(rows[some_left]), torch.from_numpy(items[some_left])
+
+
 def score(
-    trained: TrainedPolicy, logged: LoggedSessions, rule: DecisionRule | None = None
+    trained: TrainedPolicy,
+    logged: LoggedSessions,
+    rule: DecisionRule | None = None,
+    filter_seen: bool = False,
 ) -> Iterator[pd.DataFrame]:
     """Compute the policy's probability of every logged choice.
 
     Args:
         logged: the logs, without unknown items.
         rule: the decision rule; None for the run's own.
+        filter_seen: exclude items that the user was shown before a step.
 
     Yields:
         Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
@@ -275,7 +297,7 @@ def score(
     assert item_ids is not None
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
     names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
-    for batch in scored_steps(trained, store, rule):
+    for batch in scored_steps(trained, store, rule, logged.rows if filter_seen else None):
         items = batch.items.unsqueeze(1)
         chosen, scored = batch.log_probabilities.gather(1, items), batch.scores.gather(1, items)
         columns = {schema.USER_ID: logged.users[batch.episodes], SESSION: batch.episodes}

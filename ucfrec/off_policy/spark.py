@@ -35,6 +35,7 @@ def score_with_spark(
     *,
     checkpoint: str = "best",
     rule: DecisionRule | None = None,
+    filter_seen: bool = False,
     memory_limit: str = "2GB",
 ) -> int:
     """Write the probability of every choice of logs, as `score` finds it.
@@ -45,6 +46,7 @@ def score_with_spark(
         out: folder for the scores, Parquet parts with sessions numbered throughout.
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
         checkpoint: with which `trained` was loaded.
+        filter_seen: exclude items that the user was shown before a step.
         memory_limit: of a worker while it reads its rows.
 
     Returns:
@@ -60,7 +62,7 @@ def score_with_spark(
     given = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
         run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
-        part = _ScorePart(run, folder.absolute(), memory_limit, rule)
+        part = _ScorePart(run, folder.absolute(), memory_limit, rule, filter_seen)
         sessions = by_users(given, folder.parent, master, part)
         number_sessions(folder, sessions)
     return sum(sessions)
@@ -76,6 +78,7 @@ class _ScorePart:
     memory_limit: str
     """Of a worker while it reads its rows."""
     rule: DecisionRule
+    filter_seen: bool
 
     def __call__(self, part: int, rows: Path, mapping: LogMapping) -> int:
         """Write the file of a part; returns its number of sessions."""
@@ -83,7 +86,7 @@ class _ScorePart:
         _, options = as_trained(trained, mapping, self.memory_limit)
         options = replace(options, reward=schema.REWARD)
         with prepared_sessions(trained, [rows], mapping, options) as logged:
-            frames = score(trained, logged, self.rule)
+            frames = score(trained, logged, self.rule, self.filter_seen)
             write_frames(self.out / part_name(part), frames, about_scores(trained, self.rule))
             return logged.store.n_episodes
 

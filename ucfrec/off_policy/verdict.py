@@ -198,7 +198,10 @@ def _failed_tests(diagnosis: Diagnosis) -> list[str]:
         failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
     )
     if worst.mean < 1:
-        cause = "the logs lack choices that the policy makes, or propensities are too large"
+        cause = (
+            "the logs lack choices that the policy makes (such as seen items, which serve excludes "
+            "without --keep-seen: evaluate with --filter-seen), or propensities are too large"
+        )
     else:
         cause = "propensities are too small"
     said = f"{worst}, where 1 is expected: {cause}"

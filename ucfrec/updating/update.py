@@ -8,6 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from ucfrec import schema
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import claimed
@@ -40,6 +42,9 @@ class UpdateOptions:
     refit: bool = True
     """Go on learning from the newest rows, too, once the runs are compared; see
     `ucfrec.runs.refit`."""
+    filter_seen: bool = False
+    """Compare the runs as they act where items that the user was shown before are excluded, as
+    `recommend` and `serve` do by default."""
 
 
 @random_state_kept()
@@ -98,7 +103,7 @@ def update_run(
     record = train_run(opened, out, config, about, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
-        record = _compared(out, record, trained, before, opened, counts)
+        record = _compared(out, record, trained, before, opened, counts, options.filter_seen)
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
@@ -111,6 +116,7 @@ def _compared(
     before: EpisodeStore,
     opened: EpisodeStore,
     counts: dict[str, Any],
+    filter_seen: bool,
 ) -> RunRecord:
     """Write the drift of the new rows and the verdict to the record of the new run."""
     assert record.update is not None
@@ -118,7 +124,10 @@ def _compared(
     added = opened.select(np.arange(first, opened.n_episodes))
     found = drift(trained, before.split("train"), added, counts, seed)
     new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
-    verdict = compare_runs(new, acting, opened.split("test"), seed)
+    newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+    rows, others = (opened.select(np.flatnonzero(which)) for which in (newest, ~newest))
+    seen = UserRows.of(rows, rows.episode_values(schema.USER), others) if filter_seen else None
+    verdict = compare_runs(new, acting, rows, seed, seen)
     update = record.update.model_copy(update={"drift": found, "verdict": verdict})
     return record.with_entries(update=update).written(out)
 

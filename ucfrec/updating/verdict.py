@@ -8,6 +8,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
@@ -27,7 +28,11 @@ _LEAST_STEPS: Final = 30
 
 
 def compare_runs(
-    new: TrainedPolicy, old: TrainedPolicy, rows: EpisodeStore, seed: int
+    new: TrainedPolicy,
+    old: TrainedPolicy,
+    rows: EpisodeStore,
+    seed: int,
+    seen: UserRows | None = None,
 ) -> UpdateVerdict:
     """Compare two runs, each under its own rule.
 
@@ -38,10 +43,12 @@ def compare_runs(
     Args:
         new: trained on a store that was grown from that of `old`.
         rows: newest episodes of the grown store, which neither was trained on.
+        seen: rows of the users of the grown store, if items that a user was shown before are
+            excluded.
     """
     places = rows.all_steps()
     user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
-    found = _Logged.of(new, rows), _Logged.of(old, as_known(rows, old))
+    found = _Logged.of(new, rows, seen), _Logged.of(old, as_known(rows, old), seen)
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)
     differences = [_ranked(*found, liked, user, seed)]
@@ -90,10 +97,10 @@ class _Logged:
     """(N,) 1 / log2(1 + rank), 0 of items that are not among the first ten."""
 
     @classmethod
-    def of(cls, trained: TrainedPolicy, view: EpisodeStore) -> "_Logged":
+    def of(cls, trained: TrainedPolicy, view: EpisodeStore, seen: UserRows | None) -> "_Logged":
         """One pass over a view whose unknown items are −1."""
         chances, gains = [], []
-        for batch in scored_steps(trained, view):
+        for batch in scored_steps(trained, view, None, seen):
             items, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
             chance = batch.log_probabilities.gather(1, items)[:, 0].double().exp()
             own = batch.scores.gather(1, items)
@@ -148,7 +155,8 @@ def _doubt(weights: Float64Array, user: IntArray) -> str:
         if not abs(mean - 1) <= _ERRORS * error:
             return (
                 f"the mean weight of the {name} run is {mean:.3g} ± {error:.2g} where 1 is "
-                "expected: the log lacks its choices, or propensities are wrong"
+                "expected: the log lacks its choices (as where it was served without seen items: "
+                "update with --filter-seen), or propensities are wrong"
             )
     effective = min(effective_number(column) for column in weights.T)
     if effective < _LEAST_STEPS:

@@ -335,3 +335,24 @@ def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
     assert clicks(LogMapping(where="source = 'app' AND click = 1")) == [0, 0, 1, 0]
     assert clicks(LogMapping(where="day = '02'", partitions=True)) == [0, 0, 0, 1]
     assert clicks(LogMapping(earliest="2023-11-14T22:20:20")) == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("name", ["run", "rule", "arm"])
+def test_a_list_of_another_run_or_rule_is_no_repetition(tmp_path: Path, name: str) -> None:
+    """`recommend LOGS` gives a user without new rows the same request id again."""
+    folder = exposures(tmp_path / "shown")
+    again = pd.read_parquet(folder / "one.parquet").assign(**{name: "other"})
+    again.assign(timestamp=again.timestamp + 60 * MINUTE).to_parquet(folder / "three.parquet")
+    feedback([(1, 10, 67, 1)]).to_parquet(tmp_path / "feedback.parquet")
+    report = join_feedback([folder], [tmp_path / "feedback.parquet"], tmp_path / "log", 30 * MINUTE)
+    assert (report.exposures, report.repeated, report.matched) == (7, 1, 1)
+
+
+@pytest.mark.parametrize("written", ["feedback.parquet", "shown/one.parquet"])
+def test_what_is_read_is_not_written_over(tmp_path: Path, written: str) -> None:
+    feedback([(1, 10, 7, 1)]).to_parquet(tmp_path / "feedback.parquet")
+    shown, out = exposures(tmp_path / "shown"), tmp_path / written
+    before = out.read_bytes()
+    with pytest.raises(InputError, match="would be written over what is read; name another file"):
+        join_feedback([shown], [tmp_path / "feedback.parquet"], out, 30 * MINUTE)
+    assert out.read_bytes() == before

@@ -486,3 +486,31 @@ def test_a_column_that_is_left_out_is_told(
     with pytest.warns(InputNote, match=f"column clicks is left out: it holds {said}"):
         found = fitted[0].recommend(log.assign(clicks=values(len(log))), k=2)
     pd.testing.assert_frame_equal(found, fitted[0].recommend(log, k=2))
+
+
+@pytest.mark.parametrize(
+    ("command", "written"),
+    [
+        ("recommend", "log.parquet"),
+        ("recommend", "run/run.json"),
+        ("recommend --exposures same.parquet", "same.parquet"),
+        ("score", "log.parquet"),
+    ],
+)
+def test_what_is_read_is_not_written_over(
+    fitted: tuple[Recommender, Path],
+    log: pd.DataFrame,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    written: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    log.to_parquet("log.parquet")
+    fitted[0].save("run")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    name, *more = command.split()
+    assert main([name, "run", "log.parquet", *more, "--out", written]) == 2
+    assert f"{written} would be written over what is read" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

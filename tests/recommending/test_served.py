@@ -17,6 +17,7 @@ from ucfrec.recommending.requests import Request
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.served import Served, arm_of, parse_split
 from ucfrec.runs.promoted import POINTER, promote, promote_back
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -105,12 +106,22 @@ def test_a_run_that_cannot_be_used_changes_nothing(
     shutil.copytree(folder / "run", folder / "broken")
     with closing(Served(make, folder, None)) as served:
         promote(folder / "broken", force=True)
-        (folder / "broken" / "policy" / "best.safetensors").unlink()
+        weights = folder / "broken" / "policy" / "best.safetensors"
+        content = weights.read_bytes()
+        weights.unlink()
         served.check()
         described = served.described()
         assert described["name"] == "run"
         assert described["refused"]["name"] == "broken"
         answers(served)
+        weights.write_bytes(content)
+        served.check()
+        assert served.described()["name"] == "run"
+        promote(folder / "broken")
+        served.check()
+        described = served.described()
+        assert described["name"] == "broken"
+        assert "refused" not in described
         promote_back(folder)
         served.check()
     assert "broken is not used" in capsys.readouterr().err
@@ -130,6 +141,7 @@ def test_a_damaged_pointer_file_is_told_of_once_and_followed_again(
         else:
             pointer.write_text(damage)
         time.sleep(0.3)
+        assert served.described()["refused"]["name"] == POINTER
         answers(served)
         if damage == "folder":
             pointer.rmdir()
@@ -142,6 +154,27 @@ def test_a_damaged_pointer_file_is_told_of_once_and_followed_again(
         promote_back(folder)
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "answers from" not in line]
     assert str(folder) in said
+
+
+def test_a_run_that_is_made_again_under_its_name_replaces_the_one_that_answers(
+    folder: Path,
+) -> None:
+    with closing(Served(make, folder, None)) as served:
+        before = served.trained.fingerprint
+        (folder / "run").rename(folder / "kept")
+        shutil.copytree(folder / "other", folder / "run")
+        record = RunRecord.read(folder / "run").with_entries(fingerprint="another store")
+        record.written(folder / "run")
+        try:
+            served.check()
+            assert served.trained.fingerprint == before
+            promote(folder / "run", force=True)
+            served.check()
+            assert served.described()["run"] != before
+        finally:
+            shutil.rmtree(folder / "run")
+            (folder / "kept").rename(folder / "run")
+            promote(folder / "run", force=True)
 
 
 def test_a_folder_without_a_promoted_run_is_refused(tmp_path: Path) -> None:

@@ -164,6 +164,14 @@ def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolic
     pd.testing.assert_frame_equal(shown(forgot[3:4]), shown(alone), rtol=1e-5)
 
 
+def test_identifiers_with_the_same_text_are_one_user(trained: TrainedPolicy) -> None:
+    row = {"item_id": 3, "timestamp": 1_700_000_000_000, "reward": 1.0}
+    asked = [{"user_id": 7, "interactions": [row]}, {"user_id": "7"}, {"user_id": 7}]
+    _, *later = streamed(trained, lines(asked), k=40)
+    for answer in later:
+        assert 3 not in [item["item_id"] for item in answer["items"]]
+
+
 def test_a_history_replaces_what_the_stream_has_had(trained: TrainedPolicy) -> None:
     whole, _ = requests_of(histories(users=2))
     rows, user = whole["history"], whole["user_id"]

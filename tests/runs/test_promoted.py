@@ -68,6 +68,21 @@ def test_a_first_run_needs_no_verdict_and_later_ones_do(
     assert (found.current, found.previous) == ("c", ("a", "b"))
 
 
+def test_another_run_under_the_name_of_the_current_one_needs_a_verdict(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path, "a")
+    promote(folder / "a")
+    RunRecord.read(folder / "a").with_entries(fingerprint="another store").written(folder / "a")
+    with pytest.raises(InputError, match="no verdict"):
+        promote(folder / "a")
+    with pytest.raises(InputError, match="was compared with a, not with the current run a"):
+        promote(updated(folder / "a", trained, "better"))
+    found = promote(folder / "a", force=True)
+    assert found.fingerprint == TrainedPolicy.load(folder / "a").fingerprint
+    assert found.previous == ()
+
+
 def test_a_verdict_against_another_run_does_not_count(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:

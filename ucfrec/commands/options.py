@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import require_other_files
 from ucfrec.files.remote import Input, uri_or_path
 
 if TYPE_CHECKING:
@@ -426,11 +427,13 @@ def logs_given(
         trained: policy that the logs are for, which remembers the dataset of its training logs.
 
     Raises:
-        InputError: a file is missing, or the dataset, a --column or the mapping file is unusable.
+        InputError: a file is missing, or would be replaced by what is written; or the dataset, a
+            --column or the mapping file is unusable.
     """
     from ucfrec.logs.expressions import Expression
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
+    from ucfrec.runs.trained_policy import RUN
 
     given = LogMapping(
         columns_given(options.column),
@@ -444,9 +447,14 @@ def logs_given(
     if trained is not None and options.dataset is None:
         from ucfrec.runs.later_logs import later_logs
 
-        return later_logs(trained, options.logs, given)
-    dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
-    return dataset.resolve(options.logs, given)
+        files, mapping = later_logs(trained, options.logs, given)
+    else:
+        dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
+        files, mapping = dataset.resolve(options.logs, given)
+    outputs = (getattr(options, name, None) for name in ("out", "exposures", "json"))
+    of_run = [] if trained is None else [trained.folder / n for n in (RUN, *trained.record.files)]
+    require_other_files((each for each in outputs if isinstance(each, Path)), [*files, *of_run])
+    return files, mapping
 
 
 def environment_given(options: argparse.Namespace) -> "Environment":

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -60,6 +60,19 @@ def _rename(scratch: Path, path: Path) -> None:
             f"{path} was made by another program meanwhile and stays as it is; name another output "
             "folder"
         ) from None
+
+
+def require_other_files(written: Iterable[Path], read: Iterable[Path]) -> None:
+    """Check that files to write are none of those to read, and differ from each other.
+
+    Raises:
+        InputError: one would replace another.
+    """
+    taken = {path.resolve() for path in read}
+    for path in written:
+        if path.resolve() in taken:
+            raise InputError(f"{path} would be written over what is read; name another file")
+        taken.add(path.resolve())
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import bind, explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
@@ -37,8 +37,11 @@ _EXPOSURE: Final = {
     schema.ARM: "VARCHAR",
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
+_MEASURED: Final = (schema.TIMESTAMP, schema.PROPENSITY)
 _ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
 """Columns that together only exposures have, and logs that were made of them."""
+_ONE_EXPOSURE: Final = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)
+"""SQL of the columns that are equal where an exposure is written twice."""
 _SAME_KEY: Final = (
     "CAST(f.user_id AS VARCHAR) = CAST(e.user_id AS VARCHAR) "
     "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
@@ -53,7 +56,7 @@ class Joined:
     exposures: int
     """Rows of the log."""
     repeated: int
-    """Rows of exposures that repeat one of the same user, request, position and item."""
+    """Rows of exposures that repeat one of the same user, request, position, item, run and rule."""
     with_feedback: int
     """Rows of the log with feedback."""
     matched: int
@@ -100,10 +103,11 @@ def join_feedback(
         memory_limit: of the engine; rows spill to disk.
 
     Raises:
-        InputError: a file or column is missing, or of a wrong type; or a file of feedback is one of
-            exposures.
+        InputError: a file or column is missing, or of a wrong type; a file of feedback is one of
+            exposures; or `out` is one of them.
     """
     files = log_files(exposures), log_files(feedback)
+    require_other_files([out], [*files[0], *files[1]])
     with (
         scratch_folder(Path(gettempdir()), "join") as folder,
         engine([*files[0], *files[1]], folder, memory_limit, shared=True) as connection,
@@ -137,9 +141,9 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
     )
     connection.execute(f"CREATE TABLE given_exposures AS {rows}")
     connection.execute(
-        "CREATE TABLE exposures AS SELECT *, row_number() OVER (ORDER BY timestamp, user_id, "
-        f"{_REQUEST}, position, item_id) AS row FROM given_exposures QUALIFY row_number() OVER "
-        f"(PARTITION BY user_id, {_REQUEST}, position, item_id ORDER BY timestamp) = 1"
+        "CREATE TABLE exposures AS SELECT *, row_number() OVER (ORDER BY timestamp, "
+        f"{_ONE_EXPOSURE}) AS row FROM given_exposures QUALIFY row_number() OVER "
+        f"(PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
     )
 
 

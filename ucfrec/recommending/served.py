@@ -13,12 +13,23 @@ import xxhash
 from ucfrec.errors import InputError
 from ucfrec.recommending.requests import Limits, Request
 from ucfrec.recommending.responder import Answer, Mean, Responder
-from ucfrec.runs.promoted import promoted
+from ucfrec.runs.promoted import POINTER, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SECONDS: Final = 2.0
 """Time between two looks at which run is current."""
 _UNITS: Final = 2**32
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What the pointer file says."""
+
+    name: str
+    """Of the current run."""
+    fingerprint: str
+    written_ns: int
+    """When the file was written: a run is tried again once it is promoted again."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +95,10 @@ class Served:
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._refused: tuple[str, str] | None = None
-        self._wanted = ""
+        self._wanted: _Wanted | None = None
         if shares is None:
             self._wanted = self._current()
-            shares = {self._wanted: 1.0}
+            shares = {self._wanted.name: 1.0}
         self._arms = [Arm(name, share, make(folder / name)) for name, share in shares.items()]
         for arm in self._arms[1:]:
             _require_alike(arm.responder.trained, self.trained)
@@ -142,9 +153,14 @@ class Served:
             InputError: no run is current.
         """
         wanted = self._current()
-        if wanted != self._wanted:
-            self._wanted = wanted
-            self._replace(wanted)
+        if wanted == self._wanted:
+            return
+        self._wanted = wanted
+        own = self._arms[0].name, self.trained.fingerprint
+        if wanted.name != own[0] or wanted.fingerprint not in ("", own[1]):
+            self._replace(wanted.name)
+        else:
+            self._refused = None
 
     def follow(self, seconds: float = SECONDS) -> None:
         """Look every so many seconds whether another run is current, in a thread of its own."""
@@ -161,26 +177,30 @@ class Served:
             for arm in self._arms:
                 arm.responder.close()
 
-    def _current(self) -> str:
+    def _current(self) -> _Wanted:
         found = promoted(self._folder)
         if found is None:
             raise InputError(
                 f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
                 "or ucfrec promote one"
             )
-        return found.run(self._folder).name
+        written = (self._folder / POINTER).stat().st_mtime_ns
+        return _Wanted(found.run(self._folder).name, found.fingerprint, written)
 
     def _run(self, seconds: float) -> None:
         said = ""
         while not self._closed.wait(seconds):
             try:
                 self.check()
-                said = ""
             except Exception as error:
                 # Whatever is wrong with the pointer file, the run that answers goes on.
                 if str(error) != said:
                     said = str(error)
                     _say(said)
+                self._refused = POINTER, said
+                self._wanted = None
+            else:
+                said = ""
 
     def _replace(self, name: str) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""

@@ -85,9 +85,9 @@ def _answered(
             request: StreamRequest | InputError = _parsed(line, responder.limits)
         except InputError as error:
             request = error
-        users = {each.user_id for _, each in waiting if isinstance(each, StreamRequest)}
+        users = {str(each.user_id) for _, each in waiting if isinstance(each, StreamRequest)}
         # Whether rows are remembered is known once they have been answered.
-        again = isinstance(request, StreamRequest) and request.user_id in users
+        again = isinstance(request, StreamRequest) and str(request.user_id) in users
         if again or len(waiting) == _AT_ONCE:
             yield from _together(responder, remembered, waiting, exposures)
             waiting = []
@@ -128,16 +128,16 @@ def _together(
 
 
 class _Remembered:
-    """The rows of the users who were heard of last."""
+    """The rows of the users who were heard of last; user 7 is user "7"."""
 
     def __init__(self, most: int, limits: Limits) -> None:
         self._most, self._limits, self._count = most, limits, 0
-        self._rows: OrderedDict[int | str, list[Row]] = OrderedDict()
+        self._rows: OrderedDict[str, list[Row]] = OrderedDict()
 
     def whole(self, request: StreamRequest) -> Request:
         """The request with all rows of its user as its history."""
         given = "history" in request.model_fields_set
-        earlier = request.history if given else self._rows.get(request.user_id, [])
+        earlier = request.history if given else self._rows.get(str(request.user_id), [])
         rows = [*earlier, *request.interactions]
         if len(rows) > self._limits.history:
             rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
@@ -150,9 +150,10 @@ class _Remembered:
 
     def keep(self, request: StreamRequest, rows: list[Row]) -> None:
         """Remember all rows of a user, if there are any."""
-        self._count += len(rows) - len(self._rows.pop(request.user_id, ()))
+        user = str(request.user_id)
+        self._count += len(rows) - len(self._rows.pop(user, ()))
         if rows:
-            self._rows[request.user_id] = rows
+            self._rows[user] = rows
         while self._count > self._most:
             self._count -= len(self._rows.popitem(last=False)[1])
 

@@ -28,6 +28,8 @@ class Promoted(Record):
 
     current: Text
     """Name of the run folder, beside the file."""
+    fingerprint: Text = ""
+    """Of the run as it was promoted; empty in a file of an earlier version."""
     previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
 
     def run(self, folder: Path) -> Path:
@@ -66,14 +68,15 @@ def promote(run: Path, force: bool = False) -> Promoted:
     folder, record = run.parent, read_record(run)
     with claim(folder / POINTER, wait=True):
         before = promoted(folder)
-        if before is not None and before.current == run.name:
-            return before
-        previous: tuple[str, ...] = ()
-        if before is not None:
-            if not force:
-                _require_verdict(run, record, before.run(folder))
-            previous = (*before.previous, before.current)[-_MOST:]
-        return Promoted(files={}, current=run.name, previous=previous).written(folder)
+        if before is None:
+            return _current(run, ()).written(folder)
+        fingerprint = TrainedPolicy.load(run).fingerprint
+        again = before.current == run.name
+        if not force and not (again and before.fingerprint in ("", fingerprint)):
+            _require_verdict(run, record, before.run(folder))
+        previous = before.previous if again else (*before.previous, before.current)[-_MOST:]
+        # Written again too, so that a server tries again what it could not use.
+        return _current(run, previous).written(folder)
 
 
 def promote_back(folder: Path) -> Promoted:
@@ -86,9 +89,14 @@ def promote_back(folder: Path) -> Promoted:
         before = promoted(folder)
         if before is None or not before.previous:
             raise InputError(f"{folder}: no run was current before; promote one")
-        back = Promoted(files={}, current=before.previous[-1], previous=before.previous[:-1])
-        verified(back.run(folder))
-        return back.written(folder)
+        back = Promoted(files={}, current=before.previous[-1]).run(folder)
+        verified(back)
+        return _current(back, before.previous[:-1]).written(folder)
+
+
+def _current(run: Path, previous: tuple[str, ...]) -> Promoted:
+    fingerprint = TrainedPolicy.load(run).fingerprint
+    return Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
 
 
 def _require_verdict(run: Path, record: RunRecord, current: Path) -> None:

@@ -298,7 +298,7 @@ class RunRecord(TrainingRecord):
             f"the best validation loss, {best:.4g}, is not below {popularity:.4g}, the loss of "
             "showing items by popularity: the policy learned nothing about users; train with more "
             "steps or a higher train.learning_rate, add features of users and items or more "
-            "history, or use --policy item-rate"
+            "history, or use --policy item-rate (expected where the log was drawn at random)"
         )
 
     def describe(self, logged: Container[str] = ()) -> str:

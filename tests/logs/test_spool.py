@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ucfrec.logs.spool import BLOCK, Spool
 
 
-def test_slices_of_rows_come_back(tmp_path: Path) -> None:
-    spool = Spool(tmp_path / "rows")
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_slices_of_rows_come_back(tmp_path: Path, on_disk: bool) -> None:
+    spool = Spool(tmp_path / "rows" if on_disk else None)
     vectors = np.arange(30, dtype=np.float32).reshape(10, 3)
     for begin, end in ((0, 4), (4, 4), (4, 10)):
         spool.append({"v": vectors[begin:end], "n": np.arange(begin, end)})
@@ -19,7 +21,6 @@ def test_slices_of_rows_come_back(tmp_path: Path) -> None:
     # Reading and appending can take turns.
     spool.append({"v": vectors[:1], "n": np.array([10])})
     np.testing.assert_array_equal(spool.read("n", 8, 11), [8, 9, 10])
-    spool.close()
 
 
 def test_fewer_long_rows_are_in_memory(tmp_path: Path) -> None:

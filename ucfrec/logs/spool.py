@@ -1,9 +1,8 @@
 """Rows on disk, column by column: written once in order, then read in slices of bounded size."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class Spool:
         if folder is not None:
             folder.mkdir()
         self._folder = folder
-        self._files: dict[str, IO[bytes]] = {}
+        self._memory: dict[str, bytearray] = {}
         self._rows: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         self._length = 0
 
@@ -54,32 +53,28 @@ class Spool:
             columns: each (M,) or (M, size), of its own dtype, which stays the same.
         """
         for name, values in columns.items():
-            if name not in self._files:
-                self._files[name] = self._opened(name)
-                self._rows[name] = values.dtype, values.shape[1:]
-            self._files[name].write(np.ascontiguousarray(values).data)
+            self._rows.setdefault(name, (values.dtype, values.shape[1:]))
+            if self._folder is None:
+                self._memory.setdefault(name, bytearray()).extend(values.tobytes())
+                continue
+            with self._file(name).open("ab") as file:
+                file.write(np.ascontiguousarray(values).data)
         self._length += len(next(iter(columns.values())))
 
     def read(self, name: str, start: int, stop: int) -> Array:
         """Rows `start` to `stop` of a column, after the last `append`."""
         dtype, shape = self._rows[name]
         size = int(np.prod(shape, dtype=np.int64))
-        file = self._files[name]
-        file.seek(start * size * dtype.itemsize)
-        count = (stop - start) * size
-        if isinstance(file, BytesIO):
-            values = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype)
+        count, offset = (stop - start) * size, start * size * dtype.itemsize
+        if self._folder is None:
+            values = np.frombuffer(self._memory[name], dtype, count, offset).copy()
         else:
-            values = np.fromfile(file, dtype, count)
+            values = np.fromfile(self._file(name), dtype, count, offset=offset)
         return values.reshape(-1, *shape)
 
-    def _opened(self, name: str) -> IO[bytes]:
-        return BytesIO() if self._folder is None else (self._folder / f"{name}.bin").open("w+b")
-
-    def close(self) -> None:
-        """Close the files."""
-        for file in self._files.values():
-            file.close()
+    def _file(self, name: str) -> Path:
+        assert self._folder is not None
+        return self._folder / f"{name}.bin"
 
 
 def whole_groups(batches: Iterable[dict[str, Array]], *keys: str) -> Iterator[dict[str, Array]]:

@@ -452,8 +452,11 @@ def logs_given(
         dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
         files, mapping = dataset.resolve(options.logs, given)
     outputs = (getattr(options, name, None) for name in ("out", "exposures", "json"))
-    of_run = [] if trained is None else [trained.folder / n for n in (RUN, *trained.record.files)]
-    require_other_files((each for each in outputs if isinstance(each, Path)), [*files, *of_run])
+    read = [*files]
+    if trained is not None:
+        of_run = (trained.record.FILE, *trained.record.files)
+        read += [trained.folder / name for name in of_run]
+    require_other_files((each for each in outputs if isinstance(each, Path)), read)
     return files, mapping
 
 

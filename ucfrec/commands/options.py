@@ -433,7 +433,6 @@ def logs_given(
     from ucfrec.logs.expressions import Expression
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
-    from ucfrec.runs.trained_policy import RUN
 
     given = LogMapping(
         columns_given(options.column),

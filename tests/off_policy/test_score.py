@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from tests.support.replay import replayed
-from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, logged_steps, step_features
 from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
+from ucfrec.recommending.histories import histories_of_frame
+from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
@@ -247,18 +248,20 @@ def test_rows_that_repeat_count_as_in_the_training_log(
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
 
 
+@pytest.mark.parametrize(("pause", "new_session"), [(60_000, False), (3_600_000, True)])
 def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, pause: int, new_session: bool
 ) -> None:
     """Two rounds of serving: what was seen is in the store of the run, or in the scored log."""
     rule = DecisionRule(trained.rule.target, temperature=1.0)
     before, served = pd.read_parquet(folder / "train.parquet"), []
     before = before[before.groupby("user_id").item_id.transform("nunique") < 28]
     for _ in range(2):
-        found = Recommender.load(folder / "run").recommend(before, k=1, rule=rule)
+        batches = histories_of_frame(trained, before, LogMapping())
+        found = pd.concat(recommend(trained, batches, 1, rule=rule, new_session=new_session))
         last = before.groupby("user_id").timestamp.max()
         rows = found[["user_id", "item_id", "propensity"]].assign(reward=0.0)
-        served.append(rows.assign(timestamp=rows.user_id.map(last) + 60_000))
+        served.append(rows.assign(timestamp=rows.user_id.map(last) + pause))
         before = pd.concat([before, served[-1]])
     log = pd.concat(served).sort_values(["user_id", "timestamp"])
     log.to_parquet(tmp_path / "served.parquet")

@@ -85,6 +85,19 @@ def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> No
         pd.testing.assert_frame_equal(own, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
+def test_a_user_may_begin_a_new_session(trained: TrainedPolicy) -> None:
+    log, by = histories(users=6), responder(trained, k=24)
+    asked = [{**each, "new_session": n % 2 == 0} for n, each in enumerate(requests_of(log))]
+    goes_on, begins = (recommended(trained, log, 24, new_session=new) for new in (False, True))
+    for request, found in zip(asked, by.answers([Request(**r) for r in asked]), strict=True):
+        assert isinstance(found, Answer)
+        same, other = (begins, goes_on) if request["new_session"] else (goes_on, begins)
+        user = request["user_id"]
+        scores = [each[each.user_id == user].score.to_numpy() for each in (same, other)]
+        np.testing.assert_allclose(found.scores, scores[0], rtol=1e-5, atol=1e-6)
+        assert not np.allclose(*scores, rtol=1e-3)
+
+
 def test_a_request_id_gives_the_same_answer_and_another_draws_again(trained: TrainedPolicy) -> None:
     by = responder(trained, k=9, rule=DecisionRule(3.0, temperature=4.0))
     given = [Request(user_id=7, request_id=name) for name in ("a", "a", "b")] + [Request(user_id=7)]

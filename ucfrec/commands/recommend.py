@@ -37,6 +37,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     memory_option(parser)
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
+    parser.add_argument(
+        "--new-session",
+        action="store_true",
+        help="recommend for the first step of a new session (default: the latest session of each "
+        "user goes on)",
+    )
     rule_options(parser)
     draw_options(parser, "FILE")
     parser.add_argument(
@@ -120,6 +126,7 @@ def run(options: argparse.Namespace) -> None:
             rule=rule,
             filter_seen=not options.keep_seen,
             skip_unknown=options.skip_unknown,
+            new_session=options.new_session,
             seed=options.seed,
             index=index,
         )
@@ -154,6 +161,7 @@ def _recommend_with_spark(
         rule=rule_given(options, trained),
         filter_seen=not options.keep_seen,
         skip_unknown=options.skip_unknown,
+        new_session=options.new_session,
         seed=options.seed,
         memory_limit=options.memory_limit,
     )
@@ -170,6 +178,8 @@ def _answer_stream(options: argparse.Namespace) -> None:
         raise InputError("--stream answers in this process; leave --engine spark out")
     if options.approximate:
         raise InputError("--stream finds items exactly; leave --approximate out")
+    if options.new_session:
+        raise InputError("with --stream, each line says new_session; leave --new-session out")
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     responder = responder_given(options, trained)
     # Unbuffered, so that a request is answered without waiting for the next ones.

@@ -115,13 +115,18 @@ class Histories:
             observations=None,
         )
 
-    def latest_session(self, gap_ms: float | None) -> "Histories":
+    def latest_session(self, gap_ms: float | None, new: BoolArray | None = None) -> "Histories":
         """The same users with only the rows of each user's latest session.
 
         With `session_ids`, these are the rows with the session id of the user's last row. Without,
         the session begins after the last pause of more than `gap_ms` milliseconds, or with the
         user's first row if `gap_ms` is None.
+
+        Args:
+            new: (U,) users who begin a new session, which has no rows yet; None for no one.
         """
+        if new is not None and new.any():
+            return self.rows(~new[self.owner]).latest_session(gap_ms)
         row = np.arange(len(self.owner))
         latest = np.zeros(len(self.users), dtype=np.int64)
         if self.session_ids is not None:

@@ -40,13 +40,15 @@ def recommend(
     filter_seen: bool = True,
     candidates: Sequence[Any] | None = None,
     skip_unknown: bool = False,
+    new_session: bool = False,
     seed: int = 0,
     index: ItemIndex | None = None,
 ) -> Iterator[pd.DataFrame]:
     """`k` next items of every user, by the decision rule.
 
     A user's latest session is assumed to continue: items are scored at its next step, and the
-    rewards that the session has had lower the target as in acting. A rule with a temperature
+    rewards that the session has had lower the target as in acting; with `new_session`, items are
+    scored at the first step of a new one. A rule with a temperature
     draws the items one after the other, without repetition; otherwise they are the `k` best. For
     users who are not in the training logs, the state is made of their rows alone.
 
@@ -57,6 +59,7 @@ def recommend(
         filter_seen: exclude every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
         skip_unknown: ignore rows of items that are not in the training data.
+        new_session: whether users begin a new session.
         seed: of the draws of a rule with a temperature, or that explores. They also depend on the
             user and the time of the user's last row: the same history gives the same items, and a
             later one draws anew.
@@ -79,7 +82,7 @@ def recommend(
     known_ids = trained.items
     excluded = None if candidates is None else _all_but(known_ids, candidates)
 
-    choice = _Choice(trained, scorer, k, excluded, seed, index)
+    choice = _Choice(trained, scorer, k, excluded, new_session, seed, index)
     return map(choice.frame, _numbered(known_ids, batches, filter_seen, skip_unknown))
 
 
@@ -117,13 +120,16 @@ class _Choice:
     k: int
     excluded: Tensor | None
     """(n_items,) true for items that no user is recommended."""
+    new_session: bool
     seed: int
     index: ItemIndex | None
 
     def frame(self, batch: Histories) -> pd.DataFrame:
         """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
         unknown ones; those of `seen_ids` are not recommended."""
-        latest = batch.rows(batch.item_ids >= 0).latest_session(self.trained.record.session_gap_ms)
+        latest = batch.rows(batch.item_ids >= 0).latest_session(
+            self.trained.record.session_gap_ms, np.full(len(batch.users), self.new_session)
+        )
         # Sessions of about the same length share a pass, which costs as much as the longest.
         lengths = np.bincount(latest.owner, minlength=len(latest.users))
         order = np.argsort(lengths, kind="stable")

@@ -119,6 +119,13 @@ class Request(BaseModel):
         ]
         | None
     ) = None
+    new_session: Annotated[
+        bool,
+        Field(
+            description="Whether the user begins a new session. Otherwise the latest one of the "
+            "history goes on."
+        ),
+    ] = False
     request_id: (
         Annotated[
             str,

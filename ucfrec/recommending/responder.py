@@ -85,6 +85,7 @@ class _Prepared(NamedTuple):
     request_id: str
     k: int
     history: UserHistory
+    new_session: bool
     known: IntArray
     """(n,) index of each item of the history, −1 for items that the policy does not know."""
     left_out: IntArray
@@ -213,7 +214,15 @@ class Responder:
         k = self._k if request.k is None else request.k
         request_id = request.request_id or uuid4().hex
         return _Prepared(
-            number, request.user_id, request_id, k, history, known, seen[seen >= 0], allowed
+            number,
+            request.user_id,
+            request_id,
+            k,
+            history,
+            request.new_session,
+            known,
+            seen[seen >= 0],
+            allowed,
         )
 
     def _scored(self, prepared: Sequence[_Prepared]) -> list[Answer]:
@@ -269,7 +278,7 @@ class Responder:
         )
         known = batch.item_ids >= 0
         return (batch if known.all() else batch.rows(known)).latest_session(
-            self.trained.record.session_gap_ms
+            self.trained.record.session_gap_ms, np.asarray([one.new_session for one in prepared])
         )
 
     def _best(self, prepared: Sequence[_Prepared], scores: Tensor) -> list[Answer]:

@@ -32,6 +32,7 @@ def recommend_with_spark(
     rule: DecisionRule | None = None,
     filter_seen: bool = True,
     skip_unknown: bool = False,
+    new_session: bool = False,
     seed: int = 0,
     memory_limit: str = "2GB",
 ) -> int:
@@ -69,6 +70,7 @@ def recommend_with_spark(
             k,
             filter_seen,
             skip_unknown,
+            new_session,
             seed,
         )
         return sum(by_users(given, parts[0].parent, master, part))
@@ -89,6 +91,7 @@ class _RecommendPart:
     k: int
     filter_seen: bool
     skip_unknown: bool
+    new_session: bool
     seed: int
 
     def __call__(self, part: int, rows: Path, mapping: LogMapping) -> int:
@@ -110,6 +113,7 @@ class _RecommendPart:
             rule=self.rule,
             filter_seen=self.filter_seen,
             skip_unknown=self.skip_unknown,
+            new_session=self.new_session,
             seed=self.seed,
         )
         with ExitStack() as stack:

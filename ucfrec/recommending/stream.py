@@ -145,6 +145,7 @@ class _Remembered:
             user_id=request.user_id,
             k=request.k,
             candidates=request.candidates,
+            new_session=request.new_session,
             request_id=request.request_id,
         ).model_copy(update={"history": rows})
 

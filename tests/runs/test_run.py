@@ -159,7 +159,7 @@ def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: P
     single = EpisodeStore.write(
         tmp_path / "single", {name: values[:5] for name, values in columns.items()}, np.array([5])
     )
-    with pytest.raises(InputError, match="1 training episodes"):
+    with pytest.raises(InputError, match="has 1 training episode, at least 2 are needed"):
         train_run(single, tmp_path / "run-single", resolve_config("ucf"))
     assert not (tmp_path / "run-single").exists()
 

@@ -45,9 +45,10 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     """
     train, validation = store.split("train"), store.split("validation")
     if train.n_episodes < 2:
+        episodes = "1 training episode" if train.n_episodes else "no training episodes"
         raise InputError(
-            f"{store.path} has {train.n_episodes} training episodes, at least 2 are needed; "
-            "prepare it with a larger training share"
+            f"{store.path} has {episodes}, at least 2 are needed; collect more data, or prepare "
+            "the store so that fewer episodes are held out"
         )
     if validation.n_episodes:
         return train, validation

@@ -3,6 +3,7 @@
 import argparse
 import shutil
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,8 +40,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def training_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `train` for `ucfrec` and for other programs with this command."""
+def training_options(
+    parser: argparse.ArgumentParser, policies: Sequence[str] | None = None
+) -> None:
+    """Add the options of `train` for `ucfrec` and for other programs with this command.
+
+    Args:
+        policies: names of those that the program trains, others are refused; None for all.
+    """
     parser.epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
     parser.add_argument(
         "store",
@@ -58,8 +65,9 @@ def training_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policy",
         default="ucf",
+        choices=policies,
         metavar="NAME",
-        help=f"policy: {', '.join(policy_names())} (default: ucf)",
+        help=f"policy: {', '.join(policies or policy_names())} (default: ucf)",
     )
     parser.add_argument(
         "--config",

@@ -7,12 +7,12 @@ import torch
 from ucfrec.commands.train import training_options
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
-from ucfrec_control.training.train import dataset_of, preset_of, train_control
+from ucfrec_control.training.train import control_policies, dataset_of, preset_of, train_control
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `train`."""
-    training_options(parser)
+    training_options(parser, control_policies())
 
 
 def run(options: argparse.Namespace) -> None:

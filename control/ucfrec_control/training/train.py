@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import SILENT, Callbacks
+from ucfrec.policies.registry import BUILT_IN, policy_names
 from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
@@ -17,6 +18,14 @@ from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
+
+_POLICIES: Final = ("ucf", "ucf-paper", "dt", "dc", "lsdt", "bc")
+"""Built-in policies whose actions may be vectors."""
+
+
+def control_policies() -> tuple[str, ...]:
+    """Names of the policies to train on control stores: built-in ones, then those of plugins."""
+    return (*_POLICIES, *(name for name in policy_names() if name not in BUILT_IN))
 
 
 @dataclass(frozen=True)

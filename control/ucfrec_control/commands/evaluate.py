@@ -2,17 +2,19 @@
 
 import argparse
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ucfrec.commands.grid_options import seed_given
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import write_results
 from ucfrec_control.commands.options import MAX_RETURN, target_given
-from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run
+from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run, takes_target
+from ucfrec_control.training.rl_baselines import read_run
 from ucfrec_control.training.video import record_episode
 
 SHOWN = (
@@ -49,7 +51,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control evaluate`."""
+    """Run `ucfrec-control evaluate`.
+
+    Raises:
+        InputError: a run or its environment cannot be used, or no run takes the --target.
+    """
+    if options.target:
+        _explain_targets(options.runs)
     if options.video is not None:
         _record(options)
     rows: list[ResultRow] = []
@@ -64,11 +72,23 @@ def run(options: argparse.Namespace) -> None:
             distractor=options.distractor,
         )
     print(format_rows([_shown(row) for row in rows], SHOWN))
-    warnings: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
-    for warning in dict.fromkeys(text for texts in warnings for text in texts):
+    mismatches: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
+    for warning in dict.fromkeys(text for texts in mismatches for text in texts):
         print(f"warning: {warning}", file=sys.stderr)
     if options.json is not None:
         write_results(options.json, rows)
+
+
+def _explain_targets(runs: Sequence[Path]) -> None:
+    """Note which runs --target does nothing for; refuse it if it does nothing for all."""
+    records = {run: read_run(run) for run in runs}
+    without = {run: each for run, each in records.items() if not takes_target(each)}
+    if not without:
+        return
+    named = ", ".join(f"{run} ({record.config.policy_name})" for run, record in without.items())
+    if len(without) == len(records):
+        raise InputError(f"no target return is taken by {named}; leave --target out")
+    warnings.warn(f"--target does nothing for {named}", InputNote, stacklevel=2)
 
 
 def _shown(row: ResultRow) -> dict[str, Any]:

@@ -173,13 +173,18 @@ def method_of(record: RunRecord | RLRecord) -> str:
     return record.name + _SUFFIXES[record.screening.how]
 
 
+def takes_target(record: RunRecord | RLRecord) -> bool:
+    """Whether the policy of a run acts by a target return."""
+    return not is_rl(record) and record.config.policy_name != "bc"
+
+
 def rules_of(
     trained: Trained, env_id: str, given: Sequence[float | None] = ()
 ) -> Sequence[DecisionRule | None]:
     """The target returns given, else those of the preset, as rules; (None,) for policies without a
     target return."""
     dataset, method = _dataset(trained), trained.record.config.policy_name
-    if isinstance(trained, RLPolicy) or method == "bc":
+    if isinstance(trained, RLPolicy) or not takes_target(trained.record):
         return (None,)
     task = require_task(env_id, dataset["dataset"])
     preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets

@@ -101,6 +101,18 @@ def test_another_environment_version_warns(
     assert told.startswith("the data was made with mujoco 2.1.0, ")
 
 
+def test_a_target_return_that_no_run_takes_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloned = str(tmp_path / "run")
+    assert main(["train", str(folder / "store"), "--out", cloned, "--policy", "bc", *SETTINGS]) == 0
+    asked = ["--checkpoint", "last", "--episodes", "1", "--target", "100"]
+    assert main(["evaluate", cloned, *asked]) == 2
+    assert f"no target return is taken by {cloned} (bc)" in capsys.readouterr().err
+    assert main(["evaluate", cloned, str(folder / "store-run"), *asked]) == 0
+    assert f"note: --target does nothing for {cloned} (bc)" in capsys.readouterr().err
+
+
 def test_data_does_not_choose_what_is_imported(
     folder: Path,
     tmp_path: Path,

@@ -55,3 +55,20 @@ def test_noise_is_a_finite_number(
     agent = ["--agent", "agent.zip", "--env", "Hopper-v5", "--out", str(tmp_path / "out")]
     assert main(["collect", *agent, "--noise", noise]) == 2
     assert "give at least 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["evaluate", "run", "--target", "abc"], "abc is no target; give a number or max"),
+        (["evaluate", "run", "--target", "nan"], "nan is no target; give a number or max"),
+        (["train", "store", "--out", "run", "--policy", "popular"], "invalid choice: 'popular'"),
+    ],
+)
+def test_wrong_values_are_named(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err

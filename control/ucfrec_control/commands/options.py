@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
@@ -19,6 +20,7 @@ from ucfrec_control.benchmark.rates import read_rates
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.environments.environments import note_unknown
 from ucfrec_control.environments.scores import find_task
 
 BUDGETS: Final = {
@@ -32,8 +34,20 @@ MAX_RETURN = "max"
 
 
 def target_given(text: str) -> float | None:
-    """The value of `--target`: a number, or None for `MAX_RETURN`."""
-    return None if text == MAX_RETURN else float(text)
+    """The value of `--target`: a number, or None for `MAX_RETURN`.
+
+    Raises:
+        ArgumentTypeError: `text` is neither.
+    """
+    if text == MAX_RETURN:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text:.40} is no target; give a number or {MAX_RETURN}")
+    return value
 
 
 def source_options(parser: argparse.ArgumentParser) -> None:
@@ -124,8 +138,10 @@ def read_source(options: argparse.Namespace) -> Trajectories:
     """Read the dataset that the options of `source_options` name.
 
     Raises:
-        InputError: it is missing, damaged or of another format.
+        InputError: it is missing, damaged, of another format, or of other sizes than `--env` has.
     """
+    if options.env is not None:
+        note_unknown(options.env)
     if is_minari(options.source):
         return read_minari(options.source, options.env, options.download)
     return read_d4rl(Path(options.source), options.env)
@@ -134,7 +150,7 @@ def read_source(options: argparse.Namespace) -> Trajectories:
 def describe_source(trajectories: Trajectories) -> str:
     """A text with a dataset's size, mean return, score and dropped steps."""
     source, returns = trajectories.source, trajectories.returns
-    task = find_task(source["env_id"], source["dataset"])
+    task = find_task(source["env_id"] or source["dataset"])
     score = f", normalised {task.score(returns.mean()):.2f}" if task else ""
     dropped = [f"{count} {what.replace('_', ' ')}" for what, count in source["dropped"].items()]
     name, env_id = one_line(source["dataset"]), one_line(source["env_id"] or "unknown")

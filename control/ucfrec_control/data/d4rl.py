@@ -34,7 +34,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
             environment for the task in the file's name.
 
     Raises:
-        InputError: the file is missing, damaged or not of this layout.
+        InputError: the file is missing, damaged or not of this layout, or its observations and
+            actions have other sizes than D4RL's of that environment.
     """
     with opened(path) as file:
         missing = [name for name in _REQUIRED if name not in file]
@@ -50,8 +51,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         recorded = file.attrs.get("env_id")
     _require_aligned(steps, path)
     named = env_id or (recorded if isinstance(recorded, str) else None)
-    task = find_task(named, dataset_name(path))
-    check_sizes(None if env_id else task, _sizes(steps), str(path))
+    task = find_task(named or dataset_name(path))
+    check_sizes(task, _sizes(steps), str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
     ends = np.flatnonzero(terminals | _timeouts(steps, path))
     finals = _final_observations(steps, ends, path)

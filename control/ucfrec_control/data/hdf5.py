@@ -8,7 +8,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from ucfrec.arrays import Array
+from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError, one_line
 
 _DEFLATE: Final = 1032
@@ -50,8 +50,8 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
         name: of the data set, which may lie in groups: `infos/final_observations`.
 
     Raises:
-        InputError: it is not a data set of numbers, claims more values than the file can hold, or
-            cannot be read.
+        InputError: it is not a data set of numbers, claims more values than the file can hold,
+            has numbers beyond single precision, or cannot be read.
     """
     parent = file
     for part in name.split("/"):
@@ -74,7 +74,29 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
         raise InputError(
             f"{path}: {name} cannot be read ({first_line(error)}); fetch the file again"
         ) from None
-    return values.astype(np.float32) if values.dtype.kind == "f" else values
+    return as_singles(values, str(path), name) if values.dtype.kind == "f" else values
+
+
+def as_singles(values: Array, where: str, name: str) -> Float32Array:
+    """Numbers in single precision.
+
+    Args:
+        where: source of the numbers, which the error message starts with.
+        name: of the numbers, in the plural.
+
+    Raises:
+        InputError: a finite number is beyond single precision.
+    """
+    with np.errstate(over="ignore"):
+        singles = values.astype(np.float32)
+    beyond = int(np.count_nonzero(np.isinf(singles) & np.isfinite(values)))
+    if beyond:
+        raise InputError(
+            f"{where}: {beyond} {'number' if beyond == 1 else 'numbers'} of its {name} "
+            f"{'is' if beyond == 1 else 'are'} beyond single precision "
+            f"(±{np.finfo(np.float32).max:.2g}); scale the {name}, or remove their trajectories"
+        )
+    return singles
 
 
 def require_inside(path: Path) -> None:

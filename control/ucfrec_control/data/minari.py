@@ -20,10 +20,10 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.data.hdf5 import require_inside
+from ucfrec_control.data.hdf5 import as_singles, require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
-from ucfrec_control.environments.scores import dataset_name
+from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
 _ROOT = "MINARI_DATASETS_PATH"
 """Environment variable with the folder in which Minari keeps its datasets."""
@@ -61,8 +61,8 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
         The complete trajectories, with float32 observations, actions and rewards.
 
     Raises:
-        InputError: the dataset is missing or damaged, or its observations or actions are not
-            vectors.
+        InputError: the dataset is missing or damaged, its observations or actions are not vectors,
+            or they have other sizes than those of `env_id`.
     """
     dataset = _load(source, download)
     try:
@@ -78,13 +78,19 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
                 "steps instead of one more"
             )
     spec = dataset.env_spec
+    seen_before = _joined([seen[:-1] for seen in observations], source, "observations")
+    actions = _joined([_vectors(e.actions, source) for e in complete], source, "actions")
+    if complete and not is_antmaze(env_id or ""):
+        # Of gymnasium-robotics, newer AntMazes have other sizes than D4RL's.
+        sizes = (seen_before.shape[1], actions.shape[1])
+        check_sizes(find_task(env_id), sizes, source)
     return Trajectories(
-        observations=_joined([seen[:-1] for seen in observations]),
-        actions=_joined([_vectors(e.actions, source) for e in complete]),
-        rewards=_joined([e.rewards for e in complete]).reshape(-1),
+        observations=seen_before,
+        actions=actions,
+        rewards=_joined([e.rewards for e in complete], source, "rewards").reshape(-1),
         lengths=np.array([len(e) for e in complete], dtype=np.int64),
         terminated=np.array([bool(e.terminations[-1]) for e in complete]),
-        final_observations=_joined([seen[-1:] for seen in observations]),
+        final_observations=_joined([seen[-1:] for seen in observations], source, "observations"),
         source={
             "where": source,
             "format": "minari",
@@ -251,8 +257,8 @@ def _vectors(values: Any, source: str) -> Array:
     return values
 
 
-def _joined(parts: list[Array]) -> Float32Array:
-    return np.concatenate(parts or [np.zeros((0, 0))]).astype(np.float32)
+def _joined(parts: list[Array], source: str, name: str) -> Float32Array:
+    return as_singles(np.concatenate(parts or [np.zeros((0, 0))]), source, name)
 
 
 def _made_with(metadata: Mapping[str, Any]) -> dict[str, str]:

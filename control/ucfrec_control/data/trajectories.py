@@ -110,7 +110,11 @@ class Trajectories:
                 raise InputError(f"{where}: {name} have shape {values.shape} instead of {shape}")
             non_finite = int(np.count_nonzero(~np.isfinite(values)))
             if non_finite:
-                raise InputError(f"{where}: {non_finite} numbers of its {name} are not finite")
+                numbers = "1 number" if non_finite == 1 else f"{non_finite} numbers"
+                raise InputError(
+                    f"{where}: {numbers} of its {name} {'is' if non_finite == 1 else 'are'} not "
+                    "finite; remove their trajectories"
+                )
 
     @property
     def returns(self) -> Float64Array:

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.arrays import Array
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec_control.environments.antmaze import (
     GoalObservations,
     antmaze_settings,
@@ -84,6 +84,26 @@ def make_env(
             f"the environment {env_id} cannot be made ({reason}); install ucfrec[control], or name "
             "another with --env"
         ) from None
+
+
+def note_unknown(env_id: str) -> None:
+    """Note that Gymnasium has no such environment here, if so.
+
+    AntMazes, and environments of a module that the name begins with, are only registered where they
+    are made.
+    """
+    if ":" in env_id or is_antmaze(env_id):
+        return
+    try:
+        gymnasium.spec(env_id)
+    except gymnasium.error.Error as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        warnings.warn(
+            f"--env {env_id}: Gymnasium has no such environment here ({reason}); check the name, "
+            "`ucfrec-control evaluate` needs one that it has",
+            InputNote,
+            stacklevel=2,
+        )
 
 
 def environment_of_data(dataset: Mapping[str, Any]) -> str:

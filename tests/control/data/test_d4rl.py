@@ -113,6 +113,8 @@ def test_d4rl_files_are_of_v4_environments(tmp_path: Path) -> None:
     assert read_d4rl(file, env_id="Hopper-v5").source["env_id"] == "Hopper-v5"
     unknown = write_hdf5(tmp_path / "mine.hdf5", hopper_like(), env_id=None)
     assert read_d4rl(unknown).source["env_id"] is None
+    # A name that the user gives counts, that of the file no longer.
+    assert read_d4rl(write_hdf5(tmp_path / "halfcheetah.hdf5", hopper_like()), "Hopper-v5")
     assert find_kind("hopper_medium_expert-v2") == "medium-expert"
     assert find_kind("mujoco/hopper/medium-v0") == "medium"
 
@@ -130,6 +132,9 @@ def broken(columns: Columns, how: str) -> Columns:
         columns["terminals"] = columns["terminals"] + 2.0
     elif how == "not a number":
         columns["observations"][3, 1] = np.nan
+    elif how == "beyond singles":
+        columns["rewards"] = columns["rewards"].astype(np.float64)
+        columns["rewards"][3] = -1e300
     elif how == "text":
         columns["rewards"] = np.array([b"one"] * len(columns["rewards"]))
     elif how == "no end":
@@ -152,7 +157,8 @@ def broken(columns: Columns, how: str) -> Columns:
         ("flat observations", "observations have shape"),
         ("narrow successors", "next_observations have 10 columns, observations have 11"),
         ("odd flags", "14 of its terminals are neither 0 nor 1"),
-        ("not a number", "1 numbers of its observations are not finite"),
+        ("not a number", "1 number of its observations is not finite"),
+        ("beyond singles", "1 number of its rewards is beyond single precision"),
         ("text", "rewards holds .*, not numbers"),
         ("no end", "no trajectory ends in it"),
         ("finals", "has 3 rows for 4 trajectories"),
@@ -170,6 +176,21 @@ def test_what_is_not_of_the_layout_is_refused(
     assert main(["prepare", str(file), "--out", str(tmp_path / "store")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "store").exists()
+
+
+def test_data_of_other_sizes_than_the_named_environment_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_hdf5(tmp_path / "hopper_medium.hdf5", hopper_like(LENGTHS))
+    write_minari(read_d4rl(file), "hopper/mine-v0")
+    for source in (str(file), "hopper/mine-v0"):
+        asked = ["prepare", source, "--out", str(tmp_path / "store"), "--env"]
+        assert main([*asked, "HalfCheetah-v5"]) == 2
+        assert "(11, 3), those of halfcheetah are (17, 6)" in capsys.readouterr().err
+    assert main([*asked, "Nope-v9"]) == 0
+    said = capsys.readouterr()
+    assert "note: --env Nope-v9: Gymnasium has no such environment here" in said.err
+    assert "normalised" not in said.out
 
 
 @pytest.mark.parametrize("keep", [0, 100, 3000])

@@ -171,7 +171,14 @@ _SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("gsasrec", "rec
 @pytest.mark.parametrize("name", ["bpr", *_SLOW])
 def test_peers_are_exported(tmp_path: Path, name: str) -> None:
     trained = trained_run(tmp_path, name)
-    assert export(trained, tmp_path / "out", k=5).difference <= 1e-5
+    written = export(trained, tmp_path / "out", k=5)
+    assert written.difference <= 1e-5
+    description = json.loads((tmp_path / "out" / DESCRIPTION).read_text())
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {GRAPH, DESCRIPTION}
+    assert description["files"] == [GRAPH]
+    assert written.size == (tmp_path / "out" / GRAPH).stat().st_size
+    # What is done by the graph, and what is left to the caller.
+    assert [name for name in description["rule"] if name not in description["rule_notes"]] == []
 
 
 @pytest.mark.parametrize("name", ["item-knn", "boosted"])

@@ -46,7 +46,7 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, its weights beside it) and `model.json`.
+    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
@@ -62,9 +62,10 @@ def export(
     with atomic_folder(out) as scratch:
         _write(graph, scratch / GRAPH, trained.name)
         difference = max(_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
-        write_json(scratch / DESCRIPTION, _description(graph, trained))
-        size = sum(file.stat().st_size for file in scratch.iterdir() if file.name != DESCRIPTION)
-    return Exported(size, difference)
+        sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
+        about = _description(graph, trained) | {"files": list(sizes)}
+        write_json(scratch / DESCRIPTION, about)
+    return Exported(sum(sizes.values()), difference)
 
 
 def _arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
@@ -115,9 +116,11 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "outputs": _outputs(len(trained.item_ids), graph.k),
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
-        "rule_notes": "the graph applies target, minimum_target, reward_weight, tag_window and "
-        "tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
-        "draw from `scores`, and with explore, draw that share of the requests uniformly",
+        "rule_notes": "the graph applies target, minimum_target, policy_weight, reward_weight, "
+        "lookahead, tag_window and tag_run; with exclude_seen, put the session's items into "
+        "`excluded`; with a temperature, draw from `scores` divided by it, with top_k among so "
+        "many best; with explore, draw that share of the requests uniformly, with explore_top "
+        "among so many best",
         "policy": trained.name,
         "reward": record.reward,
         "session_by": record.session_by,
@@ -152,8 +155,9 @@ def _inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
 def _outputs(items: int, k: int) -> list[dict[str, Any]]:
     b = "batch"
     scores = (
-        "log-probability of the policy plus the reward weight, up to a constant; -inf for items "
-        "excluded"
+        "policy_weight times the policy's log-probability plus reward_weight times what the reward "
+        "model says, with a lookahead also of what follows, up to a constant; -inf for items that "
+        "`excluded`, tag_window or tag_run leave out"
     )
     return [
         _entry("scores", "float32", [b, items], scores),

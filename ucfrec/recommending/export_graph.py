@@ -206,7 +206,10 @@ def write_graph(
     remedy: str,
     shapes: dict[str, Any] | None = None,
 ) -> None:
-    """Write a module as an ONNX graph, its weights beside it.
+    """Write a module as an ONNX graph with its weights.
+
+    Weights of more than 1.5 GB lie beside it, in a file with `.data` appended to its name: the file
+    of a graph ends at 2 GB.
 
     Args:
         module: in evaluation mode.
@@ -230,7 +233,7 @@ def write_graph(
                 dynamic_shapes=shapes,
                 opset_version=_OPSET,
                 dynamo=True,
-                external_data=True,
+                external_data=False,  # torch still puts more than 1.5 GB of them beside it
                 verbose=False,
             )
     except (InputError, OSError, MemoryError):

@@ -98,7 +98,7 @@ WRONG: dict[str, tuple[bytes, int, str]] = {
     "nothing": (b"", 400, "the request is not JSON"),
     "no user": (b"{}", 400, "user_id: field required"),
     "of a stream": (b'{"user_id": 1, "interactions": []}', 400, "interactions: extra inputs"),
-    "too many items": (b'{"user_id": 1, "k": 6}', 400, "6 k: the limit is 5"),
+    "too many items": (b'{"user_id": 1, "k": 6}', 400, "6 items (k): the limit is 5"),
     "too much history": (
         json.dumps({"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12}] * 4}).encode(),
         400,
@@ -236,8 +236,10 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     ("hosts", "answered"),
     [
         ("shop.example, *.shop.example", {"shop.example": 200, "a.shop.example": 200, "b": 400}),
+        ("Shop.example", {"shop.EXAMPLE:80": 200, "ashop.example": 400, "shop.example:x": 400}),
+        ("*.shop.example", {"shop.example": 400, "b/.shop.example@c": 400, "": 400}),
         ("*", {"anything": 200}),
-        ("::1", {"[::1]": 200, "[::2]:80": 400}),
+        ("::1", {"[::1]": 200, "[::1]:80": 200, "[::2]:80": 400}),
     ],
 )
 def test_hosts_that_are_allowed(
@@ -245,13 +247,16 @@ def test_hosts_that_are_allowed(
 ) -> None:
     given = _allowed_hosts(argparse.Namespace(allowed_hosts=hosts))
 
-    async def statuses() -> dict[str, int]:
+    async def answers() -> dict[str, Any]:
         app = application(responder(trained), ServerLimits(), given)
         transport = httpx.ASGITransport(app=app)
         async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
-            return {
-                host: (await http.get("/health", headers={"Host": host})).status_code
-                for host in answered
-            }
+            return {host: await http.get("/health", headers={"Host": host}) for host in answered}
 
-    assert asyncio.run(statuses()) == answered
+    found = asyncio.run(answers())
+    assert {host: answer.status_code for host, answer in found.items()} == answered
+    for host, answer in found.items():
+        if answer.status_code == 400:
+            assert answer.json().keys() == {"error"}
+            assert f"requests for the host {host!r} are not" in answer.json()["error"]
+            assert "--allowed-hosts" in answer.json()["error"]

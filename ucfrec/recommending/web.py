@@ -16,7 +16,6 @@ from fastapi_offline import FastAPIOffline
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import Field
 from starlette.exceptions import HTTPException
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -25,6 +24,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.exposures import ExposureLog
+from ucfrec.recommending.hosts import AllowedHosts
 from ucfrec.recommending.metrics import ServingMetrics
 from ucfrec.recommending.requests import Request, parsed
 from ucfrec.recommending.responder import Answer, Responder
@@ -74,6 +74,9 @@ _MOST_HEADERS: Final = 100
 _MOST_HEADER_BYTES: Final = 2**16
 """Of the address, names and values of a request. The server itself stops reading a head that is not
 whole by then."""
+_ALLOW: Final = (
+    "start the server with --allowed-hosts and this host, or ask for one that it answers"
+)
 _HUNG_UP: Final = 499
 """For the metrics, as no client receives it; nginx calls it so."""
 
@@ -186,7 +189,7 @@ def application(
         return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
 
     app.add_middleware(_Direct, answer=recommendations)
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
+    app.add_middleware(AllowedHosts, allowed=hosts, remedy=_ALLOW)
     app.add_middleware(_HeaderLimits)  # the last one added comes first
 
     @app.get("/health")

@@ -18,8 +18,8 @@ ROW = b'{"item_id": 1, "timestamp": 1.7e12, "observation": '
     [
         (b'"history": [%s]' % MANY, "history.0.item_id: field required"),
         (b'"interactions": [%s]' % MANY, "interactions.0.item_id: field required"),
-        (b'"candidates": [%s]' % MANY, "candidates.0: input should be a valid integer"),
-        (b'"history": [%s[%s]}]' % (ROW, MANY), "history.0.observation.0: input should be a valid"),
+        (b'"candidates": [%s]' % MANY, "candidates.0: give text or an integer"),
+        (b'"history": [%s[%s]}]' % (ROW, MANY), "history.0.observation.0: give a finite number"),
         (b",".join(b'"%x": 0' % n for n in range(180_000)), "has 180,000 faults; most are entries"),
     ],
 )
@@ -58,6 +58,37 @@ def test_other_text_is_no_time(given: str) -> None:
     rows = [{"item_id": 1, "timestamp": given}]
     with pytest.raises(InputError, match=r"history.0.timestamp"):
         parsed(Request, json.dumps({"user_id": 1, "history": rows}).encode(), Limits())
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ('"user_id": null', "user_id: give text or an integer of 64 bits, not null"),
+        ('"user_id": 1.5', "user_id: give text or an integer of 64 bits, not 1.5"),
+        ('"user_id": true', "user_id: give text or an integer of 64 bits, not true"),
+        (f'"user_id": {2**63}', f"user_id: give text or an integer of 64 bits, not {2**63}"),
+        ('"user_id": [1], "int": 0', "user_id: give text or an integer of 64 bits; 1 more fault"),
+        ('"user_id": null, "k": 0, "x": 0', "user_id: give .*, not null; 2 more faults"),
+        ('"user_id": 1, "int": 5', "int: extra inputs are not permitted, not 5"),
+        (f'"user_id": "{"x" * 1001}"', "user_id: string should have at most 1000 characters"),
+        (
+            '"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12, "reward": null}]',
+            "history.0.reward: give a finite number, not null",
+        ),
+        (
+            '"user_id": 1, "history": [{"item_id": 1, "timestamp": true}]',
+            "history.0.timestamp: give text or a finite number, not true",
+        ),
+        (
+            '"user_id": 1, "history": [{"item_id": 1, "timestamp": "soon"}]',
+            'history.0.timestamp: give milliseconds, or an ISO 8601 time such as .*, not "soon"',
+        ),
+    ],
+)
+def test_a_value_of_no_type_that_its_place_takes_is_one_fault(entries: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}") as refused:
+        parsed(Request, f"{{{entries}}}".encode(), Limits())
+    assert "more" in message or "more" not in str(refused.value)
 
 
 def test_integers_that_javascript_would_round_are_text() -> None:

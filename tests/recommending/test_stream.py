@@ -91,7 +91,7 @@ BAD = {
     "true for a user": (b'{"user_id": true}', "user_id: "),
     "a misspelt entry": (b'{"user_id": 1, "kk": 3}', "kk: extra inputs are not permitted"),
     "no items": (b'{"user_id": 1, "k": 0}', "k: input should be greater than or equal to 1, not 0"),
-    "too many items": (b'{"user_id": 1, "k": 1001}', "1,001 k: the limit is 1,000"),
+    "too many items": (b'{"user_id": 1, "k": 1001}', "1,001 items (k): the limit is 1,000"),
     "no candidates": (b'{"user_id": 1, "candidates": []}', "candidates: "),
     "NaN": (
         b'{"user_id": 1, "history": [{"item_id": 1, "timestamp": NaN}]}',

@@ -56,7 +56,9 @@ def _milliseconds(given: float | str) -> float:
         time = datetime.fromisoformat(given.strip())
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
     except (ValueError, OverflowError):
-        raise ValueError("no ISO 8601 time, such as 2024-05-01T10:00:00+02:00") from None
+        raise ValueError(
+            "give milliseconds, or an ISO 8601 time such as 2024-05-01T10:00:00+02:00"
+        ) from None
 
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -189,20 +191,50 @@ def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
 
 
 def fault_of(errors: Sequence[Any]) -> str:
-    """The first of pydantic's errors in one line, and how many there are."""
-    first = errors[0]
-    where = ".".join(str(part) for part in first["loc"] if part not in _KINDS)
-    message = first["msg"][:1].lower() + first["msg"][1:]
+    """The first of pydantic's errors in one line, and how many there are: one a place."""
+    first, faults = errors[0], len({_place(error) for error in errors})
     if first["type"] == "json_invalid":
-        return f"the request is not JSON ({message})"
+        return f"the request is not JSON ({_lower(first['msg'])})"
+    where = ".".join(map(str, _place(first))) or "the request"
     given = first.get("input")
     shown = "" if isinstance(given, (dict, list)) else f", not {_short(given)}"
-    more = f"; {len(errors) - 1} more faults" if len(errors) > 1 else ""
-    return f"{where or 'the request'}: {message}{shown}{more}"
+    more = f"; {faults - 1} more fault{'s' * (faults > 2)}" if faults > 1 else ""
+    return f"{where}: {_wanted(errors)}{shown}{more}"
 
 
-_KINDS: Final = ("int", "float", "str", "constrained-int", "constrained-str", "body")
-"""Parts of pydantic's places that name a type, not an entry."""
+def _wanted(errors: Sequence[Any]) -> str:
+    """What the place of the first error takes."""
+    first = errors[0]
+    same = [error for error in errors if _place(error) == _place(first)]
+    if len(same) == 1:
+        return _lower(first["msg"])
+    for error in same:
+        if error["type"] == "string_too_long":
+            return _lower(error["msg"])
+    kinds = {error["loc"][-1] for error in same}
+    if "float" in kinds:
+        kinds.discard("constrained-int")
+    return f"give {' or '.join(words for kind, words in _KINDS.items() if kind in kinds)}"
+
+
+def _place(error: Any) -> tuple[str | int, ...]:
+    """Where an error is, whichever of the types that the place takes it is about."""
+    place: tuple[str | int, ...] = error["loc"]
+    named = error["type"] == "extra_forbidden" or place[-1:] == () or place[-1] not in _KINDS
+    return place if named else place[:-1]
+
+
+def _lower(message: str) -> str:
+    message = message.removeprefix("Value error, ")
+    return message[:1].lower() + message[1:]
+
+
+_KINDS: Final = {
+    "constrained-str": "text",
+    "float": "a finite number",
+    "constrained-int": "an integer of 64 bits",
+}
+"""Last part of pydantic's place of an error in one of several types, and what that type takes."""
 
 
 def _short(value: object) -> str:
@@ -217,7 +249,7 @@ def require_within(request: Request, limits: Limits) -> None:
         InputError: it requests too much.
     """
     counts = {
-        "k": (request.k or 1, limits.k),
+        "items (k)": (request.k or 1, limits.k),
         "rows of history": (len(request.history), limits.history),
         "candidates": (len(request.candidates or ()), limits.candidates),
     }

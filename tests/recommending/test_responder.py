@@ -184,6 +184,15 @@ def test_feedback_that_is_missing_in_all_rows_takes_the_default_of_the_expressio
     rewards.close()
 
 
+@pytest.mark.parametrize("reward", ["click", "1 * click"])
+def test_feedback_is_matched_in_any_case(reward: str) -> None:
+    rewards = RowRewards(Expression(reward, "run.json"))
+    assert rewards.of_rows([{"Click": 1}, {"click": 2}, {"CLICK": 3, "click": None}]) == [1, 2, 3]
+    with pytest.raises(InputError, match="neither reward nor click"):
+        rewards.of_rows([{"clicks": 1}])
+    rewards.close()
+
+
 def test_a_reward_that_is_computed_from_a_column_of_that_name_is_computed() -> None:
     rewards = RowRewards(Expression("1 - reward / 5", "run.json"))
     assert rewards.of_rows([{"reward": 5.0}, {"reward": 0.0}]) == [0.0, 1.0]

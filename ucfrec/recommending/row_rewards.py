@@ -61,7 +61,7 @@ class RowRewards:
         name = str(self._expression)
         if _NAME.fullmatch(name):
             either = "no" if name == schema.REWARD else f"neither {schema.REWARD} nor"
-            return _checked([row.get(name) for row in rows], f"{either} {name}")
+            return _checked(_column(rows, name), f"{either} {name}")
         return _checked(self._evaluated(rows), "no reward")
 
     def _evaluated(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
@@ -69,12 +69,11 @@ class RowRewards:
             self._connection = self._stack.enter_context(engine_in_memory(_MEMORY))
         connection = self._connection
         names = columns_of(connection, self._expression)
-        given = {name.casefold(): name for row in rows for name in row}
+        given = {each.casefold() for each in set().union(*rows)}
         columns = {}
         for name in names:
-            key = given.get(name.casefold(), name)
-            values = [row.get(key) for row in rows]
-            if not any(key in row for row in rows):
+            values = _column(rows, name)
+            if name.casefold() not in given:
                 lacking, remedy = f"no {name}", "it"
                 if not self._computed:
                     lacking, remedy = f"neither {schema.REWARD} nor {name}", "one of them"
@@ -111,6 +110,18 @@ class RowRewards:
             return values
         finally:
             connection.unregister(_ROWS)
+
+
+def _column(rows: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
+    """The entry `name` of each row, in whatever case it is written; None where there is none."""
+    values = [row.get(name) for row in rows]
+    if any(value is None for value in values):
+        folded = name.casefold()
+        for other in set().union(*rows) - {name}:
+            if other.casefold() == folded:
+                found = (row.get(other) for row in rows)
+                values = [b if a is None else a for a, b in zip(values, found, strict=True)]
+    return values
 
 
 def _checked(values: Sequence[Any], missing: str) -> list[float]:

@@ -42,6 +42,19 @@ def test_ids_of_another_type_are_found(
     assert len(pd.read_parquet(tmp_path / "store" / "items.parquet")) == 3
 
 
+def test_the_index_of_a_frame_is_no_feature(tmp_path: Path) -> None:
+    mapping_of(tmp_path, [1, 2, 12], [1, 2, 12])
+    features = pd.read_parquet(tmp_path / "features.parquet")
+    features.set_index(pd.Index([7, 5, 9])).to_parquet(tmp_path / "indexed.parquet")
+    states = []
+    for name in ("features", "indexed"):
+        table = FeatureTable((tmp_path / f"{name}.parquet",), "key")
+        given = LogMapping(item_features=(table,))
+        prepare([tmp_path / "log.parquet"], given, tmp_path / name, OPTIONS)
+        states.append((tmp_path / name / "item_states.safetensors").read_bytes())
+    assert states[0] == states[1]
+
+
 @pytest.mark.parametrize(
     ("ids", "keys", "message"),
     [

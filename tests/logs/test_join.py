@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from tests.support.killed import kills
@@ -233,6 +234,16 @@ def test_a_feedback_column_may_have_any_name(tmp_path: Path, name: str) -> None:
     assert report.columns == (name, "more")
     assert log[name].tolist() == [0, 0, 3, 0]
     assert log.more.tolist() == [0, 0, 4, 0]
+
+
+def test_the_index_of_a_frame_is_no_feedback(tmp_path: Path) -> None:
+    given = feedback([(1, 10, 9, 0), (1, 10, 7, 3), (1, 10, 8, 1)])
+    given = given.set_index(pd.Index([7, 5, 9]))
+    given.to_parquet(tmp_path / "indexed.parquet")
+    assert "__index_level_0__" in pq.read_schema(tmp_path / "indexed.parquet").names
+    report, log = joined_files(tmp_path, given)
+    assert report.columns == ("click",)
+    assert "__index_level_0__" not in log
 
 
 def test_a_feedback_column_that_the_log_has_itself_is_left_out_with_a_note(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.mapping import FeatureTable, log_files
 from ucfrec.logs.tables import (
     NOTHING,
+    PANDAS_INDEX,
     Table,
     as_timestamp,
     is_integer,
@@ -119,7 +120,9 @@ def _part(
 ) -> _Part:
     key = bind(connection, opened, f"key of {kind} features", table.key)
     keys = {name.casefold() for name in key.columns}
-    given = table.columns or tuple(c for c in opened.columns if c.casefold() not in keys)
+    given = table.columns or tuple(
+        c for c in opened.columns if c.casefold() not in keys and not PANDAS_INDEX.fullmatch(c)
+    )
     # The text of a CSV file is what its keys are, not what DuckDB makes of it.
     raw = key.columns if key.is_column and not opened.columnar else ()
     if raw:

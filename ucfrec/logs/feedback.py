@@ -8,7 +8,7 @@ from typing import Final
 import duckdb
 
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.tables import Table, is_number, quoted, text
+from ucfrec.logs.tables import PANDAS_INDEX, Table, is_number, quoted, text
 
 _NUMBER_LIKE: Final = r"[-+]?[$€£]?(\d+|\d{1,3}([., ']\d{3})+)([.,]\d+)?\s*[%$€£]?"
 """Text that means a number, though it may not be written as one."""
@@ -19,8 +19,9 @@ _WRITE_NUMBERS: Final = (
 
 
 def names_of(table: Table) -> dict[str, str]:
-    """Column names in lower case to those of the files: case does not matter."""
-    return {name.casefold(): name for name in table.columns}
+    """Column names in lower case to those of the files, without a pandas index: case does not
+    matter."""
+    return {name.casefold(): name for name in table.columns if not PANDAS_INDEX.fullmatch(name)}
 
 
 def holds_feedback(kind: str) -> bool:

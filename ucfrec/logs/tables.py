@@ -40,6 +40,8 @@ ISO_TIME: Final = (
     r"([T ]\d{1,2}:\d{1,2}(:\d{1,2}([.,]\d+)?)?\s*(Z|UTC|[+-]\d{2}(:?\d{2})?)?)?"
 )
 """Times that have one meaning: the year comes first."""
+PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
+"""Column in which pandas keeps the numbers of the rows of a frame: no data."""
 _FILE: Final = "ucfrec: file"
 _RAW: Final = "ucfrec: text of "
 

@@ -105,17 +105,20 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
     listed = got(explorer, "/results", history="3, 1", k="30").text
     assert HOSTILE not in listed
     assert "javascript:" not in listed
-    assert got(explorer, "/", host="evil.example").status_code == 400
+    refused = got(explorer, "/", host="evil.example")
+    assert refused.status_code == 400
+    assert "evil.example" in refused.json()["error"]
+    assert "the address that `ucfrec explore` printed" in refused.json()["error"]
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"user": "nobody"}, "none of the 1 users is in the store"),
+        ({"user": "nobody"}, "has no user &#39;nobody&#39;; choose one of the list, or paste"),
         ({"user": "7", "k": "0"}, "k is &#39;0&#39;; give a number from 1 to 100"),
         ({"user": "7", "custom": "on", "temperature": "x"}, "temperature is"),
         ({"user": "7", "custom": "on", "temperature": "-1"}, "temperature is -1"),
-        ({"history": "99, 1"}, "item_id that the policy does not know"),
+        ({"history": "99, 1"}, "does not know the items 99; take their lines out of the history"),
         ({"history": "3, much"}, "line 1 of the history"),
     ],
 )

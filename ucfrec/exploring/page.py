@@ -8,6 +8,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
@@ -17,12 +18,15 @@ from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
 from ucfrec.files.record import CARD
 from ucfrec.given_data import histories_given
+from ucfrec.recommending.histories import Histories
+from ucfrec.recommending.recommend import some_of
 from ucfrec.reporting import charts
 from ucfrec.reporting.charts import LineChart
 from ucfrec.reporting.forest import quoted
 from ucfrec.reporting.page import write_report
 from ucfrec.reporting.page_results import results_of
 from ucfrec.results.row import ResultRow
+from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _TITLES: Final = ("title", "name")
@@ -151,8 +155,7 @@ class Explorer:
 
     def _list(self, trained: TrainedPolicy, given: Mapping[str, str]) -> tuple[str, str, Explained]:
         text, user = given.get("history", "").strip(), given.get("user", "").strip()
-        frame = pasted_history(text) if text else None
-        (history,) = histories_given(trained, frame, None, ["pasted"] if text else [user])
+        history = _pasted(trained, text) if text else _stored(trained, user)
         rule = _rule_given(trained, given)
         k = round(_number(given, "k", 10, 1, _MOST_ITEMS))
         filter_seen = given.get("keep_seen") is None
@@ -203,6 +206,33 @@ class Explorer:
     def _card(trained: TrainedPolicy) -> str:
         card = trained.folder / CARD
         return card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
+
+
+def _pasted(trained: TrainedPolicy, text: str) -> Histories:
+    (history,) = histories_given(trained, pasted_history(text), None, ["pasted"])
+    known = trained.items.numbers(history.item_ids) >= 0
+    if not known.all():
+        unknown = some_of(list(dict.fromkeys(history.item_ids[~known].tolist())))
+        raise InputError(
+            f"the run {trained.folder.name} does not know the items {unknown:.200}; take their "
+            "lines out of the history"
+        )
+    return history
+
+
+def _stored(trained: TrainedPolicy, user: str) -> Histories:
+    run = trained.folder.name
+    if trained.users.numbers(np.asarray([user]))[0] < 0:
+        raise InputError(
+            f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
+        )
+    if store_of(trained.folder, trained.record) is None:
+        raise InputError(
+            f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
+            "history instead"
+        )
+    (history,) = histories_given(trained, None, None, [user])
+    return history
 
 
 def _rule_given(trained: TrainedPolicy, given: Mapping[str, str]) -> DecisionRule:

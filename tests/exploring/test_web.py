@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,15 @@ def test_what_is_wrong_is_said_on_the_page(
     answer = got(explorer, "/", **given)
     assert answer.status_code == 200
     assert message in answer.text
+
+
+def test_without_the_store_a_history_can_be_pasted(explorer: Explorer) -> None:
+    trained = explorer.runs[0]
+    gone = trained.record.model_copy(update={"store": "gone", "store_from_run": None})
+    alone = Explorer([replace(trained, record=gone)])
+    said = "the store of the run first, gone, is gone or has changed; paste a history"
+    assert said in alone.results({"user": "7"})
+    assert 'class="card"' in alone.results({"history": "3, 1"})
 
 
 def test_one_run_or_two(explorer: Explorer) -> None:

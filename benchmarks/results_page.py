@@ -456,7 +456,7 @@ def _origin(rows: Sequence[ResultRow], command: str) -> str:
 
 
 RUN = "ucfrec benchmark recommendation --table"
-CONTROL = "ucfrec-control benchmark $UCFREC_DATA/control --budget small --table"
+CONTROL = "ucfrec-control benchmark --data $UCFREC_DATA/control --budget small --table"
 IN_TAG = "(in the git tag `benchmarks-2026-11`)"
 SECTIONS = (
     Section(
@@ -538,7 +538,8 @@ SECTIONS = (
         "Scores of the last checkpoint after 10,000 steps in batches of 64 windows of 8 steps, for "
         "cloning of 512 steps, at width 128, with averaged weights, in 50 episodes. One seed, so a "
         "difference may be chance. DT, DC and LSDT were not measured at this budget.",
-        "`ucfrec-control benchmark $UCFREC_DATA/control --budget medium --table main --seeds 1`",
+        "`ucfrec-control benchmark --data $UCFREC_DATA/control --budget medium --table main "
+        "--seeds 1`",
         of("control_medium", "main"),
         partial(scores, references=("ucf-wo-count",)),
     ),

@@ -27,7 +27,7 @@ def data(tmp_path: Path) -> Path:
         ["distract", "store", "--out", "out", "--seed"],
         ["screen", "store", "--seed"],
         ["collect", "--env", "Hopper-v5", "--out", "out", "--seed"],
-        ["benchmark", "data", "--evaluation-seed"],
+        ["benchmark", "--data", "data", "--evaluation-seed"],
     ],
 )
 def test_seeds_that_are_none_are_refused(
@@ -44,7 +44,7 @@ def test_a_benchmark_needs_a_worker(
     data: Path, tmp_path: Path, workers: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cells = ["--file", FILE, "--method", "bc", "--seeds", "1", "--out", str(tmp_path / "out")]
-    assert main(["benchmark", str(data), *cells, "--workers", workers]) == 2
+    assert main(["benchmark", "--data", str(data), *cells, "--workers", workers]) == 2
     assert f"--workers is {workers}; at least one" in capsys.readouterr().err
 
 

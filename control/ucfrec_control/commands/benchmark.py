@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
@@ -19,6 +18,7 @@ from ucfrec_control.commands.options import (
     choices_options,
     control_grid_options,
     data_given,
+    data_option,
     narrowed,
 )
 from ucfrec_control.training.evaluate import CHECKPOINTS
@@ -26,9 +26,7 @@ from ucfrec_control.training.evaluate import CHECKPOINTS
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `benchmark`."""
-    parser.add_argument(
-        "data", nargs="?", type=Path, metavar="DATA", help="folder of the HDF5 files"
-    )
+    data_option(parser)
     parser.add_argument(
         "--table",
         default=MAIN,

@@ -102,7 +102,10 @@ def data_given(options: argparse.Namespace) -> Path:
         InputError: no folder is given.
     """
     if options.data is None:
-        raise InputError("name the folder of the HDF5 files, or --show-only for rows available")
+        raise InputError(
+            "name the folder of the HDF5 files with --data, or give --show-only for the rows that "
+            "are there"
+        )
     folder: Path = options.data
     return folder
 

@@ -110,7 +110,7 @@ def test_the_search_writes_rows_and_a_choice_once(
     assert "2 of them left" in (printed := capsys.readouterr()).err
     assert "dt-wo-time = 0.01" in printed.out.split("[small]")[-1]
     # The choice is what the benchmark trains with.
-    given = ["benchmark", str(tmp_path), "--out", str(out), "--method", "dt-wo-time"]
+    given = ["benchmark", "--data", str(tmp_path), "--out", str(out), "--method", "dt-wo-time"]
     given += ["--rates", str(toml)]
     monkeypatch.setitem(BUDGETS, "small", replace(tiny, settings=(*settings, *SHORT)))
     assert main(given) == 0

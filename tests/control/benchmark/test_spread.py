@@ -82,7 +82,7 @@ def test_checkpoints_are_measured_once_and_share_the_run_of_the_main_table(
     capsys.readouterr()
     assert main(["spread", *arguments, "--show-only"]) == 0
     assert capsys.readouterr().out.count("ucf-wo-count") == 2
-    assert main(["benchmark", str(tmp_path), *arguments]) == 0
+    assert main(["benchmark", "--data", str(tmp_path), *arguments]) == 0
     (run, _) = sorted(path for path in out.glob("medium/runs/*/*") if path.is_dir())
     more = read_rows(out / "results.jsonl")[len(rows) :]
     assert {r.suite for r in more} == {"control"}

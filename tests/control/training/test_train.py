@@ -359,7 +359,7 @@ def test_a_benchmark_goes_on_where_it_was(
     )
     monkeypatch.setitem(TABLES, "main", {m: METHODS[m] for m in ("lsdt", "ucf")})
     results = tmp_path / "control.jsonl"
-    arguments = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    arguments = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "runs")]
     arguments += ["--results", str(results)]
     assert main(arguments) == 0
     rows = [json.loads(line) for line in results.read_text().splitlines()]
@@ -387,7 +387,7 @@ def test_a_benchmark_goes_on_where_it_was(
     earned = {r["checkpoint"]: r["metrics"]["return"] for r in rows if r["method"] == "lsdt"}
     assert {r["checkpoint"]: r["metrics"]["return"] for r in again[2:]} == earned
     capsys.readouterr()
-    assert main([*arguments[:1], "--show-only", *arguments[2:]]) == 0
+    assert main([*arguments[:1], "--show-only", *arguments[3:]]) == 0
     assert f"{earned['last']:.3f}" in capsys.readouterr().out
     (tmp_path / "hopper_medium-made.hdf5").rename(tmp_path / "hopper_medium-own.hdf5")
     own = ["--file", "hopper_medium-own", "--method", "lsdt", "--seeds", "2"]
@@ -414,7 +414,7 @@ def test_what_no_benchmark_can_be_of_is_refused(
     write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25)))
     rows = tmp_path / "rows.jsonl"
     rows.write_text("no row\n")
-    given = ["benchmark", str(tmp_path), "--out", str(tmp_path / "runs")]
+    given = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "runs")]
     given += ["--file", "hopper_medium-zoo"] if "--file" not in options else []
     assert main([*given, *(str(rows) if o == "{rows}" else o for o in options)]) == 2
     printed = capsys.readouterr().err.strip().splitlines()

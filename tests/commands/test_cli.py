@@ -164,7 +164,7 @@ def test_recommend_refuses_unknown_items(
     arguments += ["--out", str(tmp_path / "top.parquet")]
     printed = refused(arguments, capsys)
     assert "987654" in printed
-    assert "1 rows have an item_id" in printed
+    assert "1 row has an item_id" in printed
     assert "--skip-unknown" in printed
     assert not (tmp_path / "top.parquet").exists()
     assert main([*arguments, "--skip-unknown"]) == 0

@@ -212,7 +212,7 @@ def test_unknown_items_are_refused_or_skipped(
 ) -> None:
     policy, _ = fitted
     strange = pd.concat([log, log.tail(9).assign(item_id=999, timestamp=log.timestamp.max() + 1)])
-    with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 items: 999\)"):
+    with pytest.raises(InputError, match=r"\d rows have an item_id .* \(1 item: 999\)"):
         policy.recommend(strange)
     best = replace(policy.trained.rule, temperature=0.0)
     pd.testing.assert_frame_equal(

@@ -202,8 +202,8 @@ class Responder:
         if (known < 0).any() and not self._skip_unknown:
             unknown = sorted(set(history.item_ids[known < 0].tolist()))
             raise InputError(
-                f"{int((known < 0).sum())} rows of the history have an item_id that the policy "
-                f"does not know ({some_of(unknown)}); leave them out"
+                f"history: the policy does not know the item_id of {int((known < 0).sum())} of "
+                f"{len(known)} rows ({some_of(unknown)}); leave them out"
             )
         seen = self._items.numbers(history.seen) if self._filter_seen else np.empty(0, np.int64)
         allowed = (

@@ -1,11 +1,13 @@
 """Fit, recommend, save and load from Python."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +95,40 @@ def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
     del policy, kept
     assert not [*scratch.iterdir()]
     assert of_store.run.is_dir()
+
+
+def test_folders_are_found_from_any_folder(
+    folder: Path, log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    policy = Recommender("item-rate").fit(os.path.relpath(folder / "store"), "run")
+    loaded = Recommender.load("run")
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir("other")
+    for each in (policy, loaded):
+        assert each.run == each.trained.folder == tmp_path / "run"
+        assert len(each.score(log)) == len(log)
+        assert set(each.recommend(users=[5], k=1).user_id) == {5}
+    policy.save("copy")
+    assert (tmp_path / "other" / "copy" / "run.json").is_file()
+
+
+def test_copies_share_a_temporary_run_and_a_pickle_has_none(
+    log: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    policy = Recommender("item-rate").fit(log)
+    twin, pickled, run = deepcopy(policy), pickle.dumps(policy), policy.run
+    del policy
+    assert twin.run == run
+    twin.save(tmp_path / "copy")
+    del twin
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+    again = pickle.loads(pickled)
+    assert set(again.recommend(log, k=1).user_id) == {*log.user_id}
+    for use in (lambda: again.save(tmp_path / "x"), again.rank, lambda: again.score(log)):
+        with pytest.raises(InputError, match=r"is gone, .*call save\(folder\) before"):
+            use()
 
 
 KILLED = """

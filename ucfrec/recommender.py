@@ -4,7 +4,7 @@ import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from html import escape
@@ -92,8 +92,7 @@ class Recommender:
         """
         self.policy, self.settings, self.seed = policy, settings, seed
         self.config = resolve_config(policy, None, settings, seed)
-        self._remove_scratch: Callable[[], object] = ExitStack().close
-        self._folder: Path | None = None
+        self._scratch: _Scratch | None = None
         self._trained: TrainedPolicy | None = None
 
     def __repr__(self) -> str:
@@ -183,16 +182,14 @@ class Recommender:
             # Whoever fits next removes what is left, should this process be killed.
             folder = scratch.enter_context(scratch_folder(Path(tempfile.gettempdir()), "run"))
             store = store_given(data, mapping, folder, options)
-            out = folder / "run" if out is None else Path(out)
+            out = folder / "run" if out is None else Path(out).absolute()
             watchers = Callbacks(on_step, on_validation)
             record = train_screened(store, out, self.config, screen, callbacks=watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 warnings.warn(InputNote(warning), stacklevel=2)
             trained = _completed(store, out, refit)
-            kept = scratch.pop_all() if any(folder.iterdir()) else ExitStack()
-        self._remove_scratch()
-        self._remove_scratch = weakref.finalize(self, kept.close)
-        self._trained, self._folder = trained, out
+            kept = _Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
+        self._trained, self._scratch = trained, kept
         return self
 
     @property
@@ -200,9 +197,15 @@ class Recommender:
         """The run folder.
 
         Raises:
-            InputError: the recommender is not trained; call `fit` first.
+            InputError: the recommender is not trained, or its folder is gone.
         """
-        return self.trained.folder
+        folder = self.trained.folder
+        if not folder.is_dir():
+            raise InputError(
+                f"the run folder {folder} is gone, as a temporary one is once its recommender is; "
+                "call save(folder) before it is, or fit(..., out)"
+            )
+        return folder
 
     @property
     def trained(self) -> TrainedPolicy:
@@ -217,10 +220,10 @@ class Recommender:
 
     def _evaluated(self, logs: Logs | None) -> TrainedPolicy:
         """The policy that logs can evaluate: the test split, the weights before a refit."""
-        trained = self.trained
+        run, trained = self.run, self.trained
         if logs is not None or trained.record.refit_of is None:
             return trained
-        return TrainedPolicy.load(self.run, split=True)
+        return TrainedPolicy.load(run, split=True)
 
     def recommend(
         self,
@@ -422,8 +425,9 @@ class Recommender:
         Raises:
             InputError: the recommender is not trained, or the logs cannot be used.
         """
-        with logs_given(self.trained, logs, mapping, keep_unknown=False) as logged:
-            return pd.concat(score(self.trained, logged, rule), ignore_index=True)
+        trained = self._evaluated(logs)
+        with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
+            return pd.concat(score(trained, logged, rule), ignore_index=True)
 
     def update(
         self,
@@ -526,7 +530,7 @@ class Recommender:
             InputError: the folder is not a run folder, or has no checkpoint yet.
         """
         policy = cls()
-        policy._folder, policy._trained = Path(run), TrainedPolicy.load(Path(run))
+        policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
         policy.settings = {table: asdict(getattr(config, table)) for table in TABLES}
@@ -535,6 +539,20 @@ class Recommender:
 
 UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
+
+
+class _Scratch:
+    """The folder of a temporary run, removed once no recommender and no copy of one has it."""
+
+    def __init__(self, folder: ExitStack) -> None:
+        weakref.finalize(self, folder.close)
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another process cannot keep the folder: what is read from a pickle has none.
+        return type(None), ()
 
 
 def _completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:

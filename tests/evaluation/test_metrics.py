@@ -69,12 +69,106 @@ def test_ids_may_be_text() -> None:
     assert metrics.recall(recommended, text[1], 5) == pytest.approx(expected)
 
 
-def test_what_cannot_be_measured() -> None:
-    with pytest.raises(InputError, match="recommended has no column rank"):
-        metrics.recall(RECOMMENDED.drop(columns="rank"), RELEVANT)
-    with pytest.raises(InputError, match="relevant has no rows"):
-        metrics.mrr(RECOMMENDED, RELEVANT.head(0))
-    with pytest.raises(InputError, match="k is 0"):
-        metrics.hit_rate(RECOMMENDED, RELEVANT, 0)
-    with pytest.raises(InputError, match="1 recommended items have no row, such as 100"):
-        metrics.diversity(RECOMMENDED, FEATURES.drop(index=100))
+def test_items_of_the_catalogue_count_once() -> None:
+    for name, before in (("coverage", ()), ("serendipity", (RELEVANT, HISTORY))):
+        function: Callable[..., float] = getattr(metrics, name)
+        expected = function(RECOMMENDED, *before, CATALOGUE, 5)
+        assert function(RECOMMENDED, *before, pd.Series(CATALOGUE * 2), 5) == expected
+        assert function(RECOMMENDED, *before, {*CATALOGUE}, 5) == expected
+
+
+def test_liked_may_be_any_true_and_false() -> None:
+    rows = pd.DataFrame({"user_id": 1, "score": [1.0, 2.0, 3.0], "liked": [False, True, True]})
+    for kind in ("int", "float", "boolean", "object"):
+        assert metrics.gauc(rows.astype({"liked": kind})) == 1
+
+
+def with_text(frame: pd.DataFrame, column: str = "item_id") -> pd.DataFrame:
+    return frame.astype({column: str})
+
+
+SHOWN = pd.DataFrame({"user_id": [1, 1], "score": [1.0, 2.0], "liked": [0, 1]})
+WRONG: dict[str, tuple[Callable[[], float], str]] = {
+    "no rank": (
+        lambda: metrics.recall(RECOMMENDED.drop(columns="rank"), RELEVANT),
+        "recommended has no column rank",
+    ),
+    "nothing relevant": (
+        lambda: metrics.mrr(RECOMMENDED, RELEVANT.head(0)),
+        "relevant has no rows",
+    ),
+    "k of 0": (lambda: metrics.hit_rate(RECOMMENDED, RELEVANT, 0), "k is 0; give a whole number"),
+    "part of an item": (lambda: metrics.precision(RECOMMENDED, RELEVANT, k=2.5), "k is 2.5"),
+    "k as float": (lambda: metrics.ndcg(RECOMMENDED, RELEVANT, k=2.0), "k is 2.0; give a whole"),
+    "ranks from 0": (
+        lambda: metrics.ndcg(RECOMMENDED.assign(rank=RECOMMENDED["rank"] - 1), RELEVANT),
+        "rank is 0 in a row; ranks count from 1",
+    ),
+    "no ranks": (lambda: metrics.mrr(RECOMMENDED.assign(rank=np.nan), RELEVANT), "rank is nan"),
+    "text as rank": (lambda: metrics.mrr(RECOMMENDED.assign(rank="1"), RELEVANT), "rank is 1 in"),
+    "relevant text": (
+        lambda: metrics.hit_rate(RECOMMENDED, with_text(RELEVANT)),
+        "item_id holds numbers in recommended, but text in relevant; convert one of them",
+    ),
+    "categories of text": (
+        lambda: metrics.recall(with_text(RECOMMENDED).astype({"item_id": "category"}), RELEVANT),
+        "item_id holds text in recommended, but numbers in relevant",
+    ),
+    "users as text": (
+        lambda: metrics.hit_rate(RECOMMENDED, with_text(RELEVANT, "user_id")),
+        "user_id holds numbers in recommended, but text in relevant",
+    ),
+    "history of text": (
+        lambda: metrics.novelty(RECOMMENDED, with_text(HISTORY)),
+        "item_id holds numbers in recommended, but text in history",
+    ),
+    "popularity of text": (
+        lambda: metrics.serendipity(RECOMMENDED, RELEVANT, with_text(HISTORY), CATALOGUE),
+        "item_id holds numbers in recommended, but text in history",
+    ),
+    "serendipity of text": (
+        lambda: metrics.serendipity(RECOMMENDED, with_text(RELEVANT), HISTORY, CATALOGUE),
+        "item_id holds numbers in recommended, but text in relevant",
+    ),
+    "catalogue of text": (
+        lambda: metrics.coverage(RECOMMENDED, [*map(str, CATALOGUE)]),
+        "item_id holds numbers in recommended, but text in catalogue",
+    ),
+    "no catalogue": (lambda: metrics.coverage(RECOMMENDED, []), "catalogue is empty"),
+    "small catalogue": (
+        lambda: metrics.serendipity(RECOMMENDED, RELEVANT, HISTORY, CATALOGUE[:1]),
+        "catalogue lacks .* recommended items, such as",
+    ),
+    "liked unknown": (
+        lambda: metrics.gauc(SHOWN.assign(liked=[1.0, np.nan])),
+        "liked is neither true nor false in 1 rows",
+    ),
+    "liked as text": (
+        lambda: metrics.gauc(with_text(SHOWN, "liked")),
+        "liked is neither true nor false in 2 rows",
+    ),
+    "an item without features": (
+        lambda: metrics.diversity(RECOMMENDED, FEATURES.drop(index=100)),
+        "1 recommended items have no row, such as 100",
+    ),
+    "features twice": (
+        lambda: metrics.diversity(RECOMMENDED, pd.concat([FEATURES, FEATURES])),
+        "features has several rows of item .*; give one row per item",
+    ),
+    "features as lists": (
+        lambda: metrics.diversity(RECOMMENDED, FEATURES.assign(tags=[["a"]] * len(FEATURES))),
+        "features: tags holds lists",
+    ),
+    "no features": (
+        lambda: metrics.diversity(RECOMMENDED, FEATURES[[]]),
+        "features has no columns",
+    ),
+}
+"""Measurements, and why they are refused."""
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_cannot_be_measured(case: str) -> None:
+    use, message = WRONG[case]
+    with pytest.raises(InputError, match=message):
+        use()

@@ -12,20 +12,26 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from pandas.api.types import infer_dtype, is_list_like, is_numeric_dtype
 
+from ucfrec.arguments import require_whole
 from ucfrec.errors import InputError
 from ucfrec.results.statistics import group_auc
 from ucfrec.schema import ITEM_ID, USER_ID
 
 _RANK: Final = "rank"
 _PAIR: Final = [USER_ID, ITEM_ID]
+_KINDS: Final = {"integer": "numbers", "floating": "numbers", "string": "text"}
+"""Kinds of ids, by what pandas calls their type."""
 
 
 def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> float:
     """Share of users with a relevant item among the `k` best.
 
     Raises:
-        InputError: a column is missing, there are no rows, or `k` is below 1; as all of these.
+        InputError: a column is missing, there are no rows, ids are numbers in one frame and text
+            in the other, ranks begin below 1, or `k` is not a whole number, 1 or more; as all of
+            these.
     """
     return float(_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].any().mean())
 
@@ -80,8 +86,16 @@ def gauc(scored: pd.DataFrame) -> float:
 
     Args:
         scored: `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
+
+    Raises:
+        InputError: a column is missing, there are no rows, or `liked` is something else.
     """
     _require(scored, "scored", USER_ID, "score", "liked")
+    if other := (~scored["liked"].isin([0, 1])).sum():
+        raise InputError(
+            f"scored: liked is neither true nor false in {other:,} rows; give true and false, or 1 "
+            "and 0, and leave rows out where it is not known"
+        )
     users, owner = np.unique(scored[USER_ID].to_numpy(), return_inverse=True)
     scores, liked = scored["score"].to_numpy(np.float64), scored["liked"].to_numpy(bool)
     above, below = group_auc(scores, liked, owner, len(users))
@@ -89,8 +103,13 @@ def gauc(scored: pd.DataFrame) -> float:
 
 
 def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10) -> float:
-    """Share of the catalogue's items that are among the `k` best of a user."""
-    return float(_top(recommended, k)[ITEM_ID].nunique() / len(catalogue))
+    """Share of the catalogue's items, each counted once, that are among the `k` best of a user.
+
+    Raises:
+        InputError: the catalogue is empty or lacks a recommended item.
+    """
+    top = _top(recommended, k)
+    return float(top[ITEM_ID].nunique() / _size(catalogue, top))
 
 
 def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> float:
@@ -102,6 +121,7 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
     """
     top = _top(recommended, k)
     _require(history, "history", *_PAIR)
+    _require_comparable(top[ITEM_ID], "recommended", history[ITEM_ID], "history")
     users = history.groupby(ITEM_ID)[USER_ID].nunique()
     share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
     bits = pd.Series(-np.log2(share.to_numpy(np.float64)), top.index)
@@ -116,9 +136,10 @@ def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) ->
         features: one row per item, `item_id` as the index.
 
     Raises:
-        InputError: an item has no features.
+        InputError: an item has no features or two rows of them, or a feature is a list.
     """
     top = _top(recommended, k)
+    _require_features(features)
     places = features.index.get_indexer(pd.Index(top[ITEM_ID]))
     if (places < 0).any():
         lacking = top[ITEM_ID][places < 0]
@@ -150,10 +171,18 @@ def serendipity(
 
     Args:
         history: pairs `user_id`, `item_id` of the past, rows counted.
+        catalogue: all items; each counts once.
+
+    Raises:
+        InputError: the catalogue is empty or lacks a recommended item.
     """
-    top, n = _top(recommended, k), len(catalogue)
+    top = _top(recommended, k)
+    n = _size(catalogue, top)
     _require(relevant, "relevant", *_PAIR)
     _require(history, "history", ITEM_ID)
+    _require_comparable(top[ITEM_ID], "recommended", history[ITEM_ID], "history")
+    for name in _PAIR:
+        _require_comparable(top[name], "recommended", relevant[name], "relevant")
     popularity = history[ITEM_ID].value_counts().rank(method="dense", ascending=False)
     by_all = ((n + 1 - top[ITEM_ID].map(popularity)) / n).fillna(0.0)
     earlier = ((n + 1 - top[_RANK]) / n - by_all).clip(lower=0.0)
@@ -165,16 +194,57 @@ def serendipity(
 def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
     """The rows among the `k` best of each user."""
     _require(recommended, "recommended", *_PAIR, _RANK)
-    if k < 1:
-        raise InputError(f"k is {k}; give 1 or more")
-    return recommended[recommended[_RANK] <= k]
+    k, ranks = require_whole("k", k), recommended[_RANK]
+    if not is_numeric_dtype(ranks) or not (ranks >= 1).all():
+        lowest = ranks.min() if is_numeric_dtype(ranks) else ranks.iloc[0]
+        raise InputError(f"recommended: rank is {lowest} in a row; ranks count from 1, as numbers")
+    return recommended[ranks <= k]
 
 
 def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataFrame:
     """One row per relevant pair, with its `rank` if it is among the `k` best, else NaN."""
     _require(relevant, "relevant", *_PAIR)
     top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
+    for name in _PAIR:
+        _require_comparable(recommended[name], "recommended", relevant[name], "relevant")
     return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
+
+
+def _size(catalogue: Collection[Any], top: pd.DataFrame) -> int:
+    """Number of distinct items of a catalogue that has all the recommended ones."""
+    items = pd.Series(list(catalogue), dtype=None if len(catalogue) else object).drop_duplicates()
+    if items.empty:
+        raise InputError("catalogue is empty; give the item_ids of all items")
+    _require_comparable(top[ITEM_ID], "recommended", items, "catalogue")
+    lacking = top[ITEM_ID][~top[ITEM_ID].isin(items)]
+    if len(lacking):
+        raise InputError(
+            f"catalogue lacks {lacking.nunique():,} recommended items, such as {lacking.iloc[0]}; "
+            "give the item_ids of all items"
+        )
+    return len(items)
+
+
+def _require_features(features: pd.DataFrame) -> None:
+    """Check that features are a table with one row per item, of values that can be compared."""
+    if not features.shape[1]:
+        raise InputError("features has no columns; give one per feature, item_id being the index")
+    if not features.index.is_unique:
+        twice = features.index[features.index.duplicated()][0]
+        raise InputError(f"features has several rows of item {twice}; give one row per item")
+    for name in features:
+        if any(map(is_list_like, features[name])):
+            raise InputError(f"features: {name} holds lists; give one column per value of them")
+
+
+def _require_comparable(ids: pd.Series, of: str, others: pd.Series, of_others: str) -> None:
+    """Check that ids of two frames are of one kind: 7 and "7" are different."""
+    kinds = [_KINDS.get(infer_dtype(np.asarray(each), skipna=True), "") for each in (ids, others)]
+    if {*kinds} == {"numbers", "text"}:
+        raise InputError(
+            f"{ids.name} holds {kinds[0]} in {of}, but {kinds[1]} in {of_others}; convert one of "
+            "them with astype"
+        )
 
 
 def _require(frame: pd.DataFrame, name: str, *columns: str) -> None:

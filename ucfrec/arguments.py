@@ -1,0 +1,159 @@
+"""Checks of the arguments of the Python API: each kind of value is checked in one place."""
+
+import inspect
+import operator
+import reprlib
+from collections.abc import Callable, Iterable, Mapping
+from functools import wraps
+from numbers import Real
+from typing import Any, Final, ParamSpec, TypeVar, cast
+
+import numpy as np
+
+from ucfrec.arrays import Array
+from ucfrec.errors import InputError
+
+Check = Callable[[str, Any], Any]
+"""Takes the name of an argument and its value, and returns the value to use in its place."""
+LARGEST_SEED: Final = 2**32 - 1
+"""scikit-learn accepts no larger one."""
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
+_One = TypeVar("_One")
+_WRITTEN: Final = (str, bytes, int, float, np.generic, list, tuple, set, dict, type(None))
+"""Kinds of values that messages write out."""
+
+
+def shown(value: object) -> str:
+    """A value in a message, after "is": shortened, or of what type it is if that says more."""
+    written = isinstance(value, _WRITTEN)
+    return reprlib.repr(value) if written else f"a value of type {type(value).__name__}"
+
+
+def require_whole(name: str, value: object, least: int = 1) -> int:
+    """The whole number that `value` is; NumPy's count too.
+
+    Raises:
+        InputError: it is not a whole number, or below `least`.
+    """
+    whole = _whole(value)
+    if whole is None or whole < least:
+        raise InputError(f"{name} is {shown(value)}; give a whole number, {least} or more")
+    return whole
+
+
+def require_seed(name: str, value: object) -> int:
+    """The seed that `value` is; NumPy's integers count too.
+
+    Raises:
+        InputError: it is not a whole number, or out of range.
+    """
+    whole = _whole(value)
+    if whole is None or not 0 <= whole <= LARGEST_SEED:
+        raise InputError(
+            f"{name} is {shown(value)}; give a whole number from 0 to {LARGEST_SEED:,}"
+        )
+    return whole
+
+
+def _whole(value: object) -> int | None:
+    try:
+        return None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
+
+
+def require_number(name: str, value: object) -> float:
+    """The number that `value` is.
+
+    Raises:
+        InputError: it is not a number.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InputError(f"{name} is {shown(value)}; give a number")
+    return float(value)
+
+
+def require_ids(name: str, value: object, of: str) -> Array:
+    """The identifiers (N,) of a list, a series, an array, a set or an iterator, at least one.
+
+    Args:
+        of: what they are, e.g. "user_id".
+
+    Raises:
+        InputError: `value` is something else, is empty, or holds lists.
+    """
+    if not _is_list(value) or getattr(value, "ndim", 1) != 1:
+        raise InputError(f"{name} is {shown(value)}; give a list of {of}s")
+    ids = list(cast("Iterable[object]", value))
+    if not ids or any(map(_is_list, ids)):
+        raise InputError(f"{name} is empty or nested; give a list of {of}s, or None for all")
+    return np.asarray(ids)
+
+
+def _is_list(value: object) -> bool:
+    return isinstance(value, Iterable) and not isinstance(value, (str, bytes))
+
+
+def of_kind(what: str, *kinds: Any) -> Check:
+    """A check that a value is of one of some types.
+
+    Args:
+        what: the remedy, after "give".
+    """
+
+    def check(name: str, value: Any) -> Any:
+        if not isinstance(value, kinds):
+            raise InputError(f"{name} is {shown(value)}; give {what}")
+        return value
+
+    return check
+
+
+def several(name: str, given: object, what: str, *kinds: type[_One]) -> list[_One]:
+    """The values that are given: one, or any number of them.
+
+    Args:
+        what: one of them in words, e.g. "a Recommender".
+        kinds: types that they may have.
+
+    Raises:
+        InputError: one has another type.
+    """
+    alone = isinstance(given, kinds) or not _is_list(given)
+    values = [given] if alone else list(cast("Iterable[object]", given))
+    if wrong := [value for value in values if not isinstance(value, kinds)]:
+        raise InputError(f"{name} has {shown(wrong[0])}; give {what}")
+    return cast("list[_One]", values)
+
+
+def checked(
+    checks: Mapping[str, Check],
+) -> Callable[[Callable[_Given, _Result]], Callable[_Given, _Result]]:
+    """A decorator that checks arguments by their names, before anything else happens.
+
+    None is not checked where it is the default.
+
+    Args:
+        checks: name of an argument to its check.
+    """
+
+    def decorate(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+        signature = inspect.signature(function)
+        own = {name: checks[name] for name in signature.parameters if name in checks}
+
+        @wraps(function)
+        def call(*args: _Given.args, **named: _Given.kwargs) -> _Result:
+            try:
+                given = signature.bind(*args, **named)
+            except TypeError:
+                return function(*args, **named)  # raises the same with the function's name
+            for name, check in own.items():
+                value, default = given.arguments.get(name), signature.parameters[name].default
+                if name in given.arguments and not (value is None and default is None):
+                    given.arguments[name] = check(name, value)
+            return function(*given.args, **given.kwargs)
+
+        return call
+
+    return decorate

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from pathlib import Path
 
@@ -188,7 +188,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (EpisodeStore.open(store), {"gap_minutes": 3.0}, "is prepared already"),
         (store, {"mapping": LogMapping({"user_id": "uid"})}, "is prepared already"),
         (folder / "nothing", {}, "nothing does not exist"),
-        ([1, 2], {}, "data: a list is not a pandas DataFrame"),
+        ([1, 2], {}, r"data is \[1, 2\]; give a pandas DataFrame"),
         (log.head(0), {}, "data: the frame has no rows"),
         (log.drop(columns="item_id"), {}, "no column 'item_id'"),
         (log, {"reward": "is_click"}, "no column 'is_click'"),
@@ -385,3 +385,126 @@ def test_new_logs_bring_it_up_to_date(log: pd.DataFrame, tmp_path: Path) -> None
     assert new.recommend(log, k=2).groupby("user_id").size().max() == 2
     with pytest.raises(InputError, match=r"gone|are not newer than"):
         Recommender.load(tmp_path / "new").update(log[:10], tmp_path / "third")
+
+
+@pytest.fixture(scope="module")
+def rated(shown: pd.DataFrame) -> Recommender:
+    """A policy that is trained at once, on logs with propensities."""
+    return Recommender("item-rate").fit(shown, reward="reward", session_by="user")
+
+
+RULE = ucfrec.DecisionRule(1.0, temperature=1.0)
+LARGEST = "give a whole number from 0 to 4,294,967,295"
+WRONG: dict[str, tuple[Callable[[Recommender, pd.DataFrame], object], str]] = {
+    "seed below 0": (lambda _, log: Recommender(seed=-1), f"seed is -1; {LARGEST}"),
+    "large seed": (lambda p, log: p.ope(log, seed=2**40), f"seed is 1099511627776; {LARGEST}"),
+    "part of a seed": (lambda p, log: p.recommend(log, seed=1.5), f"seed is 1.5; {LARGEST}"),
+    "seed of a rank": (lambda p, log: p.rank(log, seed=-1), f"seed is -1; {LARGEST}"),
+    "no k": (lambda p, log: p.rank(log, k=0), "k is 0; give a whole number, 1 or more"),
+    "k as text": (lambda p, log: p.rank(log, k="3"), "k is '3'; give a whole number"),
+    "k unset": (lambda p, _: p.recommend_to_items(k=None), "k is None; give a whole number"),
+    "part of an item": (lambda p, _: p.export("no", k=2.0), "k is 2.0; give a whole number"),
+    "k of all": (lambda p, _: p.export("no", k=99), "^k is 99; the run has 30 items"),
+    "one user": (lambda p, _: p.recommend(users=7), "users is 7; give a list of user_ids"),
+    "users as text": (lambda p, _: p.recommend(users="7"), "users is '7'; give a list of user_ids"),
+    "no user": (lambda p, _: p.recommend(users=[]), "users is empty or nested; give a list"),
+    "users in a frame": (
+        lambda p, log: p.recommend(log, users=log[["user_id"]]),
+        "users is a value of type DataFrame; give a list of user_ids",
+    ),
+    "one item": (lambda p, _: p.recommend_to_items(5), "items is 5; give a list of item_ids"),
+    "items as text": (lambda p, _: p.recommend_to_items("5"), "items is '5'; give a list"),
+    "no settings": (
+        lambda *_: Recommender(settings=None),
+        "settings is None; give a list of texts",
+    ),
+    "settings of numbers": (lambda *_: Recommender(settings=[3]), "settings has 3; give texts"),
+    "policies": (lambda *_: Recommender(["dt"]), r"no policy is called \['dt'\]; choose from"),
+    "gap as text": (lambda p, log: p.fit(log, gap_minutes="30"), "gap_minutes is '30'; give a fin"),
+    "one share": (lambda p, log: p.fit(log, split=0.8), "split is 0.8; give three shares or two"),
+    "no time": (lambda p, log: p.fit(log, split=(1, "x")), "split '1,x': write shares as .* ISO"),
+    "reward of a number": (lambda p, log: p.fit(log, reward=1), "reward is 1; give text"),
+    "rewards": (lambda p, log: p.fit(log, reward=["r"]), r"reward is \['r'\]; give text"),
+    "no function": (lambda p, log: p.fit(log, on_step=3), "on_step is 3; give a function"),
+    "no path": (lambda p, log: p.fit(log, 3), "out is 3; give a path"),
+    "mapped to a number": (
+        lambda p, log: p.fit(log, mapping={"user_id": 3}),
+        "mapping is {'user_id': 3}; give a LogMapping, or a dictionary",
+    ),
+    "no run": (lambda *_: Recommender.load(None), "run is None; give a path"),
+    "no environment": (lambda p, _: p.evaluate(None), "environment is None; give the name of a"),
+    "episodes as text": (
+        lambda p, _: p.evaluate("synthetic-catalog", "50"),
+        "episodes is '50'; give a whole number, 1 or more",
+    ),
+    "behavior of a number": (
+        lambda p, _: p.evaluate("synthetic-catalog", 5, behaviors=3),
+        "behaviors has 3; give the name of a behavior",
+    ),
+    "days as text": (
+        lambda p, log: p.update(log, "no", window_days="3"),
+        "window_days is '3'; give a finite number",
+    ),
+    "endless days": (
+        lambda p, log: p.update(log, "no", window_days=np.nan),
+        "window_days is nan; give a finite number",
+    ),
+    "no logs": (lambda p, _: p.score(None), "logs is None; give a pandas DataFrame"),
+    "no frame": (lambda p, _: p.recommend(3), "histories is 3; give a pandas DataFrame"),
+    "rule as text": (lambda p, log: p.recommend(log, rule="greedy"), "rule is 'greedy'; give a De"),
+    "options as a dictionary": (
+        lambda p, log: p.ope(log, options={"discount": 0.9}),
+        r"options is {'discount': 0\.9}; give EstimateOptions",
+    ),
+    "a run's name": (lambda p, log: p.rank(log, others=["run"]), "others has 'run'; give a Rec"),
+    "nested candidates": (
+        lambda p, log: p.recommend(log, candidates=[[1], [2, 3]]),
+        "candidates is empty or nested; give a list of item_ids, or None for all",
+    ),
+}
+"""Calls, and what is said of them."""
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_arguments_are_named(rated: Recommender, shown: pd.DataFrame, case: str) -> None:
+    use, message = WRONG[case]
+    with pytest.raises(InputError, match=message):
+        use(rated, shown)
+
+
+def test_numpys_integers_and_any_list_of_ids_are_taken(
+    rated: Recommender, shown: pd.DataFrame
+) -> None:
+    one = np.int64(1)
+    assert (
+        Recommender("item-rate", seed=np.int64(3)).config == Recommender("item-rate", seed=3).config
+    )
+    drawn = rated.recommend(shown, k=np.int64(2), rule=RULE, seed=one)
+    pd.testing.assert_frame_equal(drawn, rated.recommend(shown, k=2, rule=RULE, seed=1))
+    assert rated.rank(shown, k=one, seed=one).rows[0].conditions["k"] == 1
+    assert len(rated.recommend_to_items({5}, k=one)) == 1
+    for users in ({7, 8}, iter([7, 8]), pd.Series([7, 8]), np.array([7, 8])):
+        assert set(rated.recommend(users=users, k=1).user_id) == {7, 8}
+
+
+def test_names_of_columns_one_recommender_and_one_behavior_are_enough(
+    rated: Recommender, shown: pd.DataFrame
+) -> None:
+    renamed, names = shown.rename(columns={"user_id": "uid"}), {"user_id": "uid"}
+    again = Recommender("item-rate").fit(renamed, reward="reward", session_by="user", mapping=names)
+    assert again.trained.record.fingerprint == rated.trained.record.fingerprint
+    pd.testing.assert_frame_equal(
+        rated.recommend(renamed, mapping=names), rated.recommend(shown, k=10)
+    )
+    assert len(rated.score(renamed, mapping=names)) == len(shown)
+    assert [row.method for row in rated.rank(shown, others=again)][1] == "item-rate-2"
+    measured = rated.evaluate("synthetic-catalog", 4, behaviors="random")
+    assert [row.method for row in measured] == ["item-rate", "random"]
+
+
+@pytest.mark.parametrize("kind", [str, pd.Timestamp, np.datetime64, float])
+def test_a_split_may_be_two_times(shown: pd.DataFrame, kind: Callable[[object], object]) -> None:
+    times = shown.timestamp.quantile([0.5, 0.75])
+    split = [kind(ms if kind is float else pd.Timestamp(ms, unit="ms")) for ms in times]
+    policy = Recommender("item-rate").fit(shown, session_by="user", split=split)
+    assert policy.trained.record.train_steps == len(shown) // 2

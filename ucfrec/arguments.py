@@ -1,6 +1,7 @@
 """Checks of the arguments of the Python API: each kind of value is checked in one place."""
 
 import inspect
+import math
 import operator
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
@@ -67,10 +68,10 @@ def require_number(name: str, value: object) -> float:
     """The number that `value` is.
 
     Raises:
-        InputError: it is not a number.
+        InputError: it is not a number, or not finite.
     """
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise InputError(f"{name} is {shown(value)}; give a number")
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        raise InputError(f"{name} is {shown(value)}; give a finite number")
     return float(value)
 
 

@@ -2,17 +2,19 @@
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from numbers import Real
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
 from ucfrec import schema
+from ucfrec.arguments import require_ids, shown
+from ucfrec.arrays import Array
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -20,7 +22,7 @@ from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.kept import note_dropped
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
@@ -30,6 +32,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""
+Columns = LogMapping | Mapping[str, str]
+"""What the columns of logs mean, or only the names of some."""
 _FRAME: Final = "frame.parquet"
 _KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
 _OPTIONS: Final = (
@@ -42,12 +46,52 @@ _OPTIONS: Final = (
     (r"--time-format", "LogMapping.time_format"),
     (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
     (r"--liked", "liked"),
+    (r"--k\b", "k"),
 )
 """Options of commands in messages, and what they are in Python."""
 
 
+def require_logs(name: str, value: object) -> object:
+    """Check that a value is a frame, files or a store.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if not (_are_paths(value) or isinstance(value, (pd.DataFrame, LogFiles, EpisodeStore))):
+        raise InputError(
+            f"{name} is {shown(value)}; give a pandas DataFrame with one row per interaction, or "
+            "files, folders or globs"
+        )
+    return value
+
+
+def split_given(name: str, value: object) -> tuple[float, ...]:
+    """A split as `PrepareOptions.split` has it, of shares or of times in any form.
+
+    Raises:
+        InputError: `value` is neither.
+    """
+    if not isinstance(value, Iterable):
+        raise InputError(f"{name} is {shown(value)}; give three shares or two times")
+    parts = [value] if isinstance(value, str) else list(value)
+    if all(isinstance(part, Real) for part in parts):
+        return tuple(float(part) for part in parts)
+    return parse_split(",".join(map(str, parts)))
+
+
+def _mapping(given: Columns | None) -> LogMapping:
+    if given is None or isinstance(given, LogMapping):
+        return given or LogMapping()
+    if not isinstance(given, Mapping) or not all(isinstance(each, str) for each in given.values()):
+        raise InputError(
+            f"mapping is {shown(given)}; give a LogMapping, or a dictionary of log columns to "
+            "columns of the data"
+        )
+    return LogMapping(given)
+
+
 def store_given(
-    data: EpisodeStore | Logs, mapping: LogMapping | None, scratch: Path, options: Mapping[str, Any]
+    data: EpisodeStore | Logs, mapping: Columns | None, scratch: Path, options: Mapping[str, Any]
 ) -> EpisodeStore:
     """The store that `data` is, or one prepared from the logs in it.
 
@@ -65,7 +109,7 @@ def store_given(
         if options or mapping is not None:
             raise InputError(f"{data} is prepared already; prepare its logs with other options")
         return data if isinstance(data, EpisodeStore) else EpisodeStore.open(str(data))
-    given, dataset = mapping or LogMapping(), options.get("dataset", "generic")
+    given, dataset = _mapping(mapping), options.get("dataset", "generic")
     if isinstance(data, LogFiles):
         files, given, dataset = data.files, given.over(data.mapping), data.dataset
     elif _are_paths(data):
@@ -83,7 +127,7 @@ def store_given(
 
 @contextmanager
 def logs_given(
-    trained: TrainedPolicy, logs: Logs | None, mapping: LogMapping | None, keep_unknown: bool
+    trained: TrainedPolicy, logs: Logs | None, mapping: Columns | None, keep_unknown: bool
 ) -> Iterator[LoggedSessions]:
     """Later logs of a policy, or None for the test split of its store.
 
@@ -112,7 +156,7 @@ def logs_given(
 
 @contextmanager
 def files_given(
-    trained: TrainedPolicy, logs: Logs, mapping: LogMapping | None
+    trained: TrainedPolicy, logs: Logs, mapping: Columns | None
 ) -> Iterator[tuple[tuple[Path, ...], LogMapping, Path | None]]:
     """Later logs of a policy as files: the files, the mapping, and the file of a frame, which lasts
     as long as the block; None for files.
@@ -120,7 +164,7 @@ def files_given(
     Raises:
         InputError: a path is missing, or the frame cannot be used.
     """
-    given = mapping or LogMapping()
+    given = _mapping(mapping)
     if isinstance(logs, LogFiles):
         yield logs.files, given.over(logs.mapping), None
     elif _are_paths(logs):
@@ -134,23 +178,25 @@ def files_given(
 def histories_given(
     trained: TrainedPolicy,
     frame: pd.DataFrame | None,
-    mapping: LogMapping | None,
-    users: Sequence[Any] | None,
+    mapping: Columns | None,
+    users: Iterable[Any] | None,
 ) -> Iterator[Histories]:
     """Histories of users: of a frame, or None for what the store of the run has of them.
 
     Raises:
-        InputError: the frame cannot be used, the store is gone, or a user has no rows.
+        InputError: the frame cannot be used, the store is gone, `users` is no list of ids, or one
+            of them has no rows.
     """
     stored = frame is None
+    wanted = None if users is None else require_ids("users", users, schema.USER_ID)
     if frame is None:
-        frame = _stored(trained, users)
+        frame = _stored(trained, wanted)
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
-    histories = histories_of_frame(trained, frame, mapping or LogMapping(), stored)
-    return histories if users is None else of_some_users(histories, users)
+    histories = histories_of_frame(trained, frame, _mapping(mapping), stored)
+    return histories if wanted is None else of_some_users(histories, wanted.tolist())
 
 
-def _stored(trained: TrainedPolicy, users: Sequence[Any] | None) -> pd.DataFrame:
+def _stored(trained: TrainedPolicy, users: Array | None) -> pd.DataFrame:
     """The rows of the run's store, of some users or all."""
     store = store_of(trained.folder, trained.record)
     if store is None:
@@ -159,7 +205,7 @@ def _stored(trained: TrainedPolicy, users: Sequence[Any] | None) -> pd.DataFrame
             "histories of the users as a frame"
         )
     if users is not None:
-        numbers = trained.users.numbers(np.asarray(list(users)))
+        numbers = trained.users.numbers(users)
         kept = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
         if not kept.any():
             raise InputError(f"none of the {len(users):,} users is in the store of the run")

@@ -4,16 +4,25 @@ import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from datetime import date
 from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arguments import (
+    checked,
+    of_kind,
+    require_number,
+    require_seed,
+    require_whole,
+    several,
+)
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
 from ucfrec.evaluation.environment import Environment
@@ -27,17 +36,20 @@ from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.given_data import (
+    Columns,
     Logs,
     files_given,
     histories_given,
     in_words_of_python,
     logs_given,
+    require_logs,
+    split_given,
     store_given,
 )
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.kept import DAY_MS
-from ucfrec.logs.mapping import LogFiles, LogMapping
+from ucfrec.logs.mapping import LogFiles
 from ucfrec.off_policy.evaluate import (
     DEFAULTS,
     EstimateOptions,
@@ -61,6 +73,26 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
+_TEXT: Final = of_kind("text", str)
+_PATH: Final = of_kind("a path", str, Path)
+_FUNCTION: Final = of_kind("a function", Callable)
+_checked: Final = checked(
+    {
+        **dict.fromkeys(("k", "episodes"), require_whole),
+        "seed": require_seed,
+        **dict.fromkeys(("gap_minutes", "window_days"), require_number),
+        **dict.fromkeys(("reward", "session_by", "dataset", "screen", "liked"), _TEXT),
+        **dict.fromkeys(("out", "run", "folder", "file"), _PATH),
+        **dict.fromkeys(("on_step", "on_validation"), _FUNCTION),
+        **dict.fromkeys(("data", "logs"), require_logs),
+        "split": split_given,
+        "histories": of_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
+        "rule": of_kind("a DecisionRule", DecisionRule),
+        "options": of_kind("EstimateOptions", EstimateOptions),
+        "environment": of_kind("the name of a simulator or an Environment", str, Environment),
+    }
+)
+"""Decorator of methods: the check of each argument by its name."""
 _FRAME = "a frame"
 """What a data frame is called in model cards."""
 
@@ -133,6 +165,7 @@ class Recommender:
         self.policy, self.settings, self.seed = (given[name] for name in _OWN)
         return self
 
+    @_checked
     def fit(
         self,
         data: EpisodeStore | Logs,
@@ -141,8 +174,8 @@ class Recommender:
         reward: str | None = None,
         session_by: str | None = None,
         gap_minutes: float | None = None,
-        split: tuple[float, ...] | None = None,
-        mapping: LogMapping | None = None,
+        split: Sequence[float | str | date] | None = None,
+        mapping: Columns | None = None,
         dataset: str | None = None,
         screen: str | None = None,
         refit: bool = False,
@@ -160,8 +193,10 @@ class Recommender:
             reward: logs only: SQL expression over the feedback columns; see `PrepareOptions`.
             session_by: logs only: "session_id", "gap" or "user"; see `PrepareOptions`.
             gap_minutes: logs only: with "gap", a longer pause (minutes) starts a new session (30).
-            split: logs only: shares of training, validation and test (0.8, 0.1, 0.1).
-            mapping: logs only: names of the columns, and feature tables.
+            split: logs only: shares of training, validation and test (0.8, 0.1, 0.1), or the two
+                times at which validation and test begin: ISO text, dates or milliseconds (UTC).
+            mapping: logs only: names of the columns, and feature tables; a dictionary of names is
+                enough.
             dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
             screen: "drop" or "copies", as for `ucfrec train --screen`.
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
@@ -225,18 +260,19 @@ class Recommender:
             return trained
         return TrainedPolicy.load(run, split=True)
 
+    @_checked
     def recommend(
         self,
         histories: pd.DataFrame | None = None,
         k: int = 10,
         *,
-        users: Sequence[Any] | None = None,
+        users: Iterable[Any] | None = None,
         filter_seen: bool = True,
-        candidates: Sequence[Any] | None = None,
+        candidates: Iterable[Any] | None = None,
         skip_unknown: bool = False,
         rule: DecisionRule | None = None,
         seed: int = 0,
-        mapping: LogMapping | None = None,
+        mapping: Columns | None = None,
     ) -> pd.DataFrame:
         """The `k` best next items of every user; nothing is written to disk.
 
@@ -286,7 +322,8 @@ class Recommender:
         with in_words_of_python():
             return pd.concat(frames, ignore_index=True)
 
-    def recommend_to_items(self, items: Sequence[Any] | None = None, k: int = 10) -> pd.DataFrame:
+    @_checked
+    def recommend_to_items(self, items: Iterable[Any] | None = None, k: int = 10) -> pd.DataFrame:
         """The `k` most similar other items of each item, by the cosine of the policy's vectors.
 
         Args:
@@ -301,24 +338,25 @@ class Recommender:
         """
         return similar_items(self.trained, items, k)
 
+    @_checked
     def rank(
         self,
         logs: Logs | None = None,
         k: int = 10,
         *,
-        others: Iterable["Recommender"] = (),
+        others: "Recommender | Iterable[Recommender]" = (),
         rule: DecisionRule | None = None,
         filter_seen: bool = True,
         liked: str | None = None,
         seed: int = 0,
-        mapping: LogMapping | None = None,
+        mapping: Columns | None = None,
     ) -> Ranking:
         """How this policy, others and baselines rank what users were shown later: `ucfrec rank`.
 
         Args:
             logs: later logs, as for `fit`; None for the test split of the store.
             k: items recommended at each step.
-            others: policies trained on the same store, ranked beside this one.
+            others: policies trained on the same store, ranked beside this one; or only one.
             rule: the decision rule of this policy; None for the run's own.
             filter_seen: exclude items that the user has seen before a step.
             liked: truth value over the column reward, such as "reward >= 4"; None for at least 60%
@@ -330,7 +368,8 @@ class Recommender:
             InputError: the recommender is not trained, the logs cannot be used, or another policy
                 has another catalogue.
         """
-        trained, *rest = (each._evaluated(logs) for each in (self, *others))
+        beside = several("others", others, "a Recommender", Recommender)
+        trained, *rest = (each._evaluated(logs) for each in (self, *beside))
         all_trained = [trained, *rest]
         require_one_catalogue(all_trained)
         with in_words_of_python():
@@ -349,6 +388,7 @@ class Recommender:
         card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
         return Ranking(rows, said)
 
+    @_checked
     def ope(
         self,
         logs: Logs | None = None,
@@ -356,7 +396,7 @@ class Recommender:
         rule: DecisionRule | None = None,
         options: EstimateOptions = DEFAULTS,
         seed: int = 0,
-        mapping: LogMapping | None = None,
+        mapping: Columns | None = None,
     ) -> OffPolicyReport:
         """Estimate the return of a session from logs alone, with a verdict: `ucfrec ope`.
 
@@ -379,13 +419,14 @@ class Recommender:
         card_of_estimates(trained.folder, [_named(logs)], report)
         return report
 
+    @_checked
     def evaluate(
         self,
         environment: str | Environment,
         episodes: int = 1000,
         *,
         rule: DecisionRule | None = None,
-        behaviors: Sequence[str] = (),
+        behaviors: Iterable[str] = (),
         seed: int = 0,
     ) -> Evaluation:
         """Measure the return in a simulator: `ucfrec evaluate`.
@@ -401,16 +442,18 @@ class Recommender:
             InputError: the recommender is not trained, or the environment does not fit it.
         """
         trained = self.trained
+        beside = several("behaviors", behaviors, "the name of a behavior", str)
         simulated = Environment(environment) if isinstance(environment, str) else environment
         about = episodes, seed
         own = evaluate_policy(simulated, trained, trained.name, *about, rule)
         own = replace(own, checkpoint="best")
         card_of_evaluation(trained.folder, own)
-        others = [evaluate_behavior(simulated, name, *about) for name in behaviors]
+        others = [evaluate_behavior(simulated, name, *about) for name in beside]
         return Evaluation([own, *others])
 
+    @_checked
     def score(
-        self, logs: Logs, *, rule: DecisionRule | None = None, mapping: LogMapping | None = None
+        self, logs: Logs, *, rule: DecisionRule | None = None, mapping: Columns | None = None
     ) -> pd.DataFrame:
         """The policy's probability of every logged choice: `ucfrec score`.
 
@@ -429,6 +472,7 @@ class Recommender:
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
             return pd.concat(score(trained, logged, rule), ignore_index=True)
 
+    @_checked
     def update(
         self,
         logs: Logs,
@@ -436,7 +480,7 @@ class Recommender:
         *,
         window_days: float | None = None,
         refit: bool = True,
-        mapping: LogMapping | None = None,
+        mapping: Columns | None = None,
     ) -> Self:
         """Bring the policy up to date with new logs: `ucfrec update`.
 
@@ -465,6 +509,7 @@ class Recommender:
         write_card(Path(out))
         return self.load(out)
 
+    @_checked
     def export(
         self, folder: Path | str, k: int | None = None, *, rule: DecisionRule | None = None
     ) -> Exported:
@@ -482,6 +527,7 @@ class Recommender:
         with in_words_of_python():
             return export(self.trained, Path(folder), rule=rule, k=k)
 
+    @_checked
     def report(
         self,
         file: Path | str,
@@ -512,6 +558,7 @@ class Recommender:
             write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
+    @_checked
     def save(self, folder: Path | str) -> None:
         """Copy the run to a new folder, which `load` and the command line can read.
 
@@ -523,6 +570,7 @@ class Recommender:
             shutil.copytree(run, scratch, dirs_exist_ok=True)
 
     @classmethod
+    @_checked
     def load(cls, run: Path | str) -> Self:
         """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`.
 

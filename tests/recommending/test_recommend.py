@@ -303,7 +303,7 @@ def test_seconds_need_a_mapping_here_and_in_prepare(
 
 
 WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
-    "a list": (lambda log: [1, 2], "histories: a list is not a pandas DataFrame"),
+    "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
     "no user": (lambda log: log.drop(columns="user_id"), "no column 'user_id'"),
     "no item": (lambda log: log.rename(columns={"item_id": "item"}), "no column 'item_id'"),

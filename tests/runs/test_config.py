@@ -182,7 +182,9 @@ def test_a_wrong_file_policy_or_seed_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no policy is called 'ufc'"):
         resolve_config("ufc")
     for seed in (-1, 2**32):
-        with pytest.raises(InputError, match=f"^seed is {seed}; it must be a whole number from 0"):
+        with pytest.raises(
+            InputError, match=f"^seed is {seed}; give a whole number from 0 to 4,294,967,295"
+        ):
             resolve_config("ucf", seed=seed)
 
 

@@ -52,7 +52,7 @@ def policy_class(name: str) -> "type[SequencePolicy]":
         InputError: no policy has this name, it cannot be imported, or it is not a `SequencePolicy`
             whose `Config` is a table of settings.
     """
-    if name in BUILT_IN:
+    if isinstance(name, str) and name in BUILT_IN:
         module, _, title = BUILT_IN[name].partition(":")
         built_in: type[SequencePolicy] = getattr(import_module(f"ucfrec.policies.{module}"), title)
         return built_in

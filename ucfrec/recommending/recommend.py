@@ -14,6 +14,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
+from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
@@ -38,7 +39,7 @@ def recommend(
     *,
     rule: DecisionRule | None = None,
     filter_seen: bool = True,
-    candidates: Sequence[Any] | None = None,
+    candidates: Iterable[Any] | None = None,
     skip_unknown: bool = False,
     new_session: bool = False,
     seed: int = 0,
@@ -78,7 +79,7 @@ def recommend(
             their batch is read.
     """
     scorer = trained.item_scorer(rule)
-    require_whole(k)
+    k = require_whole("k", k)
     known_ids = trained.items
     excluded = None if candidates is None else _all_but(known_ids, candidates)
 
@@ -99,16 +100,6 @@ def _numbered(
         if filter_seen:
             seen = known_ids.numbers(batch.seen_ids)
         yield replace(batch, item_ids=known, seen_ids=seen)
-
-
-def require_whole(k: int) -> None:
-    """Check the number of items of a user.
-
-    Raises:
-        InputError: it is not a whole number, or below 1.
-    """
-    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
-        raise InputError(f"k is {k!r}; give a whole number, 1 or more")
 
 
 @dataclass(frozen=True)
@@ -214,13 +205,9 @@ def best_of(
     return items, values.masked_fill(none, -torch.inf), propensities
 
 
-def _all_but(index: IdLookup, candidates: Sequence[Any]) -> Tensor:
+def _all_but(index: IdLookup, candidates: Iterable[Any]) -> Tensor:
     """(n_items,) true for the items that are not among the candidates."""
-    if isinstance(candidates, str) or not pd.api.types.is_list_like(candidates):
-        raise InputError(f"candidates is {candidates!r}; give a list of item_ids")
-    ids = np.asarray(list(candidates))
-    if ids.ndim != 1 or len(ids) == 0:
-        raise InputError("candidates is empty or nested; give a list of item_ids, or None for all")
+    ids = require_ids("candidates", candidates, schema.ITEM_ID)
     excluded = torch.ones(len(index), dtype=torch.bool)
     excluded[torch.from_numpy(candidate_numbers(index, ids))] = False
     return excluded

@@ -1,6 +1,6 @@
 """Items that a trained policy sees as similar to others."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
+from ucfrec.arguments import require_ids, require_whole
 from ucfrec.errors import InputError
 from ucfrec.recommending.recommend import RANK, SCORE
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -20,7 +21,7 @@ _ITEMS_AT_ONCE = 1024
 
 
 def similar_items(
-    trained: TrainedPolicy, items: Sequence[Any] | None = None, k: int = 10
+    trained: TrainedPolicy, items: Iterable[Any] | None = None, k: int = 10
 ) -> pd.DataFrame:
     """The `k` most similar other items of each item, by the cosine of the items' vectors.
 
@@ -34,21 +35,19 @@ def similar_items(
         `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
 
     Raises:
-        InputError: the policy's actions are vectors, an item is not known, or `k` is below 1.
+        InputError: the policy's actions are vectors, an item is not known, or `items` or `k` is
+            something else.
     """
-    if k < 1:
-        raise InputError(f"k is {k}; give 1 or more")
+    k = require_whole("k", k)
+    given = None if items is None else require_ids("items", items, schema.ITEM_ID)
     vectors = F.normalize(_vectors(trained), dim=1)
     ids = trained.item_ids
     assert ids is not None
-    if items is not None and len(items) == 0:
-        raise InputError("items is empty; give a list of item_ids, or None for all")
-    wanted = np.arange(len(ids)) if items is None else trained.items.numbers(np.asarray(items))
-    if (wanted < 0).any():
-        first = np.asarray(items)[wanted < 0][0]
+    wanted = np.arange(len(ids)) if given is None else trained.items.numbers(given)
+    if given is not None and (wanted < 0).any():
         raise InputError(
             f"{int((wanted < 0).sum())} of {len(wanted)} items are not in the training data, such "
-            f"as {first}; leave them out"
+            f"as {given[wanted < 0][0]}; leave them out"
         )
     k = min(k, len(ids) - 1)
     frames = []

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arguments import require_whole
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
@@ -14,7 +15,7 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import Histories, columns_used, reward_of, session_by
-from ucfrec.recommending.recommend import recommend, require_whole
+from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -55,7 +56,7 @@ def recommend_with_spark(
     """
     rule = rule or trained.rule
     trained.item_scorer(rule)
-    require_whole(k)
+    require_whole("k", k)
     columns = columns_used(trained, mapping)
     given = GivenLog(files, columns, reward_of(trained), session_by(trained))
     with ExitStack() as stack:

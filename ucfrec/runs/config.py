@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from ucfrec.arguments import LARGEST_SEED, require_seed, several, shown
 from ucfrec.choosing.choice import RuleConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -41,8 +42,7 @@ class Config:
     """The copies of training episodes."""
     rule: RuleConfig = field(default_factory=RuleConfig)
     """The choice of the decision rule."""
-    # scikit-learn accepts no larger seed.
-    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
     """Seed of every random draw."""
 
 
@@ -107,7 +107,7 @@ class _Setting(NamedTuple):
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
-    policy_type = policy_class(policy_name)
+    policy_type, seed = policy_class(policy_name), require_seed("seed", seed)
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not policy_type.augmented:
         tables["augment"]["copies"] = 0
@@ -138,9 +138,9 @@ def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> "Iterator[_
 
 
 def _from_texts(texts: Sequence[str]) -> Iterator[_Setting]:
-    if isinstance(texts, str):
-        raise InputError(f"settings are the text {texts!r}; give a list of texts, or a mapping")
-    for text in texts:
+    if isinstance(texts, str) or not isinstance(texts, Iterable):
+        raise InputError(f"settings is {shown(texts)}; give a list of texts, or a mapping")
+    for text in several("settings", texts, "texts table.field=value", str):
         name, separator, value = text.partition("=")
         table, dot, key = name.strip().partition(".")
         source = f"--set {text}"

@@ -41,7 +41,9 @@ def test_a_notebook_shows_rows_and_warnings_and_no_markup_of_names() -> None:
     assert "&lt;b&gt;" in html
     assert "<b>" not in html
     assert "mind &lt;this&gt;" in html
-    assert "popular" in repr(Measured(ROWS))
+    shown = repr(Measured(ROWS, ["mind <this>"])).splitlines()
+    assert "popular" in shown[-2]
+    assert shown[-1] == "warning: mind <this>"
 
 
 def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
@@ -50,8 +52,9 @@ def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
     assert axes.lines[0].get_xdata().tolist() == [1.0, 1.5]  # type: ignore[union-attr]
     again = Measured(ROWS).plot("S", ax=axes)
     assert again is axes
-    with pytest.raises(InputError, match="no row has the metric 'T'; they have R, S"):
-        Measured(ROWS).plot("T")
+    for name in ("T", "method", "k"):
+        with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
+            Measured(ROWS).plot(name)
 
 
 def test_a_chart_needs_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 from typing import Annotated
 
@@ -105,9 +104,9 @@ class OffPolicyReport(ResultTable):
     step_rows: Sequence[ResultRow] = ()
     """Its result rows, one for each estimator."""
 
-    def _repr_html_(self) -> str:
-        said = [f"verdict: {self.verdict.headline}", *(f"warning: {w}" for w in self.warnings)]
-        return super()._repr_html_() + "".join(f"<p>{escape(text)}</p>" for text in said)
+    def _said(self) -> list[str]:
+        said = [f"warning: {text}" for text in self.warnings]
+        return [*said, f"verdict: {self.verdict.headline}"]
 
 
 @dataclass(frozen=True)

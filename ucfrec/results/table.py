@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -31,7 +32,11 @@ class ResultTable:
         return len(self.rows)
 
     def __repr__(self) -> str:
-        return self._table().to_string(index=False)
+        return "\n".join([self._table().to_string(index=False), *self._said()])
+
+    def _said(self) -> list[str]:
+        """What to know of the rows, shown below them."""
+        return []
 
     def to_frame(self) -> "pd.DataFrame":
         """One row per method: its metrics, each with the ends of its 95% interval where it has one
@@ -52,8 +57,8 @@ class ResultTable:
             InputError: matplotlib is not installed, or no row has the metric.
         """
         metric, frame = metric or self.rows[0].metric, self.to_frame()
-        if metric not in frame:
-            known = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        known = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        if metric not in known:
             raise InputError(f"no row has the metric {metric!r}; they have {', '.join(known)}")
         frame = frame[frame[metric].notna()].iloc[::-1]
         axes = new_axes() if ax is None else ax
@@ -77,7 +82,8 @@ class ResultTable:
         return frame[["method", *(name for name in columns if name in frame)]]
 
     def _repr_html_(self) -> str:
-        return str(self._table().to_html(index=False, float_format="{:.4g}".format, na_rep="–"))
+        table = self._table().to_html(index=False, float_format="{:.4g}".format, na_rep="–")
+        return str(table) + "".join(f"<p>{escape(text)}</p>" for text in self._said())
 
 
 def _line(row: ResultRow) -> dict[str, Any]:
@@ -102,11 +108,8 @@ class Measured(ResultTable):
     warnings: Sequence[str] = ()
     """What makes the numbers less reliable."""
 
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        said = "".join(f"<p>warning: {escape(text)}</p>" for text in self.warnings)
-        return super()._repr_html_() + said
+    def _said(self) -> list[str]:
+        return [f"warning: {text}" for text in self.warnings]
 
 
 class Evaluation(Measured):

@@ -178,7 +178,7 @@ def _setting_error(
     at = first["loc"][0]
     key = known[at] if isinstance(at, int) and at < len(known) else str(at)
     if key not in known:
-        message = f"{name or 'it'} has no field {key!r}; {nearest(key, known)}"
+        message = f"{name or table.__name__} has no field {key!r}; {nearest(key, known)}"
         return SettingError(message, _key(name, key))
     info = _fields(table)[key]
     allowed = _allowed(info.annotation, info.metadata)

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ import ucfrec
 from tests.recommending.test_recommend import SMALL, random_log
 from ucfrec import UCF, EpisodeStore, Recommender
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.off_policy.selection import choose
@@ -180,6 +181,30 @@ def test_rows_that_are_left_out_are_warned_of(log: pd.DataFrame, tmp_path: Path)
         Recommender("dt", settings=SMALL).fit(holes, tmp_path / "run")
 
 
+@pytest.mark.parametrize(
+    ("spoil", "options", "says"),
+    [
+        (lambda log: pd.concat([log, log]), {}, r"3,000 rows \(50%\) are dropped: repeats user"),
+        (
+            lambda log: log,
+            {"mapping": LogMapping(where="item_id <> 3")},
+            r"1,500 rows were excluded \(\d+: does not fulfil LogMapping.where\)",
+        ),
+    ],
+)
+def test_rows_are_warned_of_once_at_the_users_line(
+    log: pd.DataFrame, spoil: Callable[..., pd.DataFrame], options: dict[str, Any], says: str
+) -> None:
+    data = spoil(log)
+    with pytest.warns(InputNote, match=says) as noted:
+        policy = Recommender("item-rate").fit(data, **options)
+    assert [each.filename for each in noted if issubclass(each.category, InputNote)] == [__file__]
+    if not options:
+        with pytest.warns(InputNote, match=says) as noted:
+            policy.score(data)
+        assert len([each for each in noted if issubclass(each.category, InputNote)]) == 1
+
+
 def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.DataFrame) -> None:
     policy = Recommender("dt", settings=SMALL)
     store = folder / "store"
@@ -193,6 +218,9 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (log.drop(columns="item_id"), {}, "no column 'item_id'"),
         (log, {"reward": "is_click"}, "no column 'is_click'"),
         (log, {"session_by": "day"}, "session_by is 'day'"),
+        (log, {"session_by": "user", "gap_minutes": 3}, "gap_minutes is 3, but sessions are those"),
+        (log.assign(session_id=1), {"gap_minutes": 3}, "session_by='session_id'; leave it out"),
+        (log, {"dataset": "movielens"}, "dataset is 'movielens', which is of files"),
         (log.assign(reward=1.0), {}, "nothing to learn"),
     ):
         with pytest.raises(InputError, match=message):
@@ -272,6 +300,8 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
         shown.groupby("user_id").reward.sum().mean()
     )
     assert report.verdict.headline in report._repr_html_()
+    assert repr(report).endswith(f"verdict: {report.verdict.headline}")
+    assert f"warning: {report.warnings[0]}\n" in repr(report)
     rule = ucfrec.DecisionRule(1.0, temperature=1.0)
     other = clicked.ope(later, rule=rule)
     choice = choose({"own": report, "drawn": other}, 0)
@@ -284,6 +314,14 @@ def test_the_whole_job_in_python(clicked: Recommender, shown: pd.DataFrame, tmp_
     page = clicked.report(tmp_path / "report.html", [report])
     text = page.read_text(encoding="utf-8")
     assert "dt" in text
+    report.save(tmp_path / "ope.json")
+    for given in (report, str(tmp_path / "ope.json")):
+        assert clicked.report(tmp_path / "again.html", given).is_file()
+    for given in (ranking, [ranking]):
+        with pytest.raises(InputError, match="type Ranking; give what evaluate or ope returned"):
+            clicked.report(tmp_path / "no.html", given)
+    with pytest.raises(InputError, match="is a folder; name a file, e"):
+        clicked.report(tmp_path)
     card = (clicked.run / "MODEL_CARD.md").read_text(encoding="utf-8")
     assert "ucfrec rank" in card
     assert "ucfrec ope" in card
@@ -360,6 +398,19 @@ def test_it_follows_scikit_learns_conventions(fitted: Recommender) -> None:
     loaded = Recommender.load(fitted.run)
     assert clone(loaded).config == fitted.config
     assert policy.set_params(policy="bc", settings={}).config.policy_name == "bc"
+
+
+def test_another_policy_keeps_the_settings_that_it_has(fitted: Recommender) -> None:
+    loaded = Recommender.load(fitted.run)
+    assert loaded.config == fitted.config
+    loaded.set_params(policy="bc")
+    assert loaded.config.policy_name == "bc"
+    assert loaded.config.train == fitted.config.train
+    assert loaded.config.policy.dim == fitted.config.policy.dim
+    layered = Recommender("dt", settings=["policy.layers=2", "policy.dim=8"])
+    assert layered.set_params(policy="bc").config.policy.dim == 8
+    with pytest.raises(InputError, match="policy has no field 'layers'"):
+        Recommender("dt").set_params(policy="bc", policy__layers=2)
 
 
 def test_evaluated_in_a_simulator(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Data as callers of the Python API give it: frames, files, stores."""
 
 import re
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -23,6 +24,7 @@ from ucfrec.logs.histories import log_table
 from ucfrec.logs.kept import note_dropped
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
+from ucfrec.logs.summary import MANY
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
@@ -47,8 +49,12 @@ _OPTIONS: Final = (
     (r"--(where|earliest|partitions|column)", r"LogMapping.\1"),
     (r"--liked", "liked"),
     (r"--k\b", "k"),
+    (r" with --out", ""),
+    (r"--policy ([\w-]+)", r"policy='\1'"),
 )
 """Options of commands in messages, and what they are in Python."""
+_NOT_THE_USERS: Final = re.compile(r"(ucfrec|contextlib)(\.|$)")
+"""Modules whose lines a warning does not name."""
 
 
 def require_logs(name: str, value: object) -> object:
@@ -110,6 +116,8 @@ def store_given(
             raise InputError(f"{data} is prepared already; prepare its logs with other options")
         return data if isinstance(data, EpisodeStore) else EpisodeStore.open(str(data))
     given, dataset = _mapping(mapping), options.get("dataset", "generic")
+    if "dataset" in options and not _are_paths(data):
+        raise InputError(f"dataset is {dataset!r}, which is of files; leave it out for other data")
     if isinstance(data, LogFiles):
         files, given, dataset = data.files, given.over(data.mapping), data.dataset
     elif _are_paths(data):
@@ -119,10 +127,30 @@ def store_given(
         files = (_written(data, scratch),)
     with in_words_of_python(files[0] if files[0].parent == scratch else None):
         named = PrepareOptions(**{**options, "dataset": dataset})
+        _require_gap(options, named.session_by or given.session_by)
         report = prepare(files, given, scratch / "store", named)
+        _require_gap(options, report["session_by"])
+        note_dropped("", _not_noted(report), report["rows_read"], fine=())
     (scratch / _FRAME).unlink(missing_ok=True)
-    note_dropped("", report["dropped"], report["rows_read"], fine=())
     return EpisodeStore.open(scratch / "store")
+
+
+def _require_gap(options: Mapping[str, Any], session_by: str | None) -> None:
+    """Refuse a gap that would count for nothing; None is for what the columns decide later."""
+    if "gap_minutes" in options and session_by not in (None, "gap"):
+        raise InputError(
+            f"gap_minutes is {options['gap_minutes']:g}, but sessions are those of "
+            f"session_by={session_by!r}; leave it out, or give session_by='gap'"
+        )
+
+
+def _not_noted(report: Mapping[str, Any]) -> dict[str, int]:
+    """Rows that a report counts as dropped, by reason, without the reasons that `prepare` notes."""
+    dropped: Mapping[str, int] = report["dropped"]
+    wanted = report["rows_read"] - dropped["left_out"]
+    return {
+        reason: n for reason, n in dropped.items() if n <= MANY * wanted or reason == "left_out"
+    }
 
 
 @contextmanager
@@ -150,7 +178,7 @@ def logs_given(
         with in_words_of_python(frame):
             read = logged_sessions(trained, files, given, keep_unknown)
             logged = stack.enter_context(read)
-        note_dropped("", logged.report["dropped"], logged.report["rows_read"])
+            note_dropped("", _not_noted(logged.report), logged.report["rows_read"])
         yield logged
 
 
@@ -251,4 +279,12 @@ def in_words_of_python(file: Path | None = None) -> Iterator[None]:
         except InputError as error:
             raise InputError(translated(error)) from None
     for each in noted:
-        warnings.warn(each.category(translated(each.message)), stacklevel=5)
+        warnings.warn(each.category(translated(each.message)), stacklevel=_level_of_caller())
+
+
+def _level_of_caller() -> int:
+    """The `stacklevel` at which a warning of the calling function names the user's line."""
+    level, frame = 0, sys._getframe()
+    while frame.f_back is not None and _NOT_THE_USERS.match(frame.f_globals.get("__name__", "")):
+        level, frame = level + 1, frame.f_back
+    return level

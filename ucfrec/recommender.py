@@ -6,7 +6,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from datetime import date
 from html import escape
 from pathlib import Path
@@ -58,6 +58,7 @@ from ucfrec.off_policy.evaluate import (
 )
 from ucfrec.off_policy.score import score
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import without_folders
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
@@ -66,7 +67,7 @@ from ucfrec.reporting.cards import card_of_estimates, card_of_evaluation, card_o
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
-from ucfrec.runs.config import TABLES, resolve_config, settings_given
+from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -152,11 +153,20 @@ class Recommender:
     def set_params(self, **params: Any) -> Self:
         """Change arguments of the constructor, or settings as `train__steps=200`, before `fit`.
 
+        Another policy keeps the settings that it has too.
+
         Raises:
             InputError: a policy or setting is unknown or out of range; nothing is changed then.
         """
         own = {name: params.pop(name) for name in _OWN if name in params}
         given = {name: own.get(name, getattr(self, name)) for name in _OWN}
+        if "settings" not in own and given["policy"] != self.policy:
+            known = {f"policy.{each.name}" for each in fields(policy_class(given["policy"]).Config)}
+            given["settings"] = {
+                name: value
+                for name, value in settings_given(self.settings).items()
+                if name in known or not name.startswith("policy.")
+            }
         if params:
             new = {name.replace("__", ".", 1): value for name, value in params.items()}
             # Texts `table.field=value` come first, so that the new values count.
@@ -221,7 +231,8 @@ class Recommender:
             watchers = Callbacks(on_step, on_validation)
             record = train_screened(store, out, self.config, screen, callbacks=watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
-                warnings.warn(InputNote(warning), stacklevel=2)
+                with in_words_of_python():
+                    warnings.warn(InputNote(warning), stacklevel=2)
             trained = _completed(store, out, refit)
             kept = _Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
         self._trained, self._scratch = trained, kept
@@ -531,31 +542,36 @@ class Recommender:
     def report(
         self,
         file: Path | str,
-        results: Iterable[ResultTable | Path | str] = (),
+        results: ResultTable | Path | str | Iterable[ResultTable | Path | str] = (),
         items: Path | str | None = None,
     ) -> Path:
         """Write one HTML page about the training and results: `ucfrec report`.
 
         Args:
             file: HTML file to write.
-            results: what `evaluate` and `ope` returned, or files of it.
+            results: what `evaluate` and `ope` returned, or files of it; one or several.
             items: file with item features to show beside sample recommendations.
 
         Returns:
             The file.
 
         Raises:
-            InputError: the recommender is not trained, or a file cannot be used.
+            InputError: the recommender is not trained, or a file or result cannot be used.
         """
+        what = "what evaluate or ope returned, or files of it"
+        kinds = (Evaluation, OffPolicyReport, Path, str)
+        listed = [results] if isinstance(results, ResultTable) else results
+        given: list[ResultTable | Path | str] = several("results", listed, what, *kinds)
         with tempfile.TemporaryDirectory() as scratch:
             files = []
-            for number, result in enumerate(results):
+            for number, result in enumerate(given):
                 if isinstance(result, ResultTable):
                     files.append(Path(scratch) / f"{number}.json")
                     result.save(files[-1])
                 else:
                     files.append(Path(result))
-            write_report(Path(file), [self.run], files, None if items is None else Path(items))
+            with in_words_of_python():
+                write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
     @_checked
@@ -581,7 +597,7 @@ class Recommender:
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
-        policy.settings = {table: asdict(getattr(config, table)) for table in TABLES}
+        policy.settings = _changed(config)
         return policy
 
 
@@ -601,6 +617,17 @@ class _Scratch:
     def __reduce__(self) -> tuple[Any, ...]:
         # Another process cannot keep the folder: what is read from a pickle has none.
         return type(None), ()
+
+
+def _changed(config: Config) -> dict[str, Any]:
+    """The settings `table.field` of a configuration that are not the defaults of its policy."""
+    defaults = asdict(resolve_config(config.policy_name))
+    return {
+        f"{table}.{name}": value
+        for table in TABLES
+        for name, value in asdict(getattr(config, table)).items()
+        if value != defaults[table][name]
+    }
 
 
 def _completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:

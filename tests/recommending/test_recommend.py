@@ -97,7 +97,7 @@ def test_scores_are_the_policys_at_the_next_step(
         tmp_path / "run",
         reward="reward",
         session_by=session_by,
-        gap_minutes=20,
+        gap_minutes=20 if session_by == "gap" else None,
     )
     given = log[log.user_id < 12].sample(frac=1, random_state=2)
     latest = given.sort_values("timestamp").groupby("user_id").tail(1)

@@ -92,10 +92,23 @@ def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
     assert {path.name for path in kept.run.parent.iterdir()} == {"run", "store"}
     assert kept.run.is_relative_to(scratch)
     of_store = Recommender("dt", settings=SMALL).fit(kept.run.parent / "store", tmp_path / "other")
-    assert len([path for path in scratch.iterdir() if path.is_dir()]) == 2
+    assert len([path for path in scratch.iterdir() if path.is_dir()]) == 1
     del policy, kept
     assert not [*scratch.iterdir()]
     assert of_store.run.is_dir()
+
+
+def test_the_store_of_a_named_run_is_kept_beside_it(log: pd.DataFrame, tmp_path: Path) -> None:
+    run = tmp_path / "new" / "run"
+    first = Recommender("item-rate").fit(log, run)
+    assert {path.name for path in run.parent.iterdir() if path.is_dir()} == {"run", "run-store"}
+    ranked = first.rank().to_frame()
+    del first
+    for policy in (Recommender.load(run), Recommender("item-rate").fit(log, run)):
+        pd.testing.assert_frame_equal(policy.rank().to_frame(), ranked)
+        assert len(policy.recommend(k=1)) == log.user_id.nunique()
+    with pytest.raises(InputError, match=r"run-store is a store of other logs .*another folder"):
+        Recommender("item-rate").fit(log[:-50], run)
 
 
 def test_folders_are_found_from_any_folder(
@@ -171,7 +184,7 @@ def test_an_interrupted_fit_on_a_frame_goes_on(log: pd.DataFrame, tmp_path: Path
     first = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
     again = Recommender("dt", settings=SMALL).fit(log, tmp_path / "run")
     pd.testing.assert_frame_equal(first.recommend(log), again.recommend(log))
-    with pytest.raises(InputError, match="is a run on another store"):
+    with pytest.raises(InputError, match="is a store of other logs"):
         Recommender("dt", settings=SMALL).fit(log.head(900), tmp_path / "run")
 
 

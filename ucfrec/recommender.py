@@ -71,7 +71,7 @@ from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.update import UpdateOptions, update_run
+from ucfrec.updating.update import STORE_SUFFIX, UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
 _TEXT: Final = of_kind("text", str)
@@ -192,14 +192,16 @@ class Recommender:
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
     ) -> Self:
-        """Train on a store's training episodes; logs are prepared into a temporary store first.
+        """Train on a store's training episodes; logs are prepared into a store first.
 
         Args:
             data: a store or its folder; or logs: files, folders and globs, what
                 `ucfrec_datasets.load` returns, or a frame with one row per interaction:
                 `user_id`, `item_id`, `timestamp` (milliseconds, dates or timestamps) and
-                feedback. A store prepared from logs lasts as long as this recommender.
-            out: run folder, resumed if training was interrupted; None for a temporary one.
+                feedback.
+            out: run folder, resumed if training was interrupted; a store prepared from logs is kept
+                beside it, as `OUT-store`. None for temporary ones, which last as long as this
+                recommender.
             reward: logs only: SQL expression over the feedback columns; see `PrepareOptions`.
             session_by: logs only: "session_id", "gap" or "user"; see `PrepareOptions`.
             gap_minutes: logs only: with "gap", a longer pause (minutes) starts a new session (30).
@@ -225,9 +227,13 @@ class Recommender:
         options = {n: v for n, v in zip(names, values, strict=True) if v is not None}
         with ExitStack() as scratch:
             # Whoever fits next removes what is left, should this process be killed.
-            folder = scratch.enter_context(scratch_folder(Path(tempfile.gettempdir()), "run"))
+            own = None if out is None else Path(out).absolute()
+            parent = Path(tempfile.gettempdir()) if own is None else own.parent
+            folder = scratch.enter_context(scratch_folder(parent, "run"))
             store = store_given(data, mapping, folder, options)
-            out = folder / "run" if out is None else Path(out).absolute()
+            if own is not None and store.path.parent == folder:
+                store = _kept_beside(own, store)
+            out = folder / "run" if own is None else own
             watchers = Callbacks(on_step, on_validation)
             record = train_screened(store, out, self.config, screen, callbacks=watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
@@ -281,6 +287,7 @@ class Recommender:
         filter_seen: bool = True,
         candidates: Iterable[Any] | None = None,
         skip_unknown: bool = False,
+        new_session: bool = False,
         rule: DecisionRule | None = None,
         seed: int = 0,
         mapping: Columns | None = None,
@@ -302,6 +309,7 @@ class Recommender:
             filter_seen: exclude items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
             skip_unknown: ignore rows of items that are not in the training data.
+            new_session: whether users begin a new session; otherwise their latest one goes on.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on
                 the user and the time of the user's last row.
@@ -329,6 +337,7 @@ class Recommender:
             filter_seen=filter_seen,
             candidates=candidates,
             skip_unknown=skip_unknown,
+            new_session=new_session,
         )
         with in_words_of_python():
             return pd.concat(frames, ignore_index=True)
@@ -464,13 +473,20 @@ class Recommender:
 
     @_checked
     def score(
-        self, logs: Logs, *, rule: DecisionRule | None = None, mapping: Columns | None = None
+        self,
+        logs: Logs,
+        *,
+        rule: DecisionRule | None = None,
+        filter_seen: bool = False,
+        mapping: Columns | None = None,
     ) -> pd.DataFrame:
         """The policy's probability of every logged choice: `ucfrec score`.
 
         Args:
             logs: as for `fit`.
             rule: the decision rule; None for the run's own.
+            filter_seen: exclude items that the user was shown before, as `recommend` does by
+                default: for logs of what it showed.
             mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
@@ -481,7 +497,7 @@ class Recommender:
         """
         trained = self._evaluated(logs)
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
-            return pd.concat(score(trained, logged, rule), ignore_index=True)
+            return pd.concat(score(trained, logged, rule, filter_seen), ignore_index=True)
 
     @_checked
     def update(
@@ -491,6 +507,7 @@ class Recommender:
         *,
         window_days: float | None = None,
         refit: bool = True,
+        filter_seen: bool = False,
         mapping: Columns | None = None,
     ) -> Self:
         """Bring the policy up to date with new logs: `ucfrec update`.
@@ -502,6 +519,7 @@ class Recommender:
             window_days: leave out sessions that ended longer ago, before the end of the new logs;
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
+            filter_seen: compare them where items that the user was shown before are excluded.
             mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
@@ -513,7 +531,7 @@ class Recommender:
                 used.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
-        options = UpdateOptions(AppendOptions(window), refit=refit)
+        options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
         given = files_given(self.trained, logs, mapping)
         with given as (files, columns, frame), in_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)
@@ -628,6 +646,20 @@ def _changed(config: Config) -> dict[str, Any]:
         for name, value in asdict(getattr(config, table)).items()
         if value != defaults[table][name]
     }
+
+
+def _kept_beside(run: Path, store: EpisodeStore) -> EpisodeStore:
+    """A new store, moved beside the folder of its run; what lies there already has to be equal."""
+    place = run.with_name(run.name + STORE_SUFFIX)
+    if not place.exists():
+        store.path.rename(place)
+    kept = EpisodeStore.open(place)
+    if kept.record.fingerprint != store.record.fingerprint:
+        raise InputError(
+            f"{place} is a store of other logs than these; name another folder than {run}, or "
+            "remove both"
+        )
+    return kept
 
 
 def _completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:

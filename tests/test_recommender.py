@@ -93,7 +93,7 @@ def test_a_frame_leaves_only_the_run_behind_once_the_recommender_is_gone(
     assert kept.run.is_relative_to(scratch)
     of_store = Recommender("dt", settings=SMALL).fit(kept.run.parent / "store", tmp_path / "other")
     # What torch keeps in the scratch folder is not ours.
-    assert len([*scratch.glob(".run-*")]) == 1
+    assert len([*scratch.glob(".run-*.ucfrec-partial")]) == 1
     del policy, kept
     assert not [*scratch.glob(".run-*")]
     assert of_store.run.is_dir()

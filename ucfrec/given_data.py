@@ -221,7 +221,7 @@ def histories_given(
         frame = _stored(trained, wanted)
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
     histories = histories_of_frame(trained, frame, _mapping(mapping), stored)
-    return histories if wanted is None else of_some_users(histories, wanted.tolist())
+    return histories if wanted is None else of_some_users(histories, wanted)
 
 
 def _stored(trained: TrainedPolicy, users: Array | None) -> pd.DataFrame:

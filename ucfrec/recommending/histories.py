@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -232,15 +232,13 @@ def histories_of_frame(
     return map(Histories.from_batch, batches)
 
 
-def of_some_users(batches: Iterable[Histories], users: Sequence[Any]) -> Iterator[Histories]:
+def of_some_users(batches: Iterable[Histories], users: Array) -> Iterator[Histories]:
     """The histories of the named users only, in the order of `batches`.
 
     Raises:
-        InputError: `users` is not a list of ids, or one of them has no rows; once all are read.
+        InputError: one of them has no rows; once all are read.
     """
-    if isinstance(users, str) or not pd.api.types.is_list_like(users) or not len(users):
-        raise InputError(f"users is {users!r}; give a list of user_ids, or None for all")
-    wanted = IdLookup(pd.unique(np.asarray(users)))
+    wanted = IdLookup(pd.unique(users))
     found = np.zeros(len(wanted), dtype=bool)
     for batch in batches:
         numbers = wanted.numbers(batch.users)

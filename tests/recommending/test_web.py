@@ -224,7 +224,14 @@ def test_the_pages_describe_the_requests_and_load_nothing_from_elsewhere(
     assert health.json()["rule_hash"] == trained.rule.hash
     body = described.json()["paths"]["/recommendations"]["post"]["requestBody"]
     properties = body["content"]["application/json"]["schema"]["properties"]
-    assert properties.keys() == {"user_id", "history", "k", "candidates", "request_id"}
+    assert properties.keys() == {
+        "user_id",
+        "history",
+        "k",
+        "candidates",
+        "new_session",
+        "request_id",
+    }
     assert "timestamp" in properties["history"]["items"]["required"]
     assert page.status_code == 200
     assert "https://" not in page.text

@@ -4,8 +4,10 @@
 set -euo pipefail
 cd /srv/ucfrec
 day=$(date -u -d yesterday +%F)
+new="runs/$day"
 shown="shown/exposures-${day//-/}T*.parquet"
 ucfrec join "$shown" "clicks/$day.parquet" --within 30m --out "logs/$day.parquet"
-ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --out "runs/$day"
-ucfrec report "runs/$day" --out "runs/$day.html"
-ucfrec promote "runs/$day"
+# The server excludes items that users have seen.
+ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --filter-seen --out "$new"
+ucfrec report "$new" --out "$new.html"
+ucfrec promote "$new"

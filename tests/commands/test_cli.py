@@ -472,3 +472,12 @@ def test_a_package_that_is_missing_is_named_with_its_extra() -> None:
     # A defect of ucfrec, such as a package that no extra has, is shown with its traceback.
     assert explanation(ModuleNotFoundError(name="hypothesis")) is None
     assert explanation(ModuleNotFoundError(name="ucfrec.nowhere")) is None
+
+
+def test_a_gap_is_refused_where_sessions_are_not_split_by_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.csv").write_text("user_id,item_id,timestamp,reward\n1,1,1,1\n")
+    command = ["prepare", str(tmp_path / "log.csv"), "--out", str(tmp_path / "store")]
+    assert main([*command, "--session-by", "user", "--gap-minutes", "5"]) == 2
+    assert "--gap-minutes is of --session-by gap, not user" in capsys.readouterr().err

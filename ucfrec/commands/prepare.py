@@ -81,13 +81,17 @@ def run(options: argparse.Namespace) -> None:
     """Run `ucfrec prepare` and print what was read, dropped and kept.
 
     Raises:
-        InputError: the logs cannot be used, or neither --out nor --validate is given.
+        InputError: the logs cannot be used, options do not go together, or neither --out nor
+            --validate is given.
     """
     from ucfrec.logs.expressions import Expression
     from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
     from ucfrec.logs.summary import format_report
 
     files, mapping = logs_given(options)
+    by = options.session_by or mapping.session_by or "gap"
+    if options.gap_minutes is not None and by != "gap":
+        raise InputError(f"--gap-minutes is of --session-by gap, not {by}; leave one of them out")
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,

@@ -31,8 +31,8 @@ ORDER = (
     {"updating"},
     {"reporting"},
     {"benchmark", "tuning"},
-    {"given_data"},
-    {"exploring", "recommender"},
+    {"python_api"},
+    {"exploring"},
     {"commands"},
     {"__init__", "__main__"},
 )

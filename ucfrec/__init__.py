@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from ucfrec.logs.mapping import FeatureTable, LogFiles, LogMapping
     from ucfrec.logs.prepare import PrepareOptions, prepare
     from ucfrec.off_policy.evaluate import EstimateOptions
-    from ucfrec.recommender import UCF, Recommender
+    from ucfrec.python_api.recommender import UCF, Recommender
 
 __version__ = "0.1.0"
 __all__ = [
@@ -37,8 +37,8 @@ _MODULES = {
     "LogFiles": "ucfrec.logs.mapping",
     "LogMapping": "ucfrec.logs.mapping",
     "PrepareOptions": "ucfrec.logs.prepare",
-    "Recommender": "ucfrec.recommender",
-    "UCF": "ucfrec.recommender",
+    "Recommender": "ucfrec.python_api.recommender",
+    "UCF": "ucfrec.python_api.recommender",
     "prepare": "ucfrec.logs.prepare",
 }
 

@@ -12,7 +12,7 @@ from tests.recommending.test_recommend import random_log
 from ucfrec import DecisionRule, FeatureTable, LogMapping, Recommender
 from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
-from ucfrec.given_data import histories_given
+from ucfrec.python_api.given_data import histories_given
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
 from ucfrec.files.record import CARD
-from ucfrec.given_data import histories_given
+from ucfrec.python_api.given_data import histories_given
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import some_of
 from ucfrec.reporting import charts

@@ -3,7 +3,6 @@
 import shutil
 import tempfile
 import warnings
-import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, fields, replace
@@ -35,17 +34,6 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.given_data import (
-    Columns,
-    Logs,
-    files_given,
-    histories_given,
-    in_words_of_python,
-    logs_given,
-    require_logs,
-    split_given,
-    store_given,
-)
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.kept import DAY_MS
@@ -60,6 +48,18 @@ from ucfrec.off_policy.score import score
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import without_folders
+from ucfrec.python_api.given_data import (
+    Columns,
+    Logs,
+    files_given,
+    histories_given,
+    in_words_of_python,
+    logs_given,
+    require_logs,
+    split_given,
+    store_given,
+)
+from ucfrec.python_api.run_folders import Scratch, completed, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
@@ -68,10 +68,9 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
-from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.update import STORE_SUFFIX, UpdateOptions, update_run
+from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
 _TEXT: Final = of_kind("text", str)
@@ -125,7 +124,7 @@ class Recommender:
         """
         self.policy, self.settings, self.seed = policy, settings, seed
         self.config = resolve_config(policy, None, settings, seed)
-        self._scratch: _Scratch | None = None
+        self._scratch: Scratch | None = None
         self._trained: TrainedPolicy | None = None
 
     def __repr__(self) -> str:
@@ -232,15 +231,15 @@ class Recommender:
             folder = scratch.enter_context(scratch_folder(parent, "run"))
             store = store_given(data, mapping, folder, options)
             if own is not None and store.path.parent == folder:
-                store = _kept_beside(own, store)
+                store = kept_beside(own, store)
             out = folder / "run" if own is None else own
             watchers = Callbacks(on_step, on_validation)
             record = train_screened(store, out, self.config, screen, callbacks=watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 with in_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            trained = _completed(store, out, refit)
-            kept = _Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
+            trained = completed(store, out, refit)
+            kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
         self._trained, self._scratch = trained, kept
         return self
 
@@ -623,20 +622,6 @@ UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
-class _Scratch:
-    """The folder of a temporary run, removed once no recommender and no copy of one has it."""
-
-    def __init__(self, folder: ExitStack) -> None:
-        weakref.finalize(self, folder.close)
-
-    def __deepcopy__(self, memo: object) -> Self:
-        return self
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Another process cannot keep the folder: what is read from a pickle has none.
-        return type(None), ()
-
-
 def _changed(config: Config) -> dict[str, Any]:
     """The settings `table.field` of a configuration that are not the defaults of its policy."""
     defaults = asdict(resolve_config(config.policy_name))
@@ -646,28 +631,6 @@ def _changed(config: Config) -> dict[str, Any]:
         for name, value in asdict(getattr(config, table)).items()
         if value != defaults[table][name]
     }
-
-
-def _kept_beside(run: Path, store: EpisodeStore) -> EpisodeStore:
-    """A new store, moved beside the folder of its run; what lies there already has to be equal."""
-    place = run.with_name(run.name + STORE_SUFFIX)
-    if not place.exists():
-        store.path.rename(place)
-    kept = EpisodeStore.open(place)
-    if kept.record.fingerprint != store.record.fingerprint:
-        raise InputError(
-            f"{place} is a store of other logs than these; name another folder than {run}, or "
-            "remove both"
-        )
-    return kept
-
-
-def _completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:
-    """The policy of a trained run, refitted to all rows if asked for, with its model card."""
-    if refit:
-        refit_within(store, out)
-    write_card(out)
-    return TrainedPolicy.load(out)
 
 
 def _named(logs: Logs | None) -> str:

@@ -537,7 +537,7 @@ SECTIONS = (
         "Control at the medium budget",
         "Scores of the last checkpoint after 10,000 steps in batches of 64 windows of 8 steps, for "
         "cloning of 512 steps, at width 128, with averaged weights, in 50 episodes. One seed, so a "
-        "difference may be chance. DT, DC and LSDT were not measured at this budget.",
+        "difference may be chance. DC and LSDT were not measured at this budget.",
         "`ucfrec-control benchmark --data $UCFREC_DATA/control --budget medium --table main "
         "--seeds 1`",
         of("control_medium", "main"),

@@ -480,4 +480,12 @@ def test_a_gap_is_refused_where_sessions_are_not_split_by_it(
     (tmp_path / "log.csv").write_text("user_id,item_id,timestamp,reward\n1,1,1,1\n")
     command = ["prepare", str(tmp_path / "log.csv"), "--out", str(tmp_path / "store")]
     assert main([*command, "--session-by", "user", "--gap-minutes", "5"]) == 2
-    assert "--gap-minutes is of --session-by gap, not user" in capsys.readouterr().err
+    assert "--gap-minutes needs --session-by gap, not user" in capsys.readouterr().err
+
+
+def test_seen_items_are_filtered_where_probabilities_are_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    assert main(["ope", str(tmp_path), "scored.parquet", "--scored", "--filter-seen"]) == 2
+    assert "give --filter-seen to score" in capsys.readouterr().err

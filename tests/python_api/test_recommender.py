@@ -234,7 +234,7 @@ def test_data_that_cannot_be_used(fitted: Recommender, folder: Path, log: pd.Dat
         (log, {"session_by": "day"}, "session_by is 'day'"),
         (log, {"session_by": "user", "gap_minutes": 3}, "gap_minutes is 3, but sessions are those"),
         (log.assign(session_id=1), {"gap_minutes": 3}, "session_by='session_id'; leave it out"),
-        (log, {"dataset": "movielens"}, "dataset is 'movielens', which is of files"),
+        (log, {"dataset": "movielens"}, "dataset is 'movielens', but only files have one"),
         (log.assign(reward=1.0), {}, "nothing to learn"),
     ):
         with pytest.raises(InputError, match=message):

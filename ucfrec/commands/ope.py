@@ -132,6 +132,8 @@ def run(options: argparse.Namespace) -> None:
     runs = dict.fromkeys(runs_given(options))
     if options.scored and not options.logs:
         raise InputError("--scored needs what ucfrec score wrote; name it after the run")
+    if options.scored and options.filter_seen:
+        raise InputError("--scored takes probabilities as they are; give --filter-seen to score")
     # On the test split, the weights that have not learned from it.
     split = not options.logs
     policies = [TrainedPolicy.load(run, options.checkpoint, split=split) for run in runs]

@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
     files, mapping = logs_given(options)
     by = options.session_by or mapping.session_by or "gap"
     if options.gap_minutes is not None and by != "gap":
-        raise InputError(f"--gap-minutes is of --session-by gap, not {by}; leave one of them out")
+        raise InputError(f"--gap-minutes needs --session-by gap, not {by}; leave one of them out")
     given = {
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,

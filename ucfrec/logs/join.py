@@ -38,6 +38,7 @@ _EXPOSURE: Final = {
 }
 """Columns of exposures and their DuckDB types; those of ids are kept."""
 _MEASURED: Final = (schema.TIMESTAMP, schema.PROPENSITY)
+"""Columns that may differ where an exposure is written twice."""
 _ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
 """Columns that together only exposures have, and logs that were made of them."""
 _ONE_EXPOSURE: Final = ", ".join(name for name in _EXPOSURE if name not in _MEASURED)

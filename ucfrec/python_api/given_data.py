@@ -117,7 +117,7 @@ def store_given(
         return data if isinstance(data, EpisodeStore) else EpisodeStore.open(str(data))
     given, dataset = _mapping(mapping), options.get("dataset", "generic")
     if "dataset" in options and not _are_paths(data):
-        raise InputError(f"dataset is {dataset!r}, which is of files; leave it out for other data")
+        raise InputError(f"dataset is {dataset!r}, but only files have one; leave it out")
     if isinstance(data, LogFiles):
         files, given, dataset = data.files, given.over(data.mapping), data.dataset
     elif _are_paths(data):

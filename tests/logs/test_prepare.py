@@ -215,7 +215,7 @@ def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:
     log.loc[7, "reward"] = np.nan
     log.loc[8, "reward"] = np.inf
     log.loc[9, "reward"] = None
-    log.loc[10, "propensity"] = -1.0
+    log.loc[10, "propensity"] = np.nan
     path = write(log, tmp_path / "log.parquet")
     report = validate([path], LogMapping(), PrepareOptions(min_steps=2))
     dropped = dict(report["dropped"])
@@ -414,6 +414,21 @@ FAULTS: dict[str, tuple[Change, PrepareOptions, str]] = {
         lambda log: log.__setitem__("propensity", 60.0),
         CORRECT,
         r"propensity is above 1, up to 60, in \d+ of \d+ rows.*propensity / 100",
+    ),
+    "logarithms of propensities": (
+        lambda log: log.__setitem__("propensity", np.log(log["propensity"] / 2)),
+        CORRECT,
+        r"propensity is not above 0, down to -\d.*, in \d+ of \d+ rows.*exp\(propensity\)",
+    ),
+    "unknown propensities as -1": (
+        lambda log: log.__setitem__("propensity", log["propensity"].where(log.index > 9, -1.0)),
+        CORRECT,
+        r"is not above 0, down to -1, in \d+ of \d+ rows.*nullif\(propensity, -1\)",
+    ),
+    "a propensity of 0": (
+        lambda log: log.__setitem__("propensity", log["propensity"].where(log.index != 9, 0.0)),
+        CORRECT,
+        r"is not above 0, down to 0, in 1 of \d+ rows.*nullif\(propensity, 0\)",
     ),
     "equal rewards": (
         lambda log: log.__setitem__("reward", 1.0),

@@ -2,12 +2,19 @@
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.off_policy.evaluate import EstimateOptions
+from ucfrec.logs import LogMapping
+from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
+from ucfrec.off_policy.score import logged_sessions
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+RULE = DecisionRule(7.5, temperature=1.0)
 
 
 def test_values_out_of_range_are_refused() -> None:
@@ -27,3 +34,29 @@ def test_logs_of_one_user_are_refused_before_anything_is_fitted(
     said = capsys.readouterr().err.splitlines()
     assert len([line for line in said if "of one user; at least two users are needed" in line]) == 1
     assert f"{tmp_path / 'one.parquet'}: the logs have " in said[-1]
+
+
+@pytest.mark.parametrize(("share", "forbids"), [(0.0, False), (0.02, False), (0.2, True)])
+def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, share: float, forbids: bool
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    lacking = int(share * len(log))
+    log.loc[log.index[:lacking], "reward"] = np.nan
+    log.to_parquet(tmp_path / "log.parquet")
+    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+        report = evaluate_off_policy(trained, logged, rule=RULE, seed=0)
+    text = f"{lacking:,} of {len(log):,} rows have no reward"
+    assert any(text in warning for warning in report.warnings) == (lacking > 0)
+    assert any(text in reason for reason in report.verdict.reasons) == forbids
+
+
+def test_an_item_twice_on_a_page_is_said(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet").drop_duplicates("user_id")
+    pd.concat([log, log.iloc[:3]]).to_parquet(tmp_path / "log.parquet")
+    pages = EstimateOptions(pages=True)
+    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+        report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
+    assert any("3 rows repeat the user, item and time" in each for each in report.warnings)

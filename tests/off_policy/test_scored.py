@@ -1,8 +1,10 @@
 """Estimates from scored rows are those from the logs that were scored."""
 
+import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -67,6 +69,10 @@ def test_estimates_are_those_from_the_logs(
         for column in ("effective_users", "mean_weight", "users", "seen_in_training"):
             mine, full = (each[name].as_line()[column] for each in (ours, theirs))
             assert mine == pytest.approx(full, rel=1e-5)
+    # What is found step by step cannot be found of sums of sessions.
+    line = ours["SNPDIS"].as_line()
+    assert not line.keys() & {"bounds", "effective_by_step", "unsupported_from_step"}
+    assert not any("from step" in text or "step 1:" in text for text in found.warnings)
 
 
 def test_what_was_not_scored_by_the_run_and_rule_is_refused(
@@ -74,7 +80,7 @@ def test_what_was_not_scored_by_the_run_and_rule_is_refused(
 ) -> None:
     parts = scored_parts(folder, trained, tmp_path, 0)
 
-    def estimated(path: Path, rule: DecisionRule = RULE, **options: bool) -> None:
+    def estimated(path: Path, rule: DecisionRule = RULE, **options: Any) -> None:
         chosen = EstimateOptions(**options)
         evaluate_scored(trained, [path], rule=rule, seed=0, options=chosen)
 
@@ -84,6 +90,8 @@ def test_what_was_not_scored_by_the_run_and_rule_is_refused(
         estimated(tmp_path / "log.parquet")
     with pytest.raises(InputError, match="need the logs"):
         estimated(parts, pages=True)
+    with pytest.raises(InputError, match="reward range is of single steps"):
+        estimated(parts, reward_range=(0.0, 1.0))
     (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
     with pytest.raises(InputError, match="cannot be read"):
         estimated(tmp_path / "broken.parquet")
@@ -144,3 +152,21 @@ def test_the_command_reads_what_score_writes(
     assert main(["ope", run, out, "--scored", *rule, "--temperatures", "1,2"]) == 2
     assert main(["ope", run, "--scored"]) == 2
     assert main(["report", run, "--results", results, "--out", str(tmp_path / "r.html")]) == 0
+
+
+@pytest.mark.parametrize(("share", "forbids"), [(0.0, False), (0.02, False), (0.2, True)])
+def test_unknown_items_left_out_of_scores_are_named_as_the_cause(
+    folder: Path, tmp_path: Path, share: float, forbids: bool
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    unknown = int(share * len(log))
+    log.loc[log.index[:unknown], "item_id"] = 10**6
+    log.to_parquet(tmp_path / "log.parquet")
+    run, out, rule = str(folder / "run"), str(tmp_path / "scored.parquet"), ["--temperature", "1"]
+    results = tmp_path / "ope.json"
+    assert main(["score", run, str(tmp_path / "log.parquet"), "--out", out, *rule]) == 0
+    assert main(["ope", run, out, "--scored", *rule, "--json", str(results)]) == 0
+    line = json.loads(results.read_text())[-1]["details"]
+    text = f"{unknown:,} of {len(log):,} rows show items that the run does not know"
+    assert any(text in each for each in line["warnings"]) == (unknown > 0)
+    assert (text in line["verdict"]) == forbids

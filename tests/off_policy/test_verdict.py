@@ -123,6 +123,20 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     assert f"the value lies between {diagnosis.bounds[0]:.4g}" in str(verdict)
 
 
+def test_a_mean_weight_that_is_off_by_chance_is_not_blamed_on_the_logs_alone() -> None:
+    """Over many steps nearly all weight is in sessions too rare to be drawn."""
+    for seed in range(20):
+        steps, _ = logs(1500, seed, length=12)
+        steps = replace(steps, target=(steps.target * ITEMS) ** 2 / (TARGET**2).sum() / ITEMS**2)
+        failed = [test for test in diagnose(steps).tests if not test.passed]
+        if [test.name for test in failed] == ["session products"] and failed[0].mean < 1:
+            said = str(conclude(steps, seed=0))
+            assert "too rare in these logs: give more logs" in said
+            assert "filter-seen" not in said
+            return
+    pytest.fail("no sample has sessions of the policy too rare")
+
+
 def test_weights_are_tested_by_segment() -> None:
     """Too large in one half, too small in the other: right on average, wrong in each."""
     steps, _ = logs(8000)

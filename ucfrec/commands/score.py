@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.files.parquet import write_frames
     from ucfrec.logs.summary import format_report
-    from ucfrec.off_policy.score import about_scores, logged_sessions, score
+    from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, logged_sessions, score
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
@@ -72,5 +72,6 @@ def run(options: argparse.Namespace) -> None:
         print(format_report(logged.report))
         rule = rule_given(options, trained)
         frames = score(trained, logged, rule, options.filter_seen)
-        rows = write_frames(options.out, frames, about_scores(trained, rule))
+        unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}
+        rows = write_frames(options.out, frames, about_scores(trained, rule) | unknown)
     print(f"\n{origin(options.out)}: {rows:,} rows")

@@ -117,6 +117,9 @@ class Measures:
     first_ms: int = 0
     last_ms: int = 0
     unknown_propensities: int = 0
+    not_above_0: int = 0
+    """Propensities of 0 or less."""
+    lowest_propensity: float = 0.0
     above_1: int = 0
     """Propensities of items above 1."""
     highest_propensity: float = 0.0
@@ -236,6 +239,10 @@ def _count_steps(measures: Measures, found: Episodes, spool: Spool) -> None:
     if schema.PROPENSITY in spool.names:
         propensities = found.column(spool, schema.PROPENSITY)
         measures.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
+        if (below := propensities <= 0).any():
+            measures.not_above_0 += int(np.count_nonzero(below))
+            lowest = float(propensities[below].min())
+            measures.lowest_propensity = min(measures.lowest_propensity, lowest)
         if schema.ITEM in spool.names and (above := propensities > 1).any():
             measures.above_1 += int(np.count_nonzero(above))
             highest = float(propensities[above].max())

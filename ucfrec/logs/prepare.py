@@ -369,6 +369,14 @@ def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
 
 
 def _require_probabilities(log: TypedLog, measures: Measures) -> None:
+    if measures.not_above_0:
+        lowest = f"{measures.lowest_propensity:.6g}"
+        raise InputError(
+            f"{log.name}: {schema.PROPENSITY} is not above 0, down to {lowest}, in "
+            f"{measures.not_above_0:,} of {measures.steps:,} rows; of a logarithm give --column "
+            f"propensity='exp(propensity)'; if {lowest} means unknown, --column "
+            f"propensity='nullif(propensity, {lowest})'"
+        )
     if measures.above_1:
         raise InputError(
             f"{log.name}: {schema.PROPENSITY} is above 1, up to {measures.highest_propensity:.6g}, "

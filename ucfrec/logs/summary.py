@@ -129,7 +129,7 @@ def format_report(report: Mapping[str, Any]) -> str:
     if "items" in report:
         lines.append(("items", f"{report['items']:,}"))
     if report.get("unknown_propensities"):
-        text = f"{report['unknown_propensities']:,}  missing, or not above 0"
+        text = f"{report['unknown_propensities']:,}  missing, NaN or infinite"
         lines.append(("  unknown propensity", text))
     lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
     if report["sessions_cut"]:

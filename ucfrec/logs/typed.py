@@ -377,7 +377,8 @@ def _typed(
         wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
     elif name == schema.PROPENSITY:
         if is_number(kind):
-            valid = f"{sql} > 0 AND {sql} <= {MAX_FLOAT}"
+            # Numbers that are not above 0 stay, to be counted and refused.
+            valid = f"{sql} BETWEEN -{MAX_FLOAT} AND {MAX_FLOAT}"
             return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
         wanted = "use a number above 0"
     else:

@@ -58,7 +58,8 @@ class Diagnosis:
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
     tests: tuple[WeightTest, ...]
     effective_by_step: tuple[float, ...]
-    """(T,) effective users at each step, of the products up to it."""
+    """(T,) effective users at each step, of the products up to it; empty of steps that are sums of
+    sessions."""
     effective_users: float
     """Of the session products, summed by user."""
     largest_weight: float
@@ -71,7 +72,7 @@ class Diagnosis:
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
     bounds: tuple[float, float] | None
     """Between these lies the value if the propensities are true, whatever the choices that the logs
-    lack are worth; up to the sampling error of PDIS."""
+    lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
     @property
     def unsupported_from_step(self) -> int | None:
@@ -102,19 +103,20 @@ def diagnose(
     rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
     if reward_range is None:
         reward_range = (float(steps.reward.min()), float(steps.reward.max()))
+    summed = known.per_decision is not None
     return Diagnosis(
         sessions=len(lacking),
         users=users,
         left_out=int(lacking.sum()),
         overlap=float((known.target / known.propensity).mean()),
         tests=weight_tests(known, None if segment is None else segment[~lacking]),
-        effective_by_step=_effective_by_step(known),
+        effective_by_step=() if summed else _effective_by_step(known),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
         mean_weight=float(known.session_weights.mean()),
         tail=pareto_tail(by_user),
-        bounds=identification_bounds(known, reward_range),
+        bounds=None if summed else identification_bounds(known, reward_range),
     )
 
 
@@ -129,7 +131,9 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     Args:
         segment: (S,) as `diagnose` takes it.
     """
-    ratios, places = steps.target / steps.propensity, _by_place(steps)
+    ratios = steps.target / steps.propensity
+    # Of sums of sessions the ratios are the session products.
+    places = _by_place(steps) if steps.per_decision is None else []
     groups = [
         (f"step {place + 1}", ratios[rows], steps.session[rows])
         for place, rows in enumerate(places)

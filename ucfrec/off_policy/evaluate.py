@@ -36,7 +36,14 @@ from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, pages_of
 from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
 from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-from ucfrec.off_policy.verdict import FAR_OFF, Verdict, cautions, conclude, influences
+from ucfrec.off_policy.verdict import (
+    FAR_OFF,
+    MOST_LEFT_OUT,
+    Verdict,
+    cautions,
+    conclude,
+    influences,
+)
 from ucfrec.provenance import without_folders
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable
@@ -153,10 +160,11 @@ def evaluate_off_policy(
     found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
     value = None if options.pages else step_value(evaluated.steps, seed)
     seen = share_seen(trained, logged.store)
-    forbidden = [*seen_too_often(seen), *_too_many_items(trained, evaluated)]
+    lacking, notes = _of_dropped_rows(logged, options.pages)
+    forbidden = [*seen_too_often(seen), *_too_many_items(trained, evaluated), *lacking]
     verdict = conclude(steps, seed, diagnosis, options.wanted_lift, forbidden, _declared(evaluated))
     warnings = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
-    warnings += [*of_groups, *_of_the_models(evaluated)]
+    warnings += [*notes, *of_groups, *_of_the_models(evaluated)]
     warnings += [value.doubt] if value is not None and value.doubt else []
     about = {
         "seen_in_training": seen,
@@ -283,6 +291,24 @@ def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
             "weigh 0"
         )
     return said
+
+
+def _of_dropped_rows(logged: LoggedSessions, pages: bool) -> tuple[list[str], list[str]]:
+    """What dropped rows forbid, and what to know of them."""
+    dropped, forbidden, notes = logged.report["dropped"], [], []
+    if lacking := dropped.get("reward_not_finite", 0):
+        rows = logged.store.n_steps + lacking
+        said = f"{lacking:,} of {rows:,} rows have no reward: they are left out"
+        if lacking > MOST_LEFT_OUT * rows:
+            forbidden.append(f"{said}, and may differ from the rest")
+        else:
+            notes.append(said)
+    if pages and (repeated := dropped.get("duplicate", 0)):
+        notes.append(
+            f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "
+            "page can show an item twice, log its positions a millisecond apart"
+        )
+    return forbidden, notes
 
 
 def logged_steps(

@@ -32,6 +32,8 @@ from ucfrec.runs.record import RUN, store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
+UNKNOWN_ITEMS = "unknown_item_rows"
+"""Metadata of a file of scores: number of rows left out because the run does not know the item."""
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
 

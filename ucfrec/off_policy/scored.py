@@ -25,9 +25,9 @@ from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import StepSums, estimate, normalised_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, conditions, of_sessions
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.score import PROBABILITY, SESSION, about_scores
+from ucfrec.off_policy.score import PROBABILITY, SESSION, UNKNOWN_ITEMS, about_scores
 from ucfrec.off_policy.training_rows import row_keys, seen_too_often, share_of_rows_seen
-from ucfrec.off_policy.verdict import cautions, conclude
+from ucfrec.off_policy.verdict import MOST_LEFT_OUT, cautions, conclude
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18
@@ -42,11 +42,7 @@ _NUMBERS: Final = (schema.REWARD, schema.PROPENSITY, PROBABILITY)
 _ROUNDING: Final = 1e-6
 """By how much a probability may be above 1."""
 _WEIGHED: Final = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
-_NOTES: Final = (
-    "from scored rows: without models of the reward there is no DR",
-    "rows of items that the run does not know are not part of scored rows; where `score` said that "
-    "it excluded many, estimate from the logs",
-)
+_NO_DR: Final = "from scored rows: without models of the reward there is no DR"
 
 
 def evaluate_scored(
@@ -70,13 +66,17 @@ def evaluate_scored(
     """
     if options.pages or options.estimate_propensities:
         raise InputError("pages and estimated propensities need the logs; leave --scored out")
+    if options.reward_range is not None:
+        raise InputError("a reward range is of single steps and needs the logs; leave --scored out")
     files = _files(paths, about_scores(trained, rule))
     sessions = _summed(files, options)
     steps = sum(pq.read_metadata(file).num_rows for file in files)
     seen = _share_seen(trained, files, steps)
-    found, diagnosis = estimate(sessions, seed), diagnose(sessions, options.reward_range)
-    verdict = conclude(sessions, seed, diagnosis, options.wanted_lift, seen_too_often(seen))
-    warnings = [*verdict.reasons, *cautions(diagnosis, found), *_NOTES]
+    found, diagnosis = estimate(sessions, seed), diagnose(sessions)
+    forbidden, notes = _of_unknown_items(files, steps)
+    forbidden += seen_too_often(seen)
+    verdict = conclude(sessions, seed, diagnosis, options.wanted_lift, forbidden)
+    warnings = [*verdict.reasons, *cautions(diagnosis, found), _NO_DR, *notes]
     about = {
         "seen_in_training": seen,
         "warnings": warnings,
@@ -128,6 +128,30 @@ def _files(paths: Sequence[Path], about: Mapping[str, str]) -> list[Path]:
                     "the same run, --checkpoint and decision rule as for ucfrec score"
                 )
     return files
+
+
+def _of_unknown_items(files: Sequence[Path], rows: int) -> tuple[list[str], list[str]]:
+    """What rows of items that the run does not know forbid, and what to know of them: sessions
+    lack them, where in the logs they weigh 0.
+
+    Args:
+        rows: number of scored rows.
+    """
+    metadata = [pq.read_schema(file).metadata or {} for file in files]
+    counts = [each.get(UNKNOWN_ITEMS.encode(), b"") for each in metadata]
+    if not all(count.isdigit() for count in counts):
+        return [], [
+            "rows of items that the run does not know are not part of scored rows; where the logs "
+            "have many, estimate from the logs"
+        ]
+    unknown = sum(map(int, counts))
+    said = (
+        f"{unknown:,} of {rows + unknown:,} rows show items that the run does not know, and are "
+        "not part of scored rows: estimate from the logs, where they weigh 0"
+    )
+    if unknown > MOST_LEFT_OUT * (rows + unknown):
+        return [said], []
+    return [], [said] if unknown else []
 
 
 def _batches(files: Sequence[Path], names: Sequence[str]) -> Iterator[dict[str, Array]]:

@@ -197,7 +197,13 @@ def _failed_tests(diagnosis: Diagnosis) -> list[str]:
     worst = next((t for t in failed if t.name == SESSION_PRODUCTS), None) or max(
         failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
     )
-    if worst.mean < 1:
+    alone = failed == [worst] and worst.name == SESSION_PRODUCTS
+    if worst.mean < 1 and alone and _few_weigh(diagnosis):
+        cause = (
+            "sessions that the policy would often have may be too rare in these logs: give more "
+            "logs; or the logs lack choices that the policy makes"
+        )
+    elif worst.mean < 1:
         cause = (
             "the logs lack choices that the policy makes (such as seen items, which serve excludes "
             "without --keep-seen: evaluate with --filter-seen), or propensities are too large"
@@ -209,6 +215,13 @@ def _failed_tests(diagnosis: Diagnosis) -> list[str]:
         low, high = diagnosis.bounds
         said += f" (if they are right, the value lies between {low:.4g} and {high:.4g})"
     return [said]
+
+
+def _few_weigh(diagnosis: Diagnosis) -> bool:
+    """Whether the tests of weights, which take means for normal, reject too often: few users have
+    most of the weight."""
+    heavy = diagnosis.tail is not None and diagnosis.tail > HEAVY_TAIL
+    return heavy or diagnosis.effective_users < ENOUGH_USERS
 
 
 def _sessions_needed(interval: Interval | None, lift: float, sessions: int) -> int | None:

@@ -52,7 +52,7 @@ ENVIRONMENTS = (
     "**SARDINE BoredInf** is by other authors. Nothing is known of a user at first, and five "
     "clicks on one topic bore: it shows which method learns tastes within a session and varies "
     "topics.",
-    "No simulator shows what real users would do: see [what the numbers cannot "
+    "No simulator shows what real users would do: see [what numbers cannot "
     "tell](numbers.md#what-they-cannot-tell).",
 )
 BUILT_IN: Final = ("random", "random-mask", "oracle", "mixture", "optimal", "best-constant")
@@ -514,8 +514,8 @@ SECTIONS = (
         settings,
     ),
     Section(
-        "A distractor that causes nothing",
-        "A planted observation that goes with the reward in the log and causes nothing. Dropping "
+        "A misleading column",
+        "A planted observation that agrees with the reward in the log and has no effect. Dropping "
         "what screening flags (`ucf-dropped`) loses nothing; UCF itself loses up to 65%.",
         f"`{RUN} distractor`",
         of("recommendation", "distractor"),

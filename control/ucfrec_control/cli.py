@@ -14,7 +14,7 @@ CONTROL = Program(
         "collect": "collect datasets with a SAC agent, or a saved one",
         "convert": "convert D4RL HDF5 to Minari, or back",
         "distract": "add a distractor to the states of a store",
-        "screen": "find state dimensions that have an effect",
+        "screen": "find state dimensions that have no effect",
         "screen-all": "screen every zoo file and distractor; resumes",
         "train": "train a policy on a store; resumes",
         "evaluate": "measure normalised scores of trained policies",

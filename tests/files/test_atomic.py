@@ -1,5 +1,6 @@
 """Outputs appear whole or not at all."""
 
+import errno
 import json
 import math
 import os
@@ -16,7 +17,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, explain_os_error
 from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json, write_sealed_json
 from ucfrec.fitting.checkpoint import save_tensors
 
@@ -96,6 +97,17 @@ def test_a_file_whose_block_raises_stays_as_it_was(
         write()
     assert target.read_text() == "old"
     assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("write", [atomic_file, atomic_folder])
+def test_an_error_of_a_full_disk_names_what_was_written(tmp_path: Path, write: Any) -> None:
+    for code in (errno.ENOSPC, errno.EDQUOT):
+        with pytest.raises(OSError, match=r"No space|quota") as raised, write(tmp_path / "out"):
+            raise OSError(code, os.strerror(code))
+        assert explain_os_error(raised.value).startswith(f"{tmp_path / 'out'}: ")
+    with pytest.raises(OSError, match="Input/output") as raised, write(tmp_path / "out"):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+    assert raised.value.filename is None
 
 
 def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:

@@ -84,3 +84,25 @@ def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
         validate([tmp_path / "log.parquet"], mapping, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "kind"),
+    [("items.csv", "item_id", "item_features"), ("users.parquet", "user_id", "user_features")],
+)
+def test_features_beside_a_log_that_is_named_alone_are_noted(
+    tmp_path: Path, name: str, key: str, kind: str
+) -> None:
+    log = pd.DataFrame({"user_id": [1, 1, 2, 2], "item_id": [1, 2, 1, 2], "reward": [0, 1, 0, 1.0]})
+    log.assign(timestamp=START + log.index).to_parquet(tmp_path / "log.parquet")
+    table, file = pd.DataFrame({key: [1, 2], "age": [3, 4]}), tmp_path / name
+    if name.endswith("csv"):
+        table.to_csv(file, index=False)
+    else:
+        table.to_parquet(file)
+    logs = [tmp_path / "log.parquet"]
+    with pytest.warns(InputNote, match=f"{name} lies beside the log and is not read"):
+        validate(logs, LogMapping(), OPTIONS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        validate(logs, LogMapping(**{kind: (FeatureTable((file,), key, ("age",)),)}), OPTIONS)

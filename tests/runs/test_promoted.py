@@ -130,3 +130,15 @@ def test_a_promotion_killed_at_any_moment_leaves_a_whole_pointer(
     assert kills("promote", folder) >= 7
     promote(folder / "other", force=True)
     assert current(folder) == "other"
+
+
+def test_a_link_to_a_run_of_another_folder_is_refused(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    folder = runs(trained, tmp_path / "runs", "a")
+    served = tmp_path / "served"
+    served.mkdir()
+    (served / "current").symlink_to(folder / "a")
+    with pytest.raises(InputError, match=r"current is a link.*name the run itself, .*runs/a"):
+        promote(served / "current")
+    assert current(folder) is None

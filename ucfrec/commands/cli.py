@@ -35,7 +35,7 @@ class Program:
 
 UCFREC = Program(
     "ucfrec",
-    "Train recommender policies from Parquet logs and estimate the return.",
+    "Train recommendation policies from logs and estimate their value.",
     "ucfrec.commands",
     {
         "demo": "run every step on simulated logs and write a report; resumes",
@@ -46,14 +46,14 @@ UCFREC = Program(
         "train": "train a policy on an episode store; resumes",
         "tune": "search the settings of a training; resumes",
         "update": "train on from a run with new logs, and compare both; resumes",
-        "promote": "make `serve RUNS` answer with a run",
+        "promote": "make a run the one that `serve RUNS` uses",
         "settings": "list every training setting: default, range, meaning",
         "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",
         "recommend": "recommend the next items to the users of a log",
         "serve": "answer requests for recommendations over HTTP",
         "explore": "try out one or two policies in the browser",
-        "join": "make a log of exposures and the feedback that they got",
+        "join": "join exposures with their feedback into a log",
         "compare": "compare two runs that shared the traffic (A/B test)",
         "export": "write the policy with its rule as an ONNX graph",
         "score": "write a policy's probability of every logged choice",

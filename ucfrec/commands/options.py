@@ -185,7 +185,7 @@ def _score_options(rule: argparse._ArgumentGroup) -> None:
         "--minimum-target",
         type=float,
         metavar="RETURN",
-        help="the least target return, also once a session has reached its target",
+        help="lower bound of the target, also once a session has reached it",
     )
     rule.add_argument(
         "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"

@@ -39,10 +39,22 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         remove(scratch)
         scratch.mkdir()
         try:
-            yield scratch
+            with _named_where_full(path):
+                yield scratch
             _rename(scratch, path)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def _named_where_full(path: Path) -> Iterator[None]:
+    """Name `path` in an error of a full disk, which names no file where an open one is written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def _require_absent(path: Path) -> None:
@@ -93,7 +105,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
         scratch = scratch_of(path)
         remove(scratch)
         try:
-            yield scratch
+            with _named_where_full(path):
+                yield scratch
             os.replace(scratch, path)
         finally:
             remove(scratch)

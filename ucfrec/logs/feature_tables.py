@@ -4,6 +4,7 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import duckdb
@@ -12,7 +13,7 @@ import numpy as np
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.binding import Bound, bind, explained, wrong_type
 from ucfrec.logs.engine import BATCH_ROWS
-from ucfrec.logs.mapping import FeatureTable, log_files
+from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
 from ucfrec.logs.tables import (
     NOTHING,
     PANDAS_INDEX,
@@ -256,3 +257,22 @@ def _comparable(sql: str, kind: str) -> tuple[str, str] | None:
     if kind.endswith("[]"):
         return f"CAST({sql} AS VARCHAR[])", "VARCHAR[]"
     return None
+
+
+def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:
+    """Note a table called `items.*` or `users.*` beside a log that was named alone.
+
+    Args:
+        files: of the log.
+    """
+    folders = dict.fromkeys(file.parent for file in files)
+    for name, given in (("items", mapping.item_features), ("users", mapping.user_features)):
+        found = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
+        table = next((file for file in found if is_table(file) and file not in files), None)
+        if table is not None and not given:
+            warnings.warn(
+                f"{table} lies beside the log and is not read; if it holds features of {name}, "
+                f"name the folder {table.parent}, or the file too",
+                InputNote,
+                stacklevel=2,
+            )

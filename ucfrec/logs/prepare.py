@@ -23,7 +23,12 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained, settled
 from ucfrec.logs.engine import engine
-from ucfrec.logs.feature_tables import feature_digest, load_features, require_known_ids
+from ucfrec.logs.feature_tables import (
+    feature_digest,
+    load_features,
+    note_unread_features,
+    require_known_ids,
+)
 from ucfrec.logs.ids import (
     EPISODE_USERS,
     ID_TABLES,
@@ -293,6 +298,7 @@ def prepared_log(
                 note_losses(rows, reward, mapping.where)
                 if like is None and onto is None:
                     require_variety(rows)
+                    note_unread_features(files, mapping)
                 note_equal_times(rows)
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)

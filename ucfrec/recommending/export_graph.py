@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from ucfrec.acting.scorer import Scorer
 from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, one_line
 
 GRAPH: Final = "model.onnx"
 INPUTS: Final = ("items", "rewards", "steps", "collected", "users", "observations")
@@ -239,9 +239,10 @@ def write_graph(
     except (InputError, OSError, MemoryError):
         raise
     except Exception as error:  # torch's exporter has no class of errors of its own for all of them
-        reason = str(error).strip().splitlines() or [type(error).__name__]
+        # The exporter's own message lists its steps; the reason is that of the error behind it.
+        reason = one_line(str(error.__cause__ or error).strip()) or type(error).__name__
         raise InputError(
-            f"torch cannot export policies of kind {kind!r} ({reason[0]:.160}); {remedy}"
+            f"torch cannot export policies of kind {kind!r} ({reason:.160}); {remedy}"
         ) from None
 
 

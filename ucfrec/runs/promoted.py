@@ -56,13 +56,18 @@ def promote(run: Path, force: bool = False) -> Promoted:
     """Make a run the current one of the folder that it lies in.
 
     Args:
-        run: a finished run, all of whose files are compared with their checksums.
+        run: a finished run, no link, all of whose files are compared with their checksums.
         force: whatever its verdict against the current run is.
 
     Raises:
-        InputError: the run is not finished or damaged, or, without `force`, is not an update of
-            the current run or worse than that.
+        InputError: the run is a link, not finished or damaged, or, without `force`, is not an
+            update of the current run or worse than that.
     """
+    if run.is_symlink():
+        raise InputError(
+            f"{run} is a link, and the run would be promoted in the folder where it really lies; "
+            f"name the run itself, {run.resolve()}"
+        )
     run = run.resolve()
     verified(run)
     folder, record = run.parent, read_record(run)

@@ -29,8 +29,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--agent",
         type=Path,
         metavar="ZIP",
-        help="let this agent act that Stable-Baselines3 saved, instead of training one; what is "
-        "pickled in the file is not read",
+        help="record this agent, saved by Stable-Baselines3, instead of training one; pickled "
+        "parts of the file are not read",
     )
     parser.add_argument(
         "--noise",

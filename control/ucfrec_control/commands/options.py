@@ -25,7 +25,7 @@ from ucfrec_control.environments.scores import find_task
 
 BUDGETS: Final = {
     "small": "a quick look: policies have not learned all they can",
-    "medium": "averaged weights, 16 times the windows; about 20 core hours for the main table",
+    "medium": "averaged weights, 10 times the windows; about 20 core hours for the main table",
     "full": "the steps, seeds and episodes of the papers",
 }
 """What the budgets are, by name."""

@@ -1,10 +1,13 @@
 """The difference of two arms: what is planted is found, and looking often finds nothing else."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from ucfrec.commands.cli import main
@@ -56,7 +59,13 @@ def test_users_in_both_arms_and_rows_without_one_are_left_out(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"arm": "a"}, "two arms"), ({"feedback": "x"}, "not a number"), ({"arm": None}, "two arms")],
+    [
+        ({"arm": "a"}, r"two arms .* 'a' \(50 users\)"),
+        ({"feedback": "x"}, "not a number"),
+        ({"arm": None}, "two arms .* none"),
+        ({"user_id": None}, "two arms .* none"),
+        ({"feedback": np.nan}, r"value of feedback .* 'a' \(0 users\), 'b' \(0 users\)"),
+    ],
 )
 def test_logs_without_two_arms_are_refused(
     tmp_path: Path, change: dict[str, str], message: str
@@ -67,6 +76,66 @@ def test_logs_without_two_arms_are_refused(
     log(50, 0.0).to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match="no column clicks"):
         compare_arms([tmp_path / "log.parquet"], "clicks")
+
+
+@pytest.mark.parametrize("missing", [None, np.nan])
+@pytest.mark.parametrize("where", ["rows", "all rows of some users"])
+def test_rows_without_a_value_are_left_out_and_said(
+    tmp_path: Path, missing: float | None, where: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frame = log(200, 0.5).assign(feedback=lambda rows: rows.feedback.astype(float))
+    lacks = frame.index % 7 == 0 if where == "rows" else frame.user_id.str.endswith("1")
+    kept = frame[~lacks].reset_index(drop=True)
+    values = [missing if lack else v for lack, v in zip(lacks, frame.feedback, strict=True)]
+    column = pa.array(values, pa.float64(), from_pandas=False)
+    table = pa.Table.from_pandas(frame.drop(columns="feedback"), preserve_index=False)
+    pq.write_table(table.append_column("feedback", column), tmp_path / "log.parquet")
+    kept.to_parquet(tmp_path / "kept.parquet")
+    expected = compare_arms([tmp_path / "kept.parquet"])
+    assert main(["compare", str(tmp_path / "log.parquet"), "--json", str(tmp_path / "o.json")]) == 0
+    of_a, of_b = (int((lacks & (frame.arm == arm)).sum()) for arm in "ab")
+    said = f"log.parquet: feedback has no value in {of_a} rows of a and {of_b} of b"
+    assert said in capsys.readouterr().err
+    found = json.loads((tmp_path / "o.json").read_text())
+    assert found["without_value"] == [of_a, of_b]
+    for name in ("values", "users", "rows", "difference", "error", "always_low"):
+        assert found[name] == pytest.approx(getattr(expected, name)), name
+
+
+def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
+    frame = log(200, 0.5)
+    frame.to_parquet(tmp_path / "kept.parquet")
+    more = [frame[:7].assign(user_id=None), frame[-4:].assign(user_id="", arm=None)]
+    more += [frame[:3].assign(arm=None), frame[:2].assign(arm="")]
+    pd.concat([frame, *more]).to_parquet(tmp_path / "log.parquet")
+    found = compare_arms([tmp_path / "log.parquet"])
+    assert (found.without_user, found.without_arm, found.in_both) == (11, 5, 0)
+    assert "11 rows have no user_id; they are left out\n5 rows have no arm;" in str(found)
+    same = replace(found, without_user=0, without_arm=0)
+    assert same == compare_arms([tmp_path / "kept.parquet"])
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])
+def test_infinite_values_are_refused_with_their_file(tmp_path: Path, value: float) -> None:
+    frame = log(50, 0.0).assign(feedback=lambda rows: rows.feedback.astype(float))
+    frame.to_parquet(tmp_path / "a.parquet")
+    frame.loc[[3, 9], "feedback"] = value
+    frame.to_parquet(tmp_path / "b.parquet")
+    files = [tmp_path / "a.parquet", tmp_path / "b.parquet"]
+    with pytest.raises(InputError, match=r"b\.parquet: feedback is infinite .* in 2 rows"):
+        compare_arms(files)
+
+
+@pytest.mark.parametrize("kind", ["int64", "int8", "float64", "category", "bool"])
+def test_arms_and_values_of_any_type_are_the_same(tmp_path: Path, kind: str) -> None:
+    frame = log(100, 0.5)
+    frame.to_parquet(tmp_path / "text.parquet")
+    expected = compare_arms([tmp_path / "text.parquet"], arms=("a", "b"))
+    arm = (frame.arm == "b").astype(int).astype(kind)
+    typed = frame.assign(arm=arm, feedback=frame.feedback.astype(bool))
+    typed.to_parquet(tmp_path / "typed.parquet")
+    found = compare_arms([tmp_path / "typed.parquet"])
+    assert replace(found, arms=("a", "b")) == expected
 
 
 def test_looking_every_day_finds_a_difference_that_is_not_there_in_few_tests() -> None:

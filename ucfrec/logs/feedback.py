@@ -8,7 +8,7 @@ from typing import Final
 import duckdb
 
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.tables import PANDAS_INDEX, Table, is_number, quoted, text
+from ucfrec.logs.tables import PANDAS_INDEX, Table, first_and_more, is_number, quoted, text
 
 _NUMBER_LIKE: Final = r"[-+]?[$€£]?(\d+|\d{1,3}([., ']\d{3})+)([.,]\d+)?\s*[%$€£]?"
 """Text that means a number, though it may not be written as one."""
@@ -70,10 +70,8 @@ def feedback_columns(
 
 
 def _note_left_out(table: Table, name: str, why: str) -> None:
-    more = f" and {len(table.files) - 1} more" if len(table.files) > 1 else ""
-    warnings.warn(
-        f"{table.files[0]}{more}: column {name} is left out: {why}", InputNote, stacklevel=5
-    )
+    files = first_and_more(table.files)
+    warnings.warn(f"{files}: column {name} is left out: {why}", InputNote, stacklevel=5)
 
 
 @dataclass(frozen=True)

@@ -165,6 +165,11 @@ def quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
+def first_and_more(files: Sequence[Path]) -> str:
+    """The first file, and how many more there are, for messages."""
+    return str(files[0]) + (f" and {len(files) - 1} more" if len(files) > 1 else "")
+
+
 def is_integer(kind: str) -> bool:
     """Whether a DuckDB type holds whole numbers."""
     return _INTEGER.fullmatch(kind) is not None
@@ -220,9 +225,8 @@ def open_tables(
         else:
             tables.append(opened)
     if not tables:
-        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
         raise InputError(
-            f"{files[0]}{more} is empty (0 rows); remove it from the input or fetch it again"
+            f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"
         )
     return _with_whole_numbers(tables)
 

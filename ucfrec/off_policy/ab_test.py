@@ -1,29 +1,33 @@
 """The difference between two runs that shared the users: an A/B test on joined exposures."""
 
 import math
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Final
 
+import duckdb
 import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import engine
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
-from ucfrec.logs.tables import is_number, open_tables, quoted
+from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quoted
 from ucfrec.off_policy.intervals import cluster_means
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
+_LARGEST: Final = 1e100
+"""Values beyond are refused, as infinite ones are: their squares would not be finite."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,13 @@ class Comparison:
     values: tuple[float, float]
     users: tuple[int, int]
     rows: tuple[int, int]
+    """Rows with a value, which count."""
+    without_value: tuple[int, int]
+    """Rows of these arms without a value, which are left out."""
+    without_user: int
+    """Rows without a user, which are left out."""
+    without_arm: int
+    """Rows of a user without an arm, which are left out."""
     in_both: int
     """Users who were in both arms; their rows are left out."""
     difference: float
@@ -55,6 +66,9 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
+        for lacking, name in ((self.without_user, schema.USER_ID), (self.without_arm, schema.ARM)):
+            if lacking:
+                lines.append(f"{lacking:,} rows have no {name}; they are left out")
         if self.in_both:
             lines.append(f"{self.in_both:,} users were in both arms; their rows are left out")
         first, second = self.arms
@@ -110,19 +124,33 @@ def compare_arms(
         expected: difference that the always-valid interval is tuned for, fixed beforehand; None for
             5% of the first arm's value.
 
+    An `InputNote` says how many rows have no value in the column; they are left out.
+
     Raises:
-        InputError: a column is missing or no number, or there are not two arms with two users each.
+        InputError: a column is missing or no number, a value is infinite, or there are not two arms
+            with two users each.
     """
-    found, in_both = _by_user(paths, column, memory_limit)
+    log = _by_user(paths, column, memory_limit)
+    found = log.of_arms
     names = arms or tuple(sorted(found, key=lambda name: -len(found[name]))[:2])
     if len(names) != 2 or not all(len(found.get(name, ())) > 1 for name in names):
-        there = ", ".join(map(repr, sorted(found))) or "none"
+        there = ", ".join(f"{name!r} ({len(found[name]):,} users)" for name in sorted(found))
         raise InputError(
-            f"two arms with two users each are needed, the logs have {there}; write exposures with "
-            "serve --split, or name two with --arms"
+            f"{log.name}: two arms with two users each who have a value of {column} are needed, "
+            f"the logs have {there or 'none'}; write exposures with serve --split, or name two "
+            "with --arms"
         )
     if arms is None and len(found) > 2:
         raise InputError(f"the logs have {len(found)} arms; name two of them with --arms A,B")
+    first, second = names
+    lacking = log.without_value[first], log.without_value[second]
+    if any(lacking):
+        warnings.warn(
+            f"{log.name}: {column} has no value in {lacking[0]:,} rows of {first} and "
+            f"{lacking[1]:,} of {second}, which are left out; write 0 where that is meant",
+            InputNote,
+            stacklevel=2,
+        )
     values, errors = zip(*(_mean(found[name]) for name in names), strict=True)
     difference, variance = values[1] - values[0], errors[0] ** 2 + errors[1] ** 2
     error = math.sqrt(variance)
@@ -131,11 +159,14 @@ def compare_arms(
         always = always_valid(difference, variance, expected or EXPECTED * abs(values[0]) or error)
     return Comparison(
         column,
-        (names[0], names[1]),
+        (first, second),
         values,
-        (len(found[names[0]]), len(found[names[1]])),
-        (int(found[names[0]][:, 1].sum()), int(found[names[1]][:, 1].sum())),
-        in_both,
+        (len(found[first]), len(found[second])),
+        (int(found[first][:, 1].sum()), int(found[second][:, 1].sum())),
+        lacking,
+        log.without_user,
+        log.without_arm,
+        log.in_both,
         difference,
         error,
         difference - _NORMAL * error,
@@ -151,10 +182,21 @@ def _mean(rows: Float64Array) -> tuple[float, float]:
     return float(means[0]), float(errors[0])
 
 
-def _by_user(
-    paths: Sequence[str | Path], column: str, memory_limit: str
-) -> tuple[dict[str, Float64Array], int]:
-    """Sums of the column and numbers of rows (U, 2) of the users of each arm, by its name."""
+@dataclass(frozen=True)
+class _Log:
+    """What the logs have of a column."""
+
+    name: str
+    """The first file, and how many more there are."""
+    of_arms: dict[str, Float64Array]
+    """(U, 2) sums of the values and their number, of the users of each arm who have one."""
+    without_value: dict[str, int]
+    without_user: int
+    without_arm: int
+    in_both: int
+
+
+def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Log:
     files = log_files(paths)
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
@@ -167,23 +209,62 @@ def _by_user(
                     raise InputError(
                         f"{table.files[0]} has no column {name}; give the log of ucfrec join"
                     )
-            if not is_number(table.columns[column]):
+            kind = table.columns[column]
+            if not is_number(kind) and kind != "BOOLEAN":
                 raise InputError(f"{table.files[0]}: {column} is not a number; name another column")
         with explained(connection, tables, folder):
-            rows = " UNION ALL BY NAME ".join(
-                f"SELECT CAST({schema.USER_ID} AS VARCHAR) AS who, {schema.ARM} AS arm, "
-                f"CAST({quoted(column)} AS DOUBLE) AS value FROM {table.sql}"
-                for table in tables
-            )
             connection.execute(
-                "CREATE TABLE of_users AS SELECT who, arm, sum(value) AS value, count(*) AS shown, "
-                f"count(*) OVER (PARTITION BY who) AS arms FROM ({rows}) WHERE arm != '' "
-                "GROUP BY who, arm"
+                "CREATE TABLE of_users AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
+                "count(value) AS shown, count(*) AS rows, "
+                f"count_if(abs(value) > {_LARGEST}) AS beyond, "
+                "count(arm) OVER (PARTITION BY who) AS arms "
+                f"FROM ({_rows(tables, column)}) GROUP BY who, arm"
             )
-            query = "SELECT arm, value, shown FROM of_users WHERE arms = 1 ORDER BY arm, who"
-            kept = connection.sql(query).fetchnumpy()
-            both = "SELECT count(DISTINCT who) FROM of_users WHERE arms > 1"
-            ((in_both,),) = connection.sql(both).fetchall()
-    names = np.asarray(kept[schema.ARM], dtype=str)
-    pairs = np.stack([kept["value"], kept["shown"].astype(np.float64)], axis=1)
-    return {str(name): pairs[names == name] for name in np.unique(names)}, int(in_both)
+            kept = connection.sql(
+                "SELECT arm, value, shown, rows FROM of_users "
+                "WHERE who IS NOT NULL AND arm IS NOT NULL AND arms = 1 ORDER BY arm, who"
+            ).fetchnumpy()
+            ((in_both, nobody, no_arm, beyond),) = connection.sql(
+                "SELECT count(DISTINCT who) FILTER (arms > 1), "
+                "coalesce(sum(rows) FILTER (who IS NULL), 0), "
+                "coalesce(sum(rows) FILTER (who IS NOT NULL AND arm IS NULL), 0), "
+                "coalesce(sum(beyond), 0) FROM of_users"
+            ).fetchall()
+            if beyond:
+                raise _beyond(connection, tables, column)
+    names, shown = np.asarray(kept[schema.ARM], dtype=str), kept["shown"]
+    pairs = np.stack([kept["value"], shown.astype(np.float64)], axis=1)
+    arms = [str(name) for name in np.unique(names)]
+    return _Log(
+        first_and_more(files),
+        {name: pairs[(names == name) & (shown > 0)] for name in arms},
+        {name: int((kept["rows"] - shown)[names == name].sum()) for name in arms},
+        int(nobody),
+        int(no_arm),
+        int(in_both),
+    )
+
+
+def _rows(tables: Sequence[Table], column: str) -> str:
+    """SQL of the rows: `who`, `arm` and `value`, NULL where there is none."""
+    return " UNION ALL BY NAME ".join(
+        f"SELECT nullif(CAST({schema.USER_ID} AS VARCHAR), '') AS who, "
+        f"nullif(CAST({schema.ARM} AS VARCHAR), '') AS arm, "
+        f"CAST({quoted(column)} AS DOUBLE) AS value FROM {table.sql}"
+        for table in tables
+    )
+
+
+def _beyond(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], column: str
+) -> InputError:
+    """Error for infinite values: names the file with the most."""
+    counts = {}
+    for single in [replace(table, files=(file,)) for table in tables for file in table.files]:
+        query = f"SELECT count_if(abs(value) > {_LARGEST}) FROM ({_rows([single], column)})"
+        ((counts[single.files[0]],),) = connection.sql(query).fetchall()
+    file = max(counts, key=lambda each: counts[each])
+    return InputError(
+        f"{file}: {column} is infinite or beyond ±{_LARGEST:g} in {counts[file]:,} rows; correct "
+        "the values, or remove them to leave the rows out"
+    )

@@ -173,7 +173,8 @@ def _setting_error(
     known = list(_fields(table))
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):
-        return cause
+        # Not the same one: it would hold `error`, which holds it, and Python finds no cycles there.
+        return SettingError(str(cause), *cause.keys)
     # Pydantic locates positional arguments by their index.
     at = first["loc"][0]
     key = known[at] if isinstance(at, int) and at < len(known) else str(at)

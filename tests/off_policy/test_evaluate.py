@@ -60,3 +60,21 @@ def test_an_item_twice_on_a_page_is_said(
     with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
     assert any("3 rows repeat the user, item and time" in each for each in report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--reward-range", "0.2", "0.1"], "the reward range is 0.2 to 0.1; name the least one"),
+        (["--discount", "2"], "discount is 2.0; it must be"),
+        (["--lift", "0"], "wanted_lift is 0.0; it must be"),
+    ],
+)
+def test_options_are_checked_before_logs_are_opened(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: list[str], says: str
+) -> None:
+    (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
+    assert main(["ope", str(folder / "run"), str(tmp_path / "broken.parquet"), *option]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(f"ucfrec ope: {says}")

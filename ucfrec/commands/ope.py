@@ -134,6 +134,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("--scored needs what ucfrec score wrote; name it after the run")
     if options.scored and options.filter_seen:
         raise InputError("--scored takes probabilities as they are; give --filter-seen to score")
+    given = _estimates_given(options)
     # On the test split, the weights that have not learned from it.
     split = not options.logs
     policies = [TrainedPolicy.load(run, options.checkpoint, split=split) for run in runs]
@@ -145,7 +146,7 @@ def run(options: argparse.Namespace) -> None:
     for name, candidate in zip(names, candidates, strict=True):
         if len(candidates) > 1:
             print(f"\n{name}:")
-        reports[name] = _evaluated(options, candidate)
+        reports[name] = _evaluated(options, candidate, given)
     if len(candidates) == 1:
         _write(options, reports, {})
         return
@@ -182,7 +183,9 @@ class _Candidate:
         }
 
 
-def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicyReport":
+def _evaluated(
+    options: argparse.Namespace, candidate: _Candidate, given: "EstimateOptions"
+) -> "OffPolicyReport":
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.scored import evaluate_scored
@@ -190,7 +193,7 @@ def _evaluated(options: argparse.Namespace, candidate: _Candidate) -> "OffPolicy
     from ucfrec.reporting.tables import format_rows
 
     trained = candidate.trained
-    arguments = {"rule": candidate.rule, "seed": options.seed, "options": _estimates_given(options)}
+    arguments = {"rule": candidate.rule, "seed": options.seed, "options": given}
     if options.scored:
         found = evaluate_scored(trained, options.logs, **arguments)
     else:

@@ -521,6 +521,10 @@ WRONG: dict[str, tuple[Callable[[Recommender, pd.DataFrame], object], str]] = {
         lambda p, log: p.ope(log, options={"discount": 0.9}),
         r"options is {'discount': 0\.9}; give EstimateOptions",
     ),
+    "logs of one user": (
+        lambda p, log: p.ope(log[log.user_id == log.user_id.iloc[0]]),
+        "^data: the logs have 1 session of one user",
+    ),
     "a run's name": (lambda p, log: p.rank(log, others=["run"]), "others has 'run'; give a Rec"),
     "nested candidates": (
         lambda p, log: p.recommend(log, candidates=[[1], [2, 3]]),

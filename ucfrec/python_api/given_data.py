@@ -179,7 +179,8 @@ def logs_given(
             read = logged_sessions(trained, files, given, keep_unknown)
             logged = stack.enter_context(read)
             note_dropped("", _not_noted(logged.report), logged.report["rows_read"])
-        yield logged
+        with _errors_in_words_of_python(frame):
+            yield logged
 
 
 @contextmanager
@@ -266,20 +267,27 @@ def in_words_of_python(file: Path | None = None) -> Iterator[None]:
         file: scratch file of the argument `data`.
     """
 
-    def translated(message: object) -> str:
-        text = str(message) if file is None else str(message).replace(str(file), "data")
-        for option, python in _OPTIONS:
-            text = re.sub(option, python, text)
-        return text
-
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")
-        try:
+        with _errors_in_words_of_python(file):
             yield
-        except InputError as error:
-            raise InputError(translated(error)) from None
     for each in noted:
-        warnings.warn(each.category(translated(each.message)), stacklevel=_level_of_caller())
+        warnings.warn(each.category(_translated(each.message, file)), stacklevel=_level_of_caller())
+
+
+@contextmanager
+def _errors_in_words_of_python(file: Path | None) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        raise InputError(_translated(error, file)) from None
+
+
+def _translated(message: object, file: Path | None) -> str:
+    text = str(message) if file is None else str(message).replace(str(file), "data")
+    for option, python in _OPTIONS:
+        text = re.sub(option, python, text)
+    return text
 
 
 def _level_of_caller() -> int:

@@ -357,9 +357,14 @@ def test_long_sessions_overflow_nothing() -> None:
     [
         ({"propensity": np.zeros(10)}, "propensities must be above 0"),
         ({"propensity": np.full(10, 1.5)}, "not a density"),
-        ({"target": np.full(10, 1.1)}, "between 0 and 1"),
-        ({"target": np.full(10, np.nan)}, "target is not finite at 10 steps"),
-        ({"reward": np.full(10, np.inf)}, "reward is not finite"),
+        (
+            {"target": np.r_[np.ones(7), 1.1, 1.2, 1]},
+            r"between 0 and 1; 2 of 10 are outside, the first is 1\.1$",
+        ),
+        ({"target": np.full(10, -0.1), "densities": True}, "0 or more; 10 of 10 are outside"),
+        ({"propensity": np.full(10, np.inf), "densities": True}, "10 of 10 .* the first is inf"),
+        ({"target": np.full(10, np.nan)}, "target probability is not finite at 10 of 10 steps"),
+        ({"reward": np.full(10, np.inf)}, "reward is not finite at 10 of 10 steps"),
         ({"reward": np.zeros(9)}, r"reward has shape \(9,\)"),
         ({"session": np.arange(10)[::-1]}, "numbered from 0 in order"),
         ({"session": np.arange(10) * 2}, "numbered from 0 in order"),

@@ -106,9 +106,9 @@ def test_what_was_not_scored_by_the_run_and_rule_is_refused(
         ("session", pa.string(), "column session has type string, not whole numbers"),
         ("timestamp", pa.string(), "column timestamp has type string, not whole numbers"),
         ("reward", pa.string(), "column reward has type string, not floating point numbers"),
-        ("propensity", 0.0, "propensities must be above 0"),
-        ("probability", 1e300, "lie between 0 and 1"),
-        ("probability", math.nan, "target is not finite"),
+        ("propensity", 0.0, r"rows 1 to 70: propensities must be above 0 .*; 70 of 70 are outside"),
+        ("probability", 1e300, "lie between 0 and 1; 70 of 70 are outside, the first is 1e\\+300"),
+        ("probability", math.nan, "target probability is not finite at 70 of 70 steps"),
     ],
 )
 def test_scored_rows_with_other_values_are_refused(
@@ -116,16 +116,53 @@ def test_scored_rows_with_other_values_are_refused(
 ) -> None:
     parts = scored_parts(folder, trained, tmp_path, 0)
     file = next(iter(sorted(parts.iterdir())))
+    rewrite(file, column, values)
+    with pytest.raises(InputError, match=f"part-0.parquet.*{says}"):
+        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
+
+
+def rewrite(file: Path, column: str, values: object, rows: slice = slice(None)) -> None:
+    """Cast a column of a file, or replace its values in some rows."""
     table = pq.read_table(file)
-    changed = (
-        table[column].cast(values)
-        if isinstance(values, pa.DataType)
-        else pa.array([values] * table.num_rows)
-    )
+    changed = table[column]
+    if isinstance(values, pa.DataType):
+        changed = changed.cast(values)
+    else:
+        given = changed.to_numpy().astype(np.float64)
+        given[rows] = values
+        changed = pa.array(given)
     table = table.set_column(table.schema.get_field_index(column), column, changed)
     pq.write_table(table, file)
-    with pytest.raises(InputError, match=says):
-        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("reward", math.inf), ("propensity", 2), ("probability", -1)]
+)
+def test_the_file_and_rows_of_a_wrong_value_are_named(
+    folder: Path,
+    trained: TrainedPolicy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    column: str,
+    value: float,
+) -> None:
+    parts = scored_parts(folder, trained, tmp_path, 0)
+    rewrite(parts / "part-2.parquet", column, value, slice(9, 11))
+    monkeypatch.setattr(scored, "_BATCH_ROWS", 7)
+    with pytest.raises(InputError, match=r"part-2\.parquet, rows 8 to 14: .* 2 of 7 "):
+        evaluate_scored(trained, [parts], rule=RULE, seed=0, options=EstimateOptions())
+
+
+def test_rounding_errors_above_one_count_as_one(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    parts = scored_parts(folder, trained, tmp_path, 0)
+    values = []
+    for certain in (1.0, 1.0000000002):
+        rewrite(parts / "part-0.parquet", "probability", certain, slice(0, 5))
+        found = evaluate_scored(trained, [parts], rule=RULE, seed=0, options=EstimateOptions())
+        values.append([row.value for row in found.rows])
+    assert values[0] == values[1]
 
 
 def test_damaged_scored_rows_are_named(

@@ -5,16 +5,23 @@ target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,�
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
+from ucfrec.off_policy.array_inputs import array_of, ids, numbers, whole_numbers
 
 _LARGEST = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
+_ROUNDING = 1e-6
+"""By how much a probability may be above 1; it counts as 1."""
+_MAY_LACK = ("propensity", "cluster_propensity")
+_PROBABILITIES = (*_MAY_LACK, "target", "cluster_target")
+_NUMBERS = ("reward", *_PROBABILITIES, "per_decision", "by_step")
+"""What there is one number of a step."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,10 @@ class Modelled:
     logged_reward: Float64Array
     """(N,) mean reward of the logged action."""
 
+    def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            object.__setattr__(self, name, numbers(f"modelled {name}", values))
+
 
 @dataclass(frozen=True)
 class ItemGroups:
@@ -40,14 +51,22 @@ class ItemGroups:
     target: Float32Array
     """(N, K) the evaluated policy's probability of every group."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "number", whole_numbers("number of the group", self.number))
+        object.__setattr__(self, "target", array_of("target of groups", self.target, dimensions=2))
+
 
 @dataclass(frozen=True)
 class LoggedSteps:
     """N logged steps of S sessions, a session's steps together and in order.
 
+    Lists and pandas Series are taken as well, by place and not by index; numbers are kept as
+    float64, and users that are not integers are numbered. Masked and missing propensities are
+    unknown ones.
+
     Raises:
-        InputError: lengths differ, sessions are not numbered in order, a number is not finite, a
-            probability or the discount is out of its range.
+        InputError: lengths differ, sessions are not numbered in order, a number is missing, masked
+            or not finite, a user is missing, a probability or the discount is out of its range.
     """
 
     session: IntArray
@@ -82,6 +101,7 @@ class LoggedSteps:
     `ucfrec.off_policy.pages`."""
 
     def __post_init__(self) -> None:
+        self._convert()
         n = len(self.session)
         rises = np.diff(self.session, prepend=-1)
         if n == 0 or rises[0] != 1 or not np.isin(rises, (0, 1)).all():
@@ -89,10 +109,10 @@ class LoggedSteps:
         finite = {"reward": self.reward}
         if self.model is not None:
             finite |= {f"modelled {name}": values for name, values in vars(self.model).items()}
+        finite |= {name: getattr(self, name) for name in ("per_decision", "by_step")}
         for name, values in finite.items():
-            _require_shape(name, values, n)
-            if not np.isfinite(values).all():
-                raise InputError(f"{name} is not finite at {(~np.isfinite(values)).sum()} steps")
+            if values is not None:
+                _require_finite(name, values, n)
         most = np.inf if self.densities else 1.0
         _require_probabilities(self.propensity, self.target, n, most)
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
@@ -110,6 +130,20 @@ class LoggedSteps:
             )
         if not 0 < self.discount <= 1:
             raise InputError(f"discount is {self.discount}; it is above 0 and at most 1")
+
+    def _convert(self) -> None:
+        """Replace what was given by the arrays to compute with."""
+        keep = partial(object.__setattr__, self)
+        keep("session", whole_numbers("session", self.session))
+        for name in _NUMBERS:
+            if (values := getattr(self, name)) is None:
+                continue
+            found = numbers(name, values, masked_is_missing=name in _MAY_LACK)
+            if name in _PROBABILITIES and not self.densities:
+                found = _without_rounding(found)
+            keep(name, found)
+        if self.user is not None:
+            keep("user", ids("user", self.user))
 
     @cached_property
     def first(self) -> IntArray:
@@ -221,10 +255,8 @@ class LoggedSteps:
 
     def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
         """What there is one of a step, at the given steps; without the sessions."""
-        names = ["reward", "propensity", "target", "cluster_propensity", "cluster_target"]
-        names += ["per_decision", "by_step"]
         parts: dict[str, Any] = {
-            name: values[rows] for name in names if (values := getattr(self, name)) is not None
+            name: values[rows] for name in _NUMBERS if (values := getattr(self, name)) is not None
         }
         if self.model is not None:
             parts["model"] = Modelled(*(values[rows] for values in vars(self.model).values()))
@@ -243,9 +275,21 @@ class LoggedSteps:
         return np.asarray(np.minimum(upto, _LARGEST))
 
 
+def _without_rounding(probabilities: Float64Array) -> Float64Array:
+    """The probabilities without rounding errors above 1; the same array where there are none."""
+    above = (probabilities > 1) & (probabilities <= 1 + _ROUNDING)
+    return np.where(above, 1.0, probabilities) if above.any() else probabilities
+
+
 def _require_shape(name: str, values: Float64Array, n: int) -> None:
     if values.shape != (n,):
         raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
+
+
+def _require_finite(name: str, values: Float64Array, n: int) -> None:
+    _require_shape(name, values, n)
+    if (others := ~np.isfinite(values)).any():
+        raise InputError(f"{name} is not finite at {others.sum():,} of {n:,} steps; correct it")
 
 
 def _require_probabilities(
@@ -255,13 +299,20 @@ def _require_probabilities(
     most: what they may not exceed; infinity for densities.
     """
     _require_shape("propensity", propensity, n)
-    _require_shape("target", target, n)
-    if not np.isfinite(target).all():
-        raise InputError(f"target is not finite at {(~np.isfinite(target)).sum()} steps")
-    if not ((target >= 0) & (target <= most)).all():
-        raise InputError("probabilities of the evaluated policy lie between 0 and 1")
-    if not (np.isnan(propensity) | (propensity > 0) & (propensity <= most)).all():
+    _require_finite("target probability", target, n)
+    if (others := (target < 0) | (target > most)).any():
+        where = "are 0 or more" if most > 1 else "lie between 0 and 1"
+        raise InputError(
+            f"probabilities of the evaluated policy {where}; {_others(target, others)}"
+        )
+    if (others := (propensity <= 0) | (propensity > most) | np.isinf(propensity)).any():
         raise InputError(
             "propensities must be above 0 and at most 1, the probability of the item shown and not "
-            "a density; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
+            f"a density; {_others(propensity, others)}; correct that column (arrays of vector "
+            "actions: LoggedSteps(densities=True))"
         )
+
+
+def _others(values: Float64Array, others: BoolArray) -> str:
+    """How many values `others` marks, and the first of them."""
+    return f"{others.sum():,} of {len(values):,} are outside, the first is {values[others][0]:.10g}"

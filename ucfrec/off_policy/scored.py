@@ -39,8 +39,6 @@ _USED: Final = (
 )
 _WHOLE: Final = (schema.TIMESTAMP, SESSION)
 _NUMBERS: Final = (schema.REWARD, schema.PROPENSITY, PROBABILITY)
-_ROUNDING: Final = 1e-6
-"""By how much a probability may be above 1."""
 _WEIGHED: Final = (schema.USER_ID, SESSION, schema.REWARD, schema.PROPENSITY, PROBABILITY)
 _NO_DR: Final = "from scored rows: without models of the reward there is no DR"
 
@@ -183,7 +181,7 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
         InputError: they are not in the order in which `score` writes them.
     """
     session, user, users = -1, None, 0
-    for rows in whole_groups(_batches(files, _WEIGHED), SESSION):
+    for rows in whole_groups(_weighed(files), SESSION):
         rises = np.diff(rows[SESSION], prepend=session)
         if rises[0] != 1 or not np.isin(rises, (0, 1)).all():
             raise InputError(
@@ -193,20 +191,38 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
         owners = rows[schema.USER_ID][rises == 1]
         new = np.append(owners[0] != user, owners[1:] != owners[:-1])
         numbers = users - 1 + np.cumsum(new)
-        steps = LoggedSteps(
-            session=rows[SESSION] - rows[SESSION][0],
-            reward=rows[schema.REWARD].astype(np.float64),
-            propensity=rows[schema.PROPENSITY].astype(np.float64),
-            target=_at_most_1(rows[PROBABILITY].astype(np.float64)),
-            discount=discount,
-        )
-        yield _Chunk(steps, numbers)
+        yield _Chunk(_steps(rows, rows[SESSION] - rows[SESSION][0], discount), numbers)
         session, user, users = rows[SESSION][-1], owners[-1], int(numbers[-1]) + 1
 
 
-def _at_most_1(probabilities: Float64Array) -> Float64Array:
-    """The probabilities without rounding errors above 1."""
-    return np.where(probabilities < 1 + _ROUNDING, np.minimum(probabilities, 1.0), probabilities)
+def _weighed(files: Sequence[Path]) -> Iterator[dict[str, Array]]:
+    """The rows of all files that are weighed.
+
+    Raises:
+        InputError: a reward or probability is none; names the file and its rows.
+    """
+    for file in files:
+        done = 0
+        for rows in _batches([file], _WEIGHED):
+            begin, done = done, done + len(rows[SESSION])
+            try:
+                _steps(rows, np.arange(done - begin))
+            except InputError as error:
+                raise InputError(
+                    f"{file}, rows {begin + 1:,} to {done:,}: {error}; name what ucfrec score "
+                    "wrote, unchanged"
+                ) from None
+            yield rows
+
+
+def _steps(rows: Mapping[str, Array], session: IntArray, discount: float = 1.0) -> LoggedSteps:
+    return LoggedSteps(
+        session,
+        reward=rows[schema.REWARD],
+        propensity=rows[schema.PROPENSITY],
+        target=rows[PROBABILITY],
+        discount=discount,
+    )
 
 
 def _summed(files: Sequence[Path], options: EstimateOptions) -> LoggedSteps:

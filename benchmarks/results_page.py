@@ -416,15 +416,16 @@ def contexts(rows: Sequence[ResultRow]) -> str:
     """Scores by context, and their mean where every file has one."""
     tasks = list(dict.fromkeys(row.task for row in rows))
     lines = []
+    ordered = sorted(rows, key=lambda row: (row.method, str(row.conditions["context"]).zfill(4)))
     for (method, context), own in grouped(
-        rows, lambda row: (row.method, row.conditions["context"])
+        ordered, lambda row: (row.method, row.conditions["context"])
     ).items():
         found = {row.task: row.value for row in own}
         mean = rounded(summary(found.values()).mean) if len(found) == len(tasks) else NONE
         cells = (rounded(found[task]) if task in found else NONE for task in tasks)
         lines.append((method, context, *cells, mean))
     head = ("method", "context", *(task.removesuffix("-zoo") for task in tasks), "mean")
-    return markdown_table(head, sorted(lines, key=lambda line: line[:2]))
+    return markdown_table(head, lines)
 
 
 def of(name: str, table: str) -> Callable[[_Files], Sequence[ResultRow]]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, PolicyConfig, SequencePolicy
+from ucfrec.policies.layers import recurrent
 from ucfrec.settings import settings_table
 
 
@@ -34,8 +35,8 @@ class GRUPolicy(SequencePolicy):
         self.gru = nn.GRU(2 * config.dim, config.dim, config.layers, batch_first=True)
 
     def features(self, windows: Windows) -> Tensor:
-        """Features (B, K, d); row t does not depend on the action of step t."""
+        """Features (B, K, d); row t depends neither on the action of step t nor on padding."""
         actions = self.head.embed(windows.actions) * windows.mask.unsqueeze(-1)
         before = torch.cat([torch.zeros_like(actions[:, :1]), actions[:, :-1]], dim=1)
-        found: Tensor = self.gru(torch.cat([self.embed_state(windows.states), before], dim=-1))[0]
-        return found
+        steps = torch.cat([self.embed_state(windows.states), before], dim=-1)
+        return recurrent(self.gru, steps, windows.mask)

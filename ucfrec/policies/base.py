@@ -190,7 +190,11 @@ class SequencePolicy(nn.Module, ABC):
 
     @abstractmethod
     def features(self, windows: Windows) -> Tensor:
-        """Inputs (B, K, d) of the action head, from normalised windows; row t ignores a_t."""
+        """Inputs (B, K, d) of the action head, from normalised windows.
+
+        Row t ignores a_t, r_t and all later steps, and how much padding is before the session:
+        windows are padded to the longest of a batch, and exported graphs to K steps.
+        """
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), for acting; subclasses may omit what it ignores."""

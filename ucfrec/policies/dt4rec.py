@@ -14,6 +14,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Heads, Layers, TokenEmbedding
 from ucfrec.policies.dt import DTConfig, DTPolicy
+from ucfrec.policies.layers import recurrent
 from ucfrec.settings import Dropout, Weight, settings_table
 
 
@@ -117,8 +118,8 @@ class PromptedEmbedding(TokenEmbedding):
 
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens of returns-to-go, states and actions, (B, K, d) each; see `TokenEmbedding`."""
-        states = _recurrent(self.states, self.embed_state(windows.states), windows.mask)
-        actions = _recurrent(self.actions, actions, windows.mask)
+        states = recurrent(self.states, self.embed_state(windows.states), windows.mask)
+        actions = recurrent(self.actions, actions, windows.mask)
         time = self._time(windows)
         return self.returns(windows), self.norm(states + time), self.norm(actions + time)
 
@@ -153,15 +154,3 @@ class RewardPrompt(nn.Module):
         hidden = F.leaky_relu(self.weight(returns))
         shares = (self.mix(hidden) + hidden).softmax(-1)  # (B, K, buckets)
         return shares @ self.embed_centre(self.centres.unsqueeze(-1))  # type: ignore[no-any-return]
-
-
-def _recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
-    """Outputs (B, K, d) of the network for left-padded inputs, run with the padding moved right."""
-    length = mask.shape[1]
-    padding = (~mask).sum(1, keepdim=True)
-    places = torch.arange(length, device=mask.device)
-
-    def rolled(x: Tensor, by: Tensor) -> Tensor:
-        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
-
-    return rolled(network(rolled(inputs, padding))[0], -padding)

@@ -173,3 +173,23 @@ def visible_tokens(valid: Tensor) -> Tensor:
     earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
     diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
     return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
+
+
+def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
+    """Outputs (B, K, d) of a network for left-padded inputs, whatever the padding before a session.
+
+    The network runs with the padding moved behind the steps.
+
+    Args:
+        network: with `batch_first=True`.
+        inputs: (B, K, c).
+        mask: (B, K) bool, false at padding.
+    """
+    length = mask.shape[1]
+    padding = (~mask).sum(1, keepdim=True)
+    places = torch.arange(length, device=mask.device)
+
+    def rolled(x: Tensor, by: Tensor) -> Tensor:
+        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
+
+    return rolled(network(rolled(inputs, padding))[0], -padding)

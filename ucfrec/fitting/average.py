@@ -36,8 +36,9 @@ class WeightAverage:
         """
         self._decay, self._start, self._step = decay, start, 0
         self._log = 0.0  # Σ log d of the steps so far
-        self._weights = {name: each.detach() for name, each in module.named_parameters()}
-        self._gradients = dict(module.named_parameters())
+        # A checkpoint has shared weights once for each name, so their averages are, too.
+        self._gradients = dict(module.named_parameters(remove_duplicate=False))
+        self._weights = {name: each.detach() for name, each in self._gradients.items()}
         self._means = {name: weights.clone() for name, weights in self._weights.items()}
         self._when: dict[str, Tensor] = {}  # `_log` at the last average of each row of a table
 

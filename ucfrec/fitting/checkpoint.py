@@ -28,7 +28,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any
     Raises:
         InputError: the disk is full, or the folder is not writable.
     """
-    plain = {name: tensor.detach().contiguous().cpu() for name, tensor in tensors.items()}
+    plain = _apart(tensors)
     with atomic_file(path) as scratch:
         scratch.touch()
         mode = scratch.stat().st_mode
@@ -43,6 +43,18 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any
             raise InputError(
                 f"{path} cannot be written ({error}); free disk space and run the command again"
             ) from None
+
+
+def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors on the CPU; safetensors refuses those that share memory, so these are copies."""
+    plain: dict[str, Tensor] = {}
+    taken = set()
+    for name, tensor in tensors.items():
+        own = tensor.detach().contiguous().cpu()
+        place = own.untyped_storage().data_ptr()
+        plain[name] = own.clone() if place in taken else own
+        taken.add(place)
+    return plain
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -176,8 +188,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
     Raises:
         InputError: they are the weights of another architecture.
     """
-    with damage_explained(path, REMEDY):
-        shapes = _shapes(build)
+    shapes = _shapes(build)
     for name in sorted(shapes.keys() & tensors.keys()):
         if shapes[name] != tensors[name].shape:
             raise InputError(
@@ -191,17 +202,21 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
             f"{path} holds weights of another architecture ({name} is only in "
             f"{'the file' if name in tensors else 'the architecture'}); restore it or train again"
         )
-    module = build()
+    with damage_explained(path, REMEDY):
+        module = build()
     load_weights(path, module, tensors)
     return module
 
 
 def _shapes(build: Callable[[], nn.Module]) -> dict[str, torch.Size]:
-    """Shapes of a module's weights, without memory for them; none if its constructor needs some."""
+    """Shapes of a module's weights, without memory for them; none if its constructor needs some.
+
+    What else is wrong with the constructor shows when the module is built with memory.
+    """
     try:
         with torch.device("meta"), _Unfilled():
             return {name: tensor.shape for name, tensor in build().state_dict().items()}
-    except NotImplementedError:
+    except Exception:  # as many kinds as there are uses of a value
         return {}
 
 

@@ -12,7 +12,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
-from ucfrec.policies.checks import require_sound
+from ucfrec.policies.checks import require_sound, require_whole
+from ucfrec.policies.layers import recurrent
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import new_policy
@@ -84,6 +85,88 @@ SHAPES: dict[str, Callable[[Net, Windows], object]] = {
     "too narrow": lambda p, w: p.net(w.states)[..., :-1],
     "no tensor": lambda p, w: (p.net(w.states), None),
 }
+
+
+PADDING: dict[str, Callable[[Net, Windows], Tensor]] = {
+    "a place in the window": lambda p, w: p.net(w.states) + torch.arange(w.mask.shape[1])[:, None],
+    "the mean over the window": lambda p, w: (
+        p.net(w.states).cumsum(1) / torch.arange(1, w.mask.shape[1] + 1)[:, None]
+    ),
+    "the number of steps": lambda p, w: p.net(w.states) + w.mask.shape[1],
+    "states of padding": lambda p, w: p.net(w.states).cumsum(1),
+}
+FAILS: dict[str, Callable[[Net, Windows], object]] = {
+    "another size": lambda p, w: w.states @ torch.zeros(99, 16),
+    "a wrong name": lambda p, w: w.state,  # type: ignore[attr-defined]
+    "nothing": lambda p, w: 1 / 0,
+}
+
+
+@pytest.mark.parametrize("what", PADDING)
+def test_what_depends_on_padding_is_refused(store: EpisodeStore, what: str) -> None:
+    with pytest.raises(InputError, match="'mine' depends on how much padding is before a session"):
+        require_sound(Net(store, PADDING[what]), store, "mine")
+
+
+@pytest.mark.parametrize("size", [1, 2, 6])
+def test_a_recurrent_network_that_skips_padding_passes(store: EpisodeStore, size: int) -> None:
+    policy = Net(store, lambda p, w: recurrent(p.gru, p.net(w.states), w.mask))  # type: ignore[arg-type]
+    policy.gru = nn.GRU(16, 16, batch_first=True)
+    object.__setattr__(policy.config, "context", size)
+    require_sound(policy, store, "mine")
+
+
+def test_features_that_are_random_are_not_taken_for_the_answer(store: EpisodeStore) -> None:
+    def random(policy: Net, windows: Windows) -> Tensor:
+        return policy.net(windows.states) + torch.randn(*windows.mask.shape, 16)
+
+    with pytest.raises(InputError, match="'mine' gives other features for the same windows"):
+        require_sound(Net(store, random), store, "mine")
+
+
+@pytest.mark.parametrize("what", FAILS)
+def test_features_that_fail_are_named(store: EpisodeStore, what: str) -> None:
+    with pytest.raises(InputError, match=r"^the policy 'mine' fails in features \(") as caught:
+        require_sound(Net(store, FAILS[what]), store, "mine")  # type: ignore[arg-type]
+    assert caught.value.__cause__ is not None
+    with pytest.raises(type(caught.value.__cause__)):
+        require_sound(Net(store, FAILS[what]), store, "dt")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda pair: pair[0], lambda pair: (float(pair[0]), {}), lambda _: None, lambda _: 1 / 0],
+)
+def test_a_loss_that_gives_no_pair_is_refused(
+    store: EpisodeStore, change: Callable[[tuple[Tensor, dict[str, Tensor]]], object]
+) -> None:
+    class Other(Net):
+        def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+            return change(super().loss(windows))  # type: ignore[return-value]
+
+    with pytest.raises(InputError, match=r"loss of the policy 'mine'|'mine' fails in loss"):
+        require_sound(Other(store, lambda p, w: p.net(w.states)), store, "mine")
+
+
+@pytest.mark.parametrize("kept", ["parameters", "a buffer", "an attribute"])
+def test_state_outside_parameters_and_buffers_is_refused(store: EpisodeStore, kept: str) -> None:
+    def policy() -> Net:
+        net = Net(store, lambda p, w: p.net(w.states) * p.scale)  # type: ignore[operator]
+        if kept == "a buffer":
+            net.register_buffer("scale", torch.ones(()))
+        else:
+            net.scale = 1.0  # type: ignore[assignment]
+        return net.eval()
+
+    mine, rebuilt = policy(), policy()
+    if kept != "parameters":
+        mine.scale *= 7  # type: ignore[operator, assignment]
+    rebuilt.load_state_dict(mine.state_dict())
+    if kept == "an attribute":
+        with pytest.raises(InputError, match=r"'mine' keeps state outside .*; use register_buffer"):
+            require_whole(mine, rebuilt, store, "mine")
+    else:
+        require_whole(mine, rebuilt, store, "mine")
 
 
 @pytest.mark.parametrize("what", READS)

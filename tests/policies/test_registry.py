@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import load_trained
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import resolve_config
@@ -44,6 +46,55 @@ class Mine(SequencePolicy):
     def features(self, windows):
         return self.net(windows.states)
 
+class Tied(Mine):
+    def __init__(self, config, sizes):
+        super().__init__(config, sizes)
+        self.one, self.two = (nn.Linear(config.dim, config.dim) for _ in range(2))
+        self.two.weight = self.one.weight
+
+    def features(self, windows):
+        return self.two(self.one(self.net(windows.states)))
+
+class ReadsValue(Mine):
+    def __init__(self, config, sizes):
+        super().__init__(config, sizes)
+        assert float(self.net[0].weight.abs().mean()) > 0
+
+class Starts(Mine):
+    scale = 1.0
+
+    def start_from(self, train):
+        self.scale = 7.0
+
+    def features(self, windows):
+        return self.scale * self.net(windows.states)
+
+class Learns(Starts):
+    def start_from(self, train):
+        pass
+
+    def loss(self, windows):
+        self.scale += self.training
+        return super().loss(windows)
+
+class Extra(Mine):
+    def get_extra_state(self):
+        return {}
+
+    def set_extra_state(self, state):
+        pass
+
+class NoFeatures(SequencePolicy):
+    pass
+
+class NoSizes(Mine):
+    def __init__(self, config):
+        super().__init__(config, {"state": 3})
+
+class NoBase(Mine):
+    def __init__(self, config, sizes):
+        pass
+
 class Sees(SequencePolicy):
     def features(self, windows):
         return windows.actions
@@ -75,6 +126,14 @@ class Unchecked(SequencePolicy):
 ENTRY_POINTS = """[ucfrec.policies]
 mine = my_learner:Mine
 dt = my_learner:Mine
+tied = my_learner:Tied
+reads-value = my_learner:ReadsValue
+starts = my_learner:Starts
+learns = my_learner:Learns
+extra = my_learner:Extra
+no-features = my_learner:NoFeatures
+no-sizes = my_learner:NoSizes
+no-base = my_learner:NoBase
 sees = my_learner:Sees
 normalizes = my_learner:Normalizes
 values = my_learner:Values
@@ -138,6 +197,43 @@ def test_a_policy_that_reads_the_answer_leaves_no_run(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("name", ["tied", "reads-value"])
+@pytest.mark.parametrize("average", [0.0, 0.9])
+def test_a_policy_is_read_back_as_it_was_trained(tmp_path: Path, name: str, average: float) -> None:
+    store = small_store(tmp_path / "store")
+    given = ["train.steps=30", "train.warmup_steps=0", "policy.dim=8", f"train.average={average}"]
+    train_run(store, tmp_path / "run", resolve_config(name, None, given))
+    windows = store.windows(np.arange(4), np.full(4, 3), 6)
+    for each in ("best", "last"):
+        policy = TrainedPolicy.load(tmp_path / "run", each).policy
+        assert policy.act(windows).shape == (4, 2)
+        if name == "tied":
+            weights = load_trained(tmp_path / "run" / "policy" / f"{each}.safetensors")
+            assert torch.equal(weights["one.weight"], weights["two.weight"])
+            assert torch.equal(weights["one.weight"], policy.one.weight)  # type: ignore[arg-type, union-attr]
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("starts", "keeps state outside parameters and buffers"),
+        ("learns", "keeps state outside parameters and buffers"),
+        ("extra", "keeps _extra_state, which is no tensor"),
+        ("no-features", "fails in __init__.* abstract method"),
+        ("no-sizes", "fails in __init__.* positional arguments"),
+        ("no-base", "fails in __init__"),
+    ],
+)
+def test_a_policy_that_cannot_be_read_back_is_refused(tmp_path: Path, name: str, says: str) -> None:
+    store = small_store(tmp_path / "store")
+    config = resolve_config(name, None, ["train.steps=2", "policy.dim=8"])
+    with pytest.raises(InputError, match=f"the policy '{name}' {says}"):
+        train_run(store, tmp_path / "run", config)
+    assert (tmp_path / "run").exists() == (name == "learns")
+
+
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_name_is_a_learner(name: str) -> None:
     assert issubclass(policy_class(name), SequencePolicy)
@@ -197,7 +293,7 @@ def test_an_installed_learner_that_cannot_be_built_leaves_nothing(
         raise ZeroDivisionError("of my own")
 
     monkeypatch.setattr(mine, "__init__", broken)
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(InputError, match=r"policy 'mine' fails in __init__.* of my own"):
         train_run(store, tmp_path / "run", config)
     assert not (tmp_path / "run").exists()
     monkeypatch.setattr(mine, "__init__", built)

@@ -149,6 +149,39 @@ def test_the_graph_recommends_what_the_policy_does(
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
 
 
+@pytest.fixture
+def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example of a plug-in, as pip installs it."""
+    plugin = Path(__file__).parents[2] / "examples" / "plugin"
+    info = tmp_path / "site" / "ucfrec_gru-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: ucfrec-gru\nVersion: 0.1.0\n")
+    (info / "entry_points.txt").write_text("[ucfrec.policies]\ngru = ucfrec_gru:GRUPolicy\n")
+    monkeypatch.syspath_prepend(str(plugin))
+    monkeypatch.syspath_prepend(str(info.parent))
+
+
+@pytest.mark.usefixtures("example")
+def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None:
+    store = store_of(tagged_log(), tmp_path, reward="reward", session_by="gap", embedding_size=6)
+    settings = [*SETTINGS, "policy.context=12", "policy.layers=2"]
+    Recommender("gru", settings=settings).fit(store, tmp_path / "run")
+    given, log = TrainedPolicy.load(tmp_path / "run"), histories()
+    rule = DecisionRule(3.0)
+    assert export(given, tmp_path / "out", rule=rule, k=20).difference <= 1e-5
+    # Alone, a session has less padding before it than in a graph or beside a longer session.
+    for users in (log.user_id.unique(), *([user] for user in log.user_id.unique()[:3])):
+        some = log[log.user_id.isin(users)].groupby("user_id").tail(3)
+        expected = pd.concat(
+            recommend(given, histories_of_frame(given, some, LogMapping()), 20, rule=rule)
+        )
+        found = ranked(tmp_path / "out", given, some, LogMapping())
+        pd.testing.assert_frame_equal(
+            found, expected[[*found.columns]].reset_index(drop=True),
+            check_dtype=False, rtol=1e-4, atol=1e-4,
+        )  # fmt: skip
+
+
 def test_by_default_all_items_of_a_small_catalogue_are_chosen(trained: TrainedPolicy) -> None:
     assert RuleGraph(trained.scorer(), trained.name, None).k == 24
 

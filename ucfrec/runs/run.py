@@ -28,7 +28,8 @@ from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_withi
 from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.checks import require_sound
+from ucfrec.policies.checks import require_sound, require_whole
+from ucfrec.policies.registry import BUILT_IN
 from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
@@ -43,7 +44,14 @@ from ucfrec.runs.record import (
 )
 from ucfrec.runs.samples import SAMPLES, sample_recommendations
 from ucfrec.runs.shared_stages import OWN, SharedStages
-from ucfrec.runs.start import begin, new_policy, require_startable, training_views
+from ucfrec.runs.start import (
+    begin,
+    new_policy,
+    policy_sizes,
+    rebuilt,
+    require_startable,
+    training_views,
+)
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.runs.warm_start import rule_to_start_from, start_warm
 from ucfrec.user_model.model import UserModel
@@ -128,6 +136,7 @@ def train_run(
             fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
+        _require_whole(run.policy, run.train, config)
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.with_entries(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
@@ -163,6 +172,7 @@ def _prepare_inputs(
     policy = new_policy(train, config)
     if distributed.leads():
         require_sound(policy, train, config.policy_name)
+        _require_whole(policy, train, config)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
         record = RunRecord.read(out).reopened(out, INPUTS)
@@ -185,6 +195,13 @@ def _prepare_inputs(
         *(record, out, config, shared, device),
         *(logged, held_out, view, validation, policy.to(device)),
     )
+
+
+def _require_whole(policy: SequencePolicy, train: EpisodeStore, config: Config) -> None:
+    """Check that the file of a plug-in's policy will have all of it, `require_whole`."""
+    if config.policy_name not in BUILT_IN:
+        other = rebuilt(policy, config, policy_sizes(train))
+        require_whole(policy, other, train, config.policy_name)
 
 
 def _augment(

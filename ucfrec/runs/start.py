@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -22,6 +23,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.checks import blamed
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 from ucfrec.processes import random_state_kept
@@ -154,6 +156,24 @@ def begin(
         RunRecord.of(entries, out / RUN).sealed(scratch)
 
 
+@random_state_kept()
+def rebuilt(policy: SequencePolicy, config: Config, sizes: Mapping[str, int]) -> SequencePolicy:
+    """Another policy with the parameters and buffers of `policy`, in evaluation mode.
+
+    Raises:
+        InputError: what the policy wants to keep is no tensor.
+    """
+    state = policy.state_dict()
+    if strange := [key for key, value in state.items() if not isinstance(value, Tensor)]:
+        raise InputError(
+            f"the policy {config.policy_name!r} keeps {strange[0]}, which is no tensor; use "
+            "register_buffer"
+        )
+    other = policy_class(config.policy_name)(config.policy, sizes)
+    other.load_state_dict(state)
+    return other.to(policy.state_mean.device).eval()
+
+
 def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
     """What the returns-to-go of a run on `store` count."""
     return config.policy.returns(store.record.source.session_by)
@@ -207,10 +227,21 @@ def policy_sizes(store: EpisodeStore) -> dict[str, int]:
 
 @random_state_kept()
 def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
-    """An untrained policy with the normalisation and item embeddings of `train`."""
+    """An untrained policy with the normalisation and item embeddings of `train`.
+
+    Raises:
+        InputError: the policy does not support the actions of `train`, or is a plug-in that fails.
+    """
     torch.manual_seed(config.seed)
-    policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
     base = train.without_augmentation()
+    with blamed(config.policy_name, "__init__(config, sizes) or start_from"):
+        policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
+        _set_statistics(policy, base, config)
+        policy.start_from(base)
+    return policy
+
+
+def _set_statistics(policy: SequencePolicy, base: EpisodeStore, config: Config) -> None:
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
@@ -229,5 +260,3 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     else:
         actions = base.column(schema.ACTION)
         policy.head.scale.copy_(torch.from_numpy(np.abs(actions).max(0)).clamp(min=1.0))
-    policy.start_from(base)
-    return policy

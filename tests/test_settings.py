@@ -28,10 +28,14 @@ class Shop:
     """What is on them."""
     open: bool = True
     """Now."""
-    hours: Annotated[tuple[int, int], Field(strict=False)] | None = None
+    hours: tuple[int, int] | None = None
     """From, to."""
     name: str = ""
     """Above the door."""
+    staff: tuple[str, ...] = ("Ann",)
+    """Who works there."""
+    shifts: Annotated[tuple[tuple[int, int], ...], Field(min_length=1)] = ((8, 17),)
+    """From, to, of each."""
 
     def __post_init__(self) -> None:
         require(
@@ -60,6 +64,8 @@ def test_a_table_is_a_dataclass() -> None:
         "open": True,
         "hours": None,
         "name": "",
+        "staff": ("Ann",),
+        "shifts": ((8, 17),),
         "ovens": 1,
     }
     assert [f.name for f in fields(shop)] == list(asdict(shop))
@@ -83,6 +89,12 @@ def test_a_table_is_a_dataclass() -> None:
         ({"sells": "milk"}, "shop.sells is 'milk'; it must be 'bread' or 'wine'"),
         ({"open": 1}, "shop.open is 1; it must be true or false"),
         ({"hours": (1,)}, "shop.hours is (1,); it must be 2 values, each a whole number, or unset"),
+        (
+            {"hours": [1, "2"]},
+            "shop.hours is [1, '2']; it must be 2 values, each a whole number, or unset",
+        ),
+        ({"staff": "Ann"}, "shop.staff is 'Ann'; it must be one or more values, each text"),
+        ({"staff": [3]}, "shop.staff is [3]; it must be one or more values, each text"),
         ({"name": 3}, "shop.name is 3; it must be text"),
         ({"name": ["x" * 100]}, f"shop.name is ['{'x' * 55}…; it must be text"),
         ({"shelfs": 2}, "shop has no field 'shelfs'; did you mean 'shelves'?"),
@@ -94,6 +106,18 @@ def test_what_is_not_allowed_is_named(given: dict[str, object], says: str) -> No
         Bakery(**{"shelves": 3, **given})  # type: ignore[arg-type]
     assert str(caught.value) == says
     assert isinstance(caught.value, InputError)
+
+
+def test_a_list_is_accepted_for_a_tuple() -> None:
+    listed = Bakery(3, hours=[9, 17], staff=["Ann"], shifts=[[8, 17]])  # type: ignore[arg-type]
+    assert listed == Bakery(3, hours=(9, 17))
+    assert hash(listed) == hash(Bakery(3, hours=(9, 17)))
+    assert Bakery(3, 0.25, "bread", True, [9, 17]) == listed  # type: ignore[arg-type]
+    assert replace(listed, staff=[]).staff == ()  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match=r"^shop\.shifts is \[\]; it must be one or more values"):
+        Bakery(3, shifts=[])  # type: ignore[arg-type]
+    with pytest.raises(SettingError):
+        Bakery(3, 0.25, "bread", True, [9, 17], "", [], [[8, 17]], 2, 7)  # type: ignore[arg-type, call-arg]
 
 
 def test_positions_and_what_is_missing_are_named_too() -> None:

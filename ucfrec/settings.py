@@ -83,7 +83,8 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     """A decorator that makes a class a frozen dataclass with validated fields.
 
     Ranges are annotated for pydantic (`Annotated[int, Field(ge=1)]`); constraints between fields
-    are checked in `__post_init__`, with `require`. `dataclasses.fields`, `asdict` and `replace`
+    are checked in `__post_init__`, with `require`. A list is accepted for a tuple.
+    `dataclasses.fields`, `asdict` and `replace`
     work as on any dataclass. Constructing the class with an invalid value raises `SettingError`.
 
     Args:
@@ -93,14 +94,19 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
 
     def decorate(cls: type[Table]) -> type[Table]:
         table: Any = checked_dataclass(frozen=True, config=_CHECKED)(cls)
-        build = table.__init__
+        build, names = table.__init__, [f.name for f in fields(table)]
+        tuples = {name for name, info in _fields(table).items() if _takes_tuple(info.annotation)}
+
+        def taken(name: str, value: Any) -> Any:
+            return _as_tuple(value) if name in tuples else value
 
         @wraps(build)
         def checked(self: Any, *args: Any, **values: Any) -> None:
+            by_position = [taken(*each) for each in zip(names, args, strict=False)]
+            by_name = {name: taken(name, value) for name, value in values.items()}
             try:
-                build(self, *args, **values)
+                build(self, *by_position, *args[len(names) :], **by_name)
             except ValidationError as error:
-                names = [f.name for f in fields(table)]
                 given = dict(zip(names, args, strict=False)) | values
                 raise _setting_error(table, name, error, given) from None
 
@@ -163,6 +169,18 @@ def _fields(table: type) -> Mapping[str, Any]:
         return {}
     infos: Mapping[str, Any] = table.__dict__["__pydantic_fields__"]
     return infos
+
+
+def _takes_tuple(annotation: Any) -> bool:
+    origin = get_origin(annotation)
+    if origin in (Annotated, Union, UnionType):
+        return any(map(_takes_tuple, get_args(annotation)))
+    return tuple in (origin, annotation)
+
+
+def _as_tuple(value: Any) -> Any:
+    """A list, and lists in it, as tuples, because TOML and JSON have lists only."""
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
 def _setting_error(

@@ -19,8 +19,7 @@ _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 _Runs = Annotated[int, Field(ge=0, le=10)]
-_SOME = Field(strict=False, min_length=1)
-"""Not strict, because TOML and JSON have lists instead of tuples."""
+_SOME = Field(min_length=1)
 
 
 @settings_table("rule")

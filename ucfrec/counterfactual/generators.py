@@ -37,8 +37,7 @@ class CSGConfig:
     kind: Literal["tangent", "faithful", "noise"] = "tangent"
     """`tangent` draws a different edit every time; `faithful` is the paper's network, which learns
     nearly one shift for all states; `noise` is the control: moves that ignore the reward."""
-    # Not strict, because TOML and JSON have lists instead of tuples.
-    band: Annotated[tuple[Length, Length], Field(strict=False)] = (0.2, 0.5)
+    band: tuple[Length, Length] = (0.2, 0.5)
     """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
     reward_quantile: Quantile = 0.3
     """Steps with a reward below this quantile are excluded from training: 0.3 uses the top 70%."""

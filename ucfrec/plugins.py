@@ -6,18 +6,20 @@ A package adds a simulator to the command line by declaring, in the entry-point 
 policies (classes derived from `ucfrec.policies.base.SequencePolicy`) in `ucfrec.policies`.
 """
 
-from importlib.metadata import entry_points
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
 from ucfrec.errors import InputError
 
 _ONE_OF: Final = {
-    "benchmarks": "benchmark",
-    "datasets": "dataset",
-    "policies": "policy",
-    "simulators": "simulator",
+    "benchmarks": ("benchmark", "ucfrec.benchmark.suite", "Benchmark"),
+    "datasets": ("dataset", "ucfrec.logs.mapping", "Dataset"),
+    "policies": ("policy", "builtins", "object"),
+    "simulators": ("simulator", "ucfrec.evaluation.simulator", "Simulator"),
 }
-"""Singular of each group, for messages."""
+"""Of each group: its singular, for messages, and module and class of what is declared in it; the
+registry of policies checks these."""
 
 
 def plugin_names(group: str) -> list[str]:
@@ -29,17 +31,47 @@ def load_plugin(group: str, name: str) -> Any:
     """Import the plugin `name` of the entry-point group `ucfrec.<group>`.
 
     Raises:
-        InputError: no plugin of that name is installed, or it cannot be imported.
+        InputError: no plugin of that name is installed, or several that differ; or it cannot be
+            imported, or is something else than its group has.
     """
-    installed = entry_points(group=f"ucfrec.{group}")
-    if name not in installed.names:
-        known = ", ".join(plugin_names(group)) or "none"
-        raise InputError(f"no {_ONE_OF[group]} is called {name!r}; installed: {known}")
-    entry = installed[name]
+    entry = _entry(group, name)
+    kind, module, title = _ONE_OF[group]
     try:
-        return entry.load()
-    except (ImportError, AttributeError) as error:
+        found = entry.load()
+    except Exception as error:  # the module of a plug-in may raise anything
         raise InputError(
-            f"the {_ONE_OF[group]} {name!r} is installed as {entry.value}, which cannot be "
-            f"imported ({error}); reinstall its package"
+            f"the {kind} {name!r} is installed as {entry.value}, which cannot be imported "
+            f"({type(error).__name__}: {error}); correct or reinstall its package"
         ) from error
+    if not isinstance(found, getattr(import_module(module), title)):
+        raise InputError(
+            f"the {kind} {name!r} is installed as {entry.value}, which is of type "
+            f"{type(found).__name__}; it must be a {module}.{title}"
+        )
+    return found
+
+
+def plugin_package(group: str, name: str) -> str:
+    """Name of the distribution that the plugin `name` is installed from; empty if it is unknown.
+
+    Raises:
+        InputError: as `load_plugin`.
+    """
+    return _package(_entry(group, name))
+
+
+def _entry(group: str, name: str) -> EntryPoint:
+    found = [each for each in entry_points(group=f"ucfrec.{group}") if each.name == name]
+    if not found:
+        known = ", ".join(plugin_names(group)) or "none"
+        raise InputError(f"no {_ONE_OF[group][0]} is called {name!r}; installed: {known}")
+    if len({each.value for each in found}) > 1:
+        packages = " and ".join(sorted(_package(each) for each in found))
+        raise InputError(
+            f"the packages {packages} both have a {_ONE_OF[group][0]} {name!r}; uninstall one"
+        )
+    return found[0]
+
+
+def _package(entry: EntryPoint) -> str:
+    return "" if entry.dist is None else entry.dist.name

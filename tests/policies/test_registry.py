@@ -12,10 +12,10 @@ import torch
 
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.checkpoint import load_trained
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
+from ucfrec.policies.registry import BUILT_IN, note_ignored, policy_class, policy_names
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -142,6 +142,8 @@ not-one = my_learner:NotOne
 odd = my_learner:Odd
 unchecked = my_learner:Unchecked
 gone = my_learner:Gone
+raises = my_raising:Mine
+nonsense = my_nonsense:Mine
 nowhere = no_such_learner:Mine
 """
 
@@ -150,9 +152,11 @@ nowhere = no_such_learner:Mine
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A distribution as pip leaves it, on the path."""
     site = tmp_path / "site"
-    info = site / "my_learner-1.0.dist-info"
+    info = site / "my_policy-1.0.dist-info"
     info.mkdir(parents=True)
     (site / "my_learner.py").write_text(MINE)
+    (site / "my_raising.py").write_text("raise ValueError('of my own')")
+    (site / "my_nonsense.py").write_text("def (")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-policy\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(site))
@@ -214,6 +218,63 @@ def test_a_policy_is_read_back_as_it_was_trained(tmp_path: Path, name: str, aver
             assert torch.equal(weights["one.weight"], policy.one.weight)  # type: ignore[arg-type, union-attr]
 
 
+def metadata(site: Path, name: str, version: str) -> Path:
+    """The folder of a distribution as pip leaves it."""
+    info = site / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(parents=True, exist_ok=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    return info
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_run_knows_the_package_of_its_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, info = tmp_path / "run", tmp_path / "site" / "my_policy-1.0.dist-info"
+    config = resolve_config("mine", None, ["train.steps=2", "policy.dim=8"])
+    record = train_run(small_store(tmp_path / "store"), run, config)
+    assert (record.policy_package, record.versions["my-policy"]) == ("my-policy", "1.0")
+    TrainedPolicy.load(run)  # the same version is no reason to warn
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-policy\nVersion: 1.1\n")
+    with pytest.warns(
+        InputNote, match=r"trained with my-policy 1.0, but my-policy 1.1 is installed"
+    ):
+        TrainedPolicy.load(run)
+    learner = tmp_path / "site" / "my_learner.py"
+    learner.rename(tmp_path / "elsewhere.py")
+    monkeypatch.delitem(sys.modules, "my_learner")
+    with pytest.raises(InputError, match=r"my_learner:Mine, which cannot be imported") as caught:
+        TrainedPolicy.load(run)
+    assert "train it again" not in str(caught.value)
+    shutil.rmtree(info)
+    missing = r"policy 'mine' \(of package my-policy 1.0\), which is not installed: install it$"
+    with pytest.raises(InputError, match=missing):
+        TrainedPolicy.load(run)
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_built_in_policy_has_no_package_and_a_plugin_of_its_name_is_noted(tmp_path: Path) -> None:
+    note_ignored.cache_clear()
+    config = resolve_config("dt", None, ["train.steps=2", "policy.dim=8"])
+    with pytest.warns(InputNote, match="'dt' of package my-policy is ignored"):
+        record = train_run(small_store(tmp_path / "store"), tmp_path / "run", config)
+    assert record.policy_package is None
+    assert "my-policy" not in record.versions
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("target", ["my_learner:Sees", "my_learner:Mine"])
+def test_two_packages_may_not_have_one_name(tmp_path: Path, target: str) -> None:
+    info = metadata(tmp_path / "site", "another-policy", "2.0")
+    (info / "entry_points.txt").write_text(f"[ucfrec.policies]\nmine = {target}\n")
+    invalidate_caches()
+    if target == "my_learner:Mine":
+        assert policy_class("mine").__name__ == "Mine"
+        return
+    with pytest.raises(InputError, match=r"packages another-policy and my-policy both .* 'mine'"):
+        policy_class("mine")
+
+
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize(
     ("name", "says"),
@@ -271,6 +332,8 @@ def test_an_installed_learner_is_trained_listed_and_read_back(
         ("values", "defines values, which .* keeps for itself"),
         ("from-parent", "defines head, normalized, which .* keeps for itself"),
         ("gone", "my_learner:Gone, which cannot be imported"),
+        ("raises", r"my_raising:Mine, which cannot be imported \(ValueError: of my own\)"),
+        ("nonsense", r"my_nonsense:Mine, which cannot be imported \(SyntaxError"),
         ("nowhere", "no_such_learner:Mine, which cannot be imported"),
         ("min", "choose from ucf, ucf-paper, dt, .*, mine"),
     ],

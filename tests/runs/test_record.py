@@ -75,7 +75,11 @@ def test_every_entry_is_checked(folder: Path, tmp_path: Path, kind: str) -> None
     [
         (("session_gap_ms",), DAMAGE["missing"], "run.json has no session_gap_ms; train it again"),
         (("session_gap_ms",), "soon", "its session_gap_ms is 'soon'; train it again"),
-        (("config", "policy_name"), "no such", "no policy is called 'no such'"),
+        (
+            ("config", "policy_name"),
+            "no such",
+            "trained with policy 'no such' (of an unknown package)",
+        ),
         (("config", "seed"), "x", "seed is 'x'"),
         (("config", "train", "steps"), "many", "train.steps is 'many'"),
         (("sizes", "state"), -1, "its sizes.state is -1"),

@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     if behavior not in simulator.behaviors:
         known = ", ".join(simulator.behaviors)
         raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
-    env = simulator.make(256, environment.folder)
+    env = simulator.started(256, environment.folder)
     actor = simulator.behaviors[behavior](env, options.seed)
     played = collect(
         simulator,

@@ -1,9 +1,14 @@
 """`ucfrec datasets`: list public data sets, or download one."""
 
 import argparse
+import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
+
+if TYPE_CHECKING:
+    from ucfrec.logs.mapping import Dataset
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,10 +35,9 @@ def run(options: argparse.Namespace) -> None:
         InputError: there is no such data set, no folder is named, or it cannot be downloaded.
     """
     from ucfrec.logs.releases import find_release, load_release
-    from ucfrec.plugins import load_plugin, plugin_names
     from ucfrec.reporting.tables import text_table
 
-    adapters = {name: load_plugin("datasets", name) for name in plugin_names("datasets")}
+    adapters = _adapters()
     if options.name is None:
         lines = [
             (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)
@@ -54,3 +58,16 @@ def run(options: argparse.Namespace) -> None:
         f"next: ucfrec prepare '{options.folder / options.name / part}' --dataset {adapter} "
         "--out store"
     )
+
+
+def _adapters() -> "dict[str, Dataset]":
+    """All installed datasets by name; warns of those that cannot be loaded."""
+    from ucfrec.plugins import load_plugin, plugin_names
+
+    adapters = {}
+    for name in plugin_names("datasets"):
+        try:
+            adapters[name] = load_plugin("datasets", name)
+        except InputError as error:
+            warnings.warn(str(error), InputNote, stacklevel=2)
+    return adapters

@@ -45,7 +45,7 @@ def evaluate_behavior(
     if behavior not in simulator.behaviors:
         known = ", ".join(simulator.behaviors)
         raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
-    env = simulator.make(min(episodes, SIDE_BY_SIDE), environment.folder)
+    env = simulator.started(min(episodes, SIDE_BY_SIDE), environment.folder)
     actor = simulator.behaviors[behavior](env, seed)
     name = {"method": behavior, "policy": behavior}
     return _row(environment, name, env, actor, episodes, seed)
@@ -70,7 +70,7 @@ def evaluate_policy(
     Raises:
         InputError: the policy's actions or observations do not fit this environment.
     """
-    env = environment.simulator().make(min(episodes, SIDE_BY_SIDE), environment.folder)
+    env = environment.simulator().started(min(episodes, SIDE_BY_SIDE), environment.folder)
     numbers = _item_numbers(environment, env, trained)
     rule = rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)

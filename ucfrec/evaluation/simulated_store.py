@@ -22,7 +22,7 @@ def simulated_store(
     logs, store = folder / "logs", folder / "store"
     simulator = environment.simulator()
     if not logs.exists():
-        env = simulator.make(256, environment.folder)
+        env = simulator.started(256, environment.folder)
         chosen = behavior or simulator.logging_behavior
         actor = simulator.behaviors[chosen](env, seed)
         collect(

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ucfrec.errors import InputError
+
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
@@ -30,3 +32,19 @@ class Simulator:
     def logging_behavior(self) -> str:
         """The behavior policy of logs unless another is named."""
         return "mixture" if "mixture" in self.behaviors else "random"
+
+    def started(self, sessions: int, folder: Path | None) -> "VectorEnv[Any, Any, Any]":
+        """What `make` makes of a number of parallel sessions.
+
+        Raises:
+            InputError: it is no vector environment.
+        """
+        from gymnasium.vector import VectorEnv
+
+        env = self.make(sessions, folder)
+        if not isinstance(env, VectorEnv):
+            raise InputError(
+                f"the simulator ({self.summary}) makes an object of type {type(env).__name__}; its "
+                "`make` must give a gymnasium.vector.VectorEnv"
+            )
+        return env

@@ -7,11 +7,13 @@ a class derived from `ucfrec.policies.base.SequencePolicy`::
     mine = "my_package.policy:MyPolicy"
 """
 
+import warnings
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
-from ucfrec.errors import InputError
-from ucfrec.plugins import load_plugin, plugin_names
+from ucfrec.errors import InputError, InputNote
+from ucfrec.plugins import load_plugin, plugin_names, plugin_package
 
 if TYPE_CHECKING:
     from ucfrec.policies.base import SequencePolicy
@@ -59,6 +61,27 @@ def policy_class(name: str) -> "type[SequencePolicy]":
     if name not in policy_names():
         raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
     return _checked(name, load_plugin("policies", name))
+
+
+def policy_package(name: str) -> str:
+    """Name of the distribution that the policy `name` is installed from; empty if it is built in.
+
+    Raises:
+        InputError: no policy has this name, or several that differ.
+    """
+    return "" if name in BUILT_IN else plugin_package("policies", name)
+
+
+@cache
+def note_ignored(name: str) -> None:
+    """Warn, once, if a plugin has the name of the built-in policy `name`."""
+    if name in BUILT_IN and name in plugin_names("policies"):
+        warnings.warn(
+            f"the policy {name!r} of package {plugin_package('policies', name)} is ignored, because"
+            " a built-in policy has its name; give it another name",
+            InputNote,
+            stacklevel=2,
+        )
 
 
 def _checked(name: str, policy_type: object) -> "type[SequencePolicy]":

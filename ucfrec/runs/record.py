@@ -5,7 +5,7 @@ import os
 from collections.abc import Container, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -30,7 +30,7 @@ from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
-from ucfrec.policies.registry import policy_class
+from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import SessionEndReport
@@ -204,6 +204,9 @@ class RunRecord(TrainingRecord):
     config: Annotated[Config, PlainValidator(_config), PlainSerializer(asdict)]
     store: Text
     """Folder of the store when the run began."""
+    policy_package: Text | None = None
+    """Distribution that the policy is a plug-in of, whose version is in `versions`; None if the
+    policy is built in."""
     store_from_run: Text | None
     """The same as seen from the run; None on another drive of Windows."""
     reward: Text
@@ -230,6 +233,24 @@ class RunRecord(TrainingRecord):
     policy: Fit | None = None
     reward_model: ItemRewardReport | None = None
     rule: RuleRecord | None = None
+
+    @classmethod
+    def of(cls, value: Mapping[str, Any], path: Path) -> Self:
+        """The record of a JSON object; see `Record.of`.
+
+        Raises:
+            InputError: its policy is not installed or cannot be imported, too, which is no damage.
+        """
+        config = value.get("config")
+        name = config.get("policy_name") if isinstance(config, Mapping) else None
+        if isinstance(name, str) and name not in BUILT_IN:
+            if name not in policy_names():
+                raise InputError(
+                    f"{path}: trained with policy {name!r} (of {_package(value)}), which is not "
+                    "installed: install it"
+                )
+            policy_class(name)
+        return super().of(value, path)
 
     @property
     def name(self) -> str:
@@ -317,6 +338,15 @@ class RunRecord(TrainingRecord):
             flagged = ", ".join(map(str, self.screening.flagged)) or "none"
             lines.append(f"screening     observation columns without effect: {flagged}")
         return "\n".join(lines)
+
+
+def _package(value: Mapping[str, Any]) -> str:
+    """The package of the policy of a run's record that is not checked yet, for messages."""
+    package, numbers = value.get("policy_package"), value.get("versions")
+    if not isinstance(package, str):
+        return "an unknown package"
+    number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
+    return f"package {package} {number}".rstrip()
 
 
 def read_record(run: Path) -> RunRecord:

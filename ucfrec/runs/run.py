@@ -29,7 +29,7 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import require_sound, require_whole
-from ucfrec.policies.registry import BUILT_IN
+from ucfrec.policies.registry import BUILT_IN, note_ignored
 from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
@@ -169,6 +169,7 @@ def _prepare_inputs(
         train = logged = store
     if distributed.leads():
         require_startable(store, train, out, config)
+        note_ignored(config.policy_name)
     policy = new_policy(train, config)
     if distributed.leads():
         require_sound(policy, train, config.policy_name)

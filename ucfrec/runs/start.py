@@ -25,7 +25,7 @@ from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.checks import blamed
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.registry import policy_class
+from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config
@@ -118,6 +118,7 @@ def begin(
         validation: held-out episodes.
     """
     returns_to_go, source = returns_of(store, config), store.record.source
+    package = policy_package(config.policy_name)
     entries: dict[str, Any] = {
         "files": {},
         "command": command_line(),
@@ -136,7 +137,8 @@ def begin(
         "return_quantiles": {str(q): float(np.quantile(train.returns, q)) for q in _QUANTILES},
         "mean_return": float(train.returns.mean()),
         "data": source,
-        "versions": versions(),
+        "versions": versions([package] if package else []),
+        "policy_package": package or None,
         "wall_time_s": 0.0,
         **about,
     }

@@ -25,9 +25,9 @@ from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.registry import policy_class
+from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import random_state_kept
-from ucfrec.provenance import config_hash
+from ucfrec.provenance import config_hash, versions
 from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
@@ -101,6 +101,7 @@ class TrainedPolicy:
                 InputNote,
                 stacklevel=2,
             )
+        _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
@@ -286,6 +287,22 @@ def _rule(path: Path) -> DecisionRule:
     if not isinstance(values, Mapping):
         raise InputError(f"{path} is not a decision rule; train the policy again")
     return DecisionRule.from_dict(values, str(path))
+
+
+def _note_other_version(run: Path, record: RunRecord) -> None:
+    """Warn if the policy is a plug-in that is installed in another version, or from elsewhere."""
+    name, package = record.config.policy_name, record.policy_package
+    if package is None:
+        return
+    now = policy_package(name)
+    trained = f"{package} {record.versions.get(package, '')}"
+    if trained != (installed := f"{now} {versions([now] if now else []).get(now, '')}"):
+        warnings.warn(
+            f"{run} was trained with {trained}, but {installed} is installed: its policy {name!r} "
+            "may behave differently",
+            InputNote,
+            stacklevel=3,
+        )
 
 
 def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:

@@ -1,0 +1,72 @@
+"""Plugins of every group: what is of another type, or broken, is refused in one line."""
+
+from importlib import invalidate_caches
+from pathlib import Path
+
+import pytest
+
+from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.plugins import load_plugin
+
+MODULE = """
+from ucfrec.evaluation.simulator import Simulator
+NUMBER = 7
+BEHAVIORS = {"random": lambda env, seed: None}
+EMPTY = Simulator("no environment", lambda n, folder: 5, BEHAVIORS, "click")
+"""
+ENTRY_POINTS = """[ucfrec.simulators]
+number = my_things:NUMBER
+empty = my_things:EMPTY
+[ucfrec.datasets]
+number = my_things:NUMBER
+gone = my_gone:DATASET
+[ucfrec.benchmarks]
+number = my_things:NUMBER
+"""
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A distribution as pip leaves it, on the path."""
+    info = tmp_path / "site" / "my_things-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info.parent / "my_things.py").write_text(MODULE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-things\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(str(info.parent))
+    invalidate_caches()
+
+
+@pytest.mark.parametrize("group", ["benchmarks", "datasets", "simulators"])
+def test_an_object_of_another_type_is_refused(group: str) -> None:
+    says = rf"the {group[:-1]} 'number' is installed as my_things:NUMBER, which is of type int; it"
+    with pytest.raises(InputError, match=says):
+        load_plugin(group, "number")
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("collect --env number --sessions 2 --out logs", "the simulator 'number' is installed as"),
+        ("collect --env empty --sessions 2 --out logs", "(no environment) makes an object of type"),
+        ("evaluate --env empty --behavior random", "(no environment) makes an object of type int"),
+        ("prepare log.csv --dataset number --out store", "the dataset 'number' is installed as"),
+        ("datasets open-bandits", "no data set is called"),
+    ],
+)
+def test_commands_say_so_in_one_line(
+    command: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command.split()) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert "Traceback" not in error
+
+
+def test_other_datasets_are_listed_beside_a_broken_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["datasets"]) == 0
+    printed = capsys.readouterr()
+    assert "open-bandit" in printed.out
+    assert "note: the dataset 'gone' is installed as my_gone:DATASET, which" in printed.err
+    assert "note: the dataset 'number'" in printed.err

@@ -98,7 +98,7 @@ def run(folder: Path) -> None:
 
 
 WORK: dict[str, tuple[Callable[[Path], None], Callable[[Path], None], float]] = {
-    "run": (run, lambda folder: None, 1.0),
+    "run": (run, lambda folder: None, 0.4),
     "update": (update, lambda folder: None, 1.0),
     "promote": (promote_often, promoted_is_whole, 0.3),
     "join": (join, joined_is_whole, 0.1),

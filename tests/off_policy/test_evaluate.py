@@ -46,7 +46,7 @@ def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
     log.to_parquet(tmp_path / "log.parquet")
     with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0)
-    text = f"{lacking:,} of {len(log):,} rows have no reward"
+    text = f"{lacking:,} of {len(log):,} rows have no finite reward"
     assert any(text in warning for warning in report.warnings) == (lacking > 0)
     assert any(text in reason for reason in report.verdict.reasons) == forbids
 

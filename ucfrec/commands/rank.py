@@ -117,8 +117,8 @@ def _conclusion(rows: "list[ResultRow]", trained: "list[TrainedPolicy]") -> str:
         return "\nno method lists an item that was liked; next: a larger --k, or --keep-seen"
     own = f"; {trained[0].name} has {rated[0]:.3f}" if best else ""
     return (
-        f"\n{rows[best].method} has the highest hit rate on liked items ({rated[best]:.3f} in its "
-        f"{rows[best].conditions['k']}){own}. Logged clicks favour what was shown:\n"
+        f"\n{rows[best].method} has the highest hit rate on liked items ({rated[best]:.3f} with "
+        f"{rows[best].conditions['k']} items){own}. Logged clicks favour what was shown:\n"
         f"next: ucfrec ope {trained[0].folder}, the return per session that it would bring"
     )
 

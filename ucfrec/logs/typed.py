@@ -19,6 +19,7 @@ from ucfrec.logs.tables import (
     NOTHING,
     Table,
     as_timestamp,
+    first_and_more,
     is_integer,
     is_number,
     is_vector,
@@ -74,9 +75,7 @@ class TypedLog:
     @property
     def name(self) -> str:
         """The first file, and how many more there are, for messages."""
-        files = [str(file) for table in self.tables for file in table.files]
-        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        return files[0] + more
+        return first_and_more([file for table in self.tables for file in table.files])
 
     def id_type(self, name: str) -> str:
         """DuckDB type of an id column: BIGINT or VARCHAR."""

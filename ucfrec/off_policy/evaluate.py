@@ -298,7 +298,7 @@ def _of_dropped_rows(logged: LoggedSessions, pages: bool) -> tuple[list[str], li
     dropped, forbidden, notes = logged.report["dropped"], [], []
     if lacking := dropped.get("reward_not_finite", 0):
         rows = logged.store.n_steps + lacking
-        said = f"{lacking:,} of {rows:,} rows have no reward: they are left out"
+        said = f"{lacking:,} of {rows:,} rows have no finite reward: they are left out"
         if lacking > MOST_LEFT_OUT * rows:
             forbidden.append(f"{said}, and may differ from the rest")
         else:

@@ -553,8 +553,8 @@ SECTIONS = (
         "Control at the medium budget",
         "Scores of the last checkpoint after 10,000 steps in batches of 64 windows of 8 steps, for "
         "cloning of 512 steps, at width 128, with averaged weights, in 50 episodes. One seed, so a "
-        "difference may be chance. `ucf-wo-count-context-20` is `ucf-wo-count` with the 20 steps of "
-        "history that the search below selects, `--context ucf-wo-count=20`. DC and LSDT were "
+        "difference may be chance. `ucf-wo-count-context-20` is `ucf-wo-count` with the 20 steps "
+        "of history that the search below selects, `--context ucf-wo-count=20`. DC and LSDT were "
         "trained on a GPU (H200), the others on CPUs.",
         "`ucfrec-control benchmark --data $UCFREC_DATA/control --budget medium --table main "
         "--seeds 1`",

@@ -478,14 +478,12 @@ SECTIONS = (
     Section(
         "Recommendation (Table 2)",
         "A method's name stands for it as published, `+shared` for it with the components that UCF "
-        "has as well: exposure features, and a decision rule with a reward weight, chosen on the "
-        "log. `ucf-plain` is UCF without them, `ucf-paper` is the paper's UCF. `…-mask` leaves out "
-        "the tags of the last ten items. Bold is the highest mean of a column among policies that "
+        "has as well: exposure features, and a decision rule with a reward weight, selected on the "
+        "log. Bold is the highest mean of a column among policies that "
         "do not know the simulator. The shared components decide, not the network: with them all "
-        "methods are level in the catalogue and in KuaiRand, and behavior cloning is ahead of UCF "
+        "methods are level in the catalogue and in KuaiRand, and behaviour cloning is ahead of UCF "
         "by 2 in SARDINE. A lookahead was among the candidates in the catalogue, and for `ucf` and "
-        "`bc+shared` in SARDINE. `ucf` has augmented states, `ucf-wo-count` has none, as is the "
-        "default.",
+        "`bc+shared` in SARDINE.",
         f"`{RUN} main`",
         of("recommendation", "main"),
         returns,
@@ -539,7 +537,7 @@ SECTIONS = (
     ),
     Section(
         "Control (Tables 1 and 3)",
-        "Normalized scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
+        "Normalised scores of the last checkpoint after 4,000 steps in batches of 16, a hundredth "
         "of the authors' training (IQL: 50,000 in batches of 64, CQL: 10,000). Learning rates were "
         "chosen on validation loss by one search for all methods. Without a standard error there "
         "is one seed, and a difference may be chance. At these equal steps UCF is between DT and "
@@ -622,6 +620,26 @@ SECTIONS = (
 )
 
 
+NAMES = (
+    ("ucf", "UCF with augmented states, as in the paper; by default `train` augments nothing"),
+    ("ucf-wo-count", "UCF without augmentation, the default of `train`"),
+    ("ucf-wo-arch", "DT on the augmented data of UCF"),
+    ("ucf-plain", "UCF without the shared components"),
+    ("ucf-paper", "the paper's settings; `-algorithm-5` edits states as its Algorithm 5 says"),
+    ("ucf-screened, -dropped", "interventions on the columns that screening flags; without them"),
+    ("-wo-exposure, -wo-rule", "without exposure features; without a selected rule"),
+    ("-actions, -both", "augmented actions; augmented states and actions"),
+    ("-weights, -max-return", "advantage weights; the largest expected return as target"),
+    ("bc-10, bc-25", "behaviour cloning of the best 10% or 25% of the episodes"),
+    ("-best-25", "trained on the best 25% of the trajectories"),
+    ("-wo-time", "without timestep embeddings"),
+    ("-mask", "without items that share a tag with the last ten"),
+    ("-x2, -x3, -x8", "two, three or eight times the training steps"),
+    ("-context-N", "N steps of history"),
+)
+"""Methods and suffixes of the tables, and what they mean."""
+
+
 def page(files: _Files, pictures: Sequence[str]) -> str:
     """The whole page as Markdown."""
     head = fill(
@@ -639,6 +657,12 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
     about = "\n".join(fill(f"- {each}", subsequent_indent="  ") for each in ENVIRONMENTS)
     parts = ["# Tables", head, "## What each simulator can and cannot show", about]
+    parts += [
+        "## Names of methods",
+        markdown_table(
+            ("name", "meaning"), [(f"`{name}`".replace(", ", "`, `"), said) for name, said in NAMES]
+        ),
+    ]
     parts += [section.text(files) for section in SECTIONS if section.rows(files)]
     parts += ["## The paper's Table 2", paper, PAPER]
     parts += ["## Pictures", shown] if pictures else []

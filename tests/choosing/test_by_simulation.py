@@ -13,7 +13,7 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
+from ucfrec.choosing.by_simulation import RuleSearch, _warning, choose_by_simulation
 from ucfrec.choosing.candidates import near
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
 from ucfrec.choosing.many_rules import Sessions
@@ -243,6 +243,15 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
     found = chosen(narrow, store, folder / "run", config, 2.0, 2.0)
     assert not found.warning
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
+
+
+def test_a_policy_below_the_log_is_warned_of(folder: Path, trained: TrainedPolicy) -> None:
+    search, rule = search_of(folder, trained), DecisionRule(2.0, temperature=1.0)
+    (found,), estimate = search.simulate([rule]), search.estimate(rule)
+    logged = float(search.problem.train.returns.mean())
+    for value, below in ((logged - 0.5, True), (logged - 0.1, False), (logged + 1, False)):
+        warning = _warning(search, found, replace(estimate, value=value, error=0.1))
+        assert (f"less than logged sessions have, {logged:.4g}" in warning) == below
 
 
 @pytest.mark.slow

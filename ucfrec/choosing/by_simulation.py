@@ -311,7 +311,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         rule=best.rule,
         chosen_by=_chosen_by(search.users) + where,
         candidates=[best if each.rule == best.rule else each for each in tried],
-        warning=_warning(search, best),
+        warning=_warning(search, best, estimate),
         estimate=estimate,
         details={
             **search.users.report(),
@@ -347,8 +347,8 @@ def _all(search: RuleSearch) -> list[SimulatedRule]:
     return tried
 
 
-def _warning(search: RuleSearch, best: SimulatedRule) -> str:
-    said = []
+def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -> str:
+    said, logged = [], float(search.problem.train.returns.mean())
     if not search.supported(best):
         said.append("the log supports no candidate, this one shows the most different items")
     elif not search.allowed(best):
@@ -357,6 +357,8 @@ def _warning(search: RuleSearch, best: SimulatedRule) -> str:
             f"of little spread; this one leaves {best.effective_users:.0f}: the log is too small "
             "to evaluate it"
         )
+    if estimate.value + 2 * estimate.error < logged:
+        said.append(f"this is less than logged sessions have, {logged:.4g}; do not launch it")
     return "".join(f"; WARNING: {each}" for each in said)
 
 

@@ -47,12 +47,12 @@ def test_rows_of_one_user_count_as_one(tmp_path: Path) -> None:
     assert compare_arms([tmp_path / "again.parquet"]).error == pytest.approx(once.error)
 
 
-def test_users_in_both_arms_and_rows_without_one_are_left_out(tmp_path: Path) -> None:
+def test_users_in_several_arms_and_rows_without_one_are_left_out(tmp_path: Path) -> None:
     frame = log(200, 0.0)
     both = frame[frame.user_id == "1"].assign(arm="b")
     pd.concat([frame, both, frame.assign(arm="")]).to_parquet(tmp_path / "log.parquet")
     found = compare_arms([tmp_path / "log.parquet"])
-    assert (found.in_both, found.users) == (1, (159, 40))
+    assert (found.in_several, found.users) == (1, (159, 40))
     named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
     assert named.difference == pytest.approx(-found.difference)
 
@@ -109,7 +109,7 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     more += [frame[:3].assign(arm=None), frame[:2].assign(arm="")]
     pd.concat([frame, *more]).to_parquet(tmp_path / "log.parquet")
     found = compare_arms([tmp_path / "log.parquet"])
-    assert (found.without_user, found.without_arm, found.in_both) == (11, 5, 0)
+    assert (found.without_user, found.without_arm, found.in_several) == (11, 5, 0)
     assert "11 rows have no user_id; they are left out\n5 rows have no arm;" in str(found)
     same = replace(found, without_user=0, without_arm=0)
     assert same == compare_arms([tmp_path / "kept.parquet"])

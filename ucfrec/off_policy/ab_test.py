@@ -46,8 +46,8 @@ class Comparison:
     """Rows without a user, which are left out."""
     without_arm: int
     """Rows of a user without an arm, which are left out."""
-    in_both: int
-    """Users who were in both arms; their rows are left out."""
+    in_several: int
+    """Users who were in more than one arm; their rows are left out."""
     difference: float
     """Of the second arm less the first."""
     error: float
@@ -69,8 +69,10 @@ class Comparison:
         for lacking, name in ((self.without_user, schema.USER_ID), (self.without_arm, schema.ARM)):
             if lacking:
                 lines.append(f"{lacking:,} rows have no {name}; they are left out")
-        if self.in_both:
-            lines.append(f"{self.in_both:,} users were in both arms; their rows are left out")
+        if self.in_several:
+            lines.append(
+                f"{self.in_several:,} users were in more than one arm; their rows are left out"
+            )
         first, second = self.arms
         lines.append(
             f"{second} − {first}: {self.difference:+.4g} [{self.low:+.4g}, {self.high:+.4g}] at "
@@ -166,7 +168,7 @@ def compare_arms(
         lacking,
         log.without_user,
         log.without_arm,
-        log.in_both,
+        log.in_several,
         difference,
         error,
         difference - _NORMAL * error,
@@ -193,7 +195,7 @@ class _Log:
     without_value: dict[str, int]
     without_user: int
     without_arm: int
-    in_both: int
+    in_several: int
 
 
 def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Log:
@@ -224,7 +226,7 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
                 "SELECT arm, value, shown, rows FROM of_users "
                 "WHERE who IS NOT NULL AND arm IS NOT NULL AND arms = 1 ORDER BY arm, who"
             ).fetchnumpy()
-            ((in_both, nobody, no_arm, beyond),) = connection.sql(
+            ((in_several, nobody, no_arm, beyond),) = connection.sql(
                 "SELECT count(DISTINCT who) FILTER (arms > 1), "
                 "coalesce(sum(rows) FILTER (who IS NULL), 0), "
                 "coalesce(sum(rows) FILTER (who IS NOT NULL AND arm IS NULL), 0), "
@@ -241,7 +243,7 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
         {name: int((kept["rows"] - shown)[names == name].sum()) for name in arms},
         int(nobody),
         int(no_arm),
-        int(in_both),
+        int(in_several),
     )
 
 

@@ -124,7 +124,7 @@ def runs_given(options: argparse.Namespace) -> list[Path]:
     Raises:
         InputError: there is none.
     """
-    from ucfrec.runs.trained_policy import RUN
+    from ucfrec.runs.record import RUN
 
     runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]

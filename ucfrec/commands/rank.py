@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
             test split to rank that none of the runs was trained on.
     """
     from ucfrec.evaluation.ranking import MEASURES
-    from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
+    from ucfrec.evaluation.ranking_table import require_one_catalogue
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]
     require_one_catalogue(trained)
-    train, liked = training_store(trained[0]), _liked(options, trained[0])
+    train, liked = trained[0].training_store(), _liked(options, trained[0])
     if options.logs:
         files, mapping = logs_given(options, trained[0])
         with logged_sessions(trained[0], files, mapping) as logged:

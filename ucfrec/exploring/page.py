@@ -26,7 +26,6 @@ from ucfrec.reporting.forest import quoted
 from ucfrec.reporting.page import write_report
 from ucfrec.reporting.page_results import results_of
 from ucfrec.results.row import ResultRow
-from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _TITLES: Final = ("title", "name")
@@ -226,7 +225,7 @@ def _stored(trained: TrainedPolicy, user: str) -> Histories:
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
         )
-    if store_of(trained.folder, trained.record) is None:
+    if trained.training_store() is None:
         raise InputError(
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"

@@ -22,13 +22,13 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS
-from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.off_policy.training_rows import readable_store
 from ucfrec.progress import progress
-from ucfrec.runs.record import RUN, store_of
+from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
@@ -130,20 +130,16 @@ def as_trained(
         mapping: which columns of the logs mean what; what it leaves open is as in the training
             logs.
     """
-    record, source = trained.record, str(trained.folder / RUN)
-    mapping = mapping.over(LogMapping.of_source(record.data, source))
-    if not trained.logged_observation_size:
-        mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
-    reward = Expression(record.reward, source)
+    record = trained.record
     options = PrepareOptions(
-        reward,
+        reward_of(trained),
         record.session_by,
         duplicates=record.data.duplicates,
         memory_limit=memory_limit,
     )
     if record.session_gap_ms is not None:
         options = replace(options, gap_minutes=record.session_gap_ms / 60_000)
-    return mapping, options
+    return columns_used(trained, mapping), options
 
 
 @contextmanager
@@ -169,14 +165,8 @@ def prepared_sessions(
         _note_unknown_users(str(files[0]), store, report["users"], trained)
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        yield _with_history(trained, LoggedSessions(store, users, report, unknown), _store(trained))
-
-
-def _store(trained: TrainedPolicy) -> EpisodeStore | None:
-    try:
-        return store_of(trained.folder, trained.record)
-    except InputError:
-        return None
+        logged = LoggedSessions(store, users, report, unknown)
+        yield _with_history(trained, logged, readable_store(trained))
 
 
 def _with_history(
@@ -336,12 +326,7 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
                 f"{policy.folder} is a refit, trained on the test split too; name later logs"
             )
     first = trained[0]
-    store = store_of(first.folder, first.record)
-    if store is None:
-        raise InputError(
-            f"{first.folder}: its store {first.record.store} is gone or has changed; move the "
-            "run together with its store, or name later logs"
-        )
+    store = first.require_store("move the run together with its store, or name later logs")
     test = store.split("test")
     if not test.n_episodes:
         raise InputError(f"{store.path} has no test split; name later logs")

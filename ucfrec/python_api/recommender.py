@@ -29,7 +29,7 @@ from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.liked import LikedExpression
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue, training_store
+from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
@@ -402,7 +402,7 @@ class Recommender:
             assert logged.rows is not None
             later = Later(logged.store, logged.rows, filter_seen)
             about = later, logged.users, k, seed
-            rows = ranking_rows(rankers, trained, training_store(trained), *about, by)
+            rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
         rows = [replace(row, checkpoint="best") for row in rows]
         card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
         return Ranking(rows, said)

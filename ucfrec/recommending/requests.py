@@ -28,6 +28,7 @@ from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import DAY_MS, kept_in_order
 from ucfrec.recommending.row_rewards import RowRewards
+from ucfrec.runs.later_logs import reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
@@ -277,7 +278,7 @@ class HistoryReader:
             trained.record.data.duplicates,
             trained.record.session_by == schema.SESSION_ID,
             trained.record.observation_size,
-            RowRewards.of(trained),
+            RowRewards(reward_of(trained)),
         )
 
     def read(self, rows: Sequence[Row], user_id: int | str) -> UserHistory:

@@ -14,8 +14,9 @@ from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.recommending.exposures import exposures_written
-from ucfrec.recommending.histories import Histories, columns_used, reward_of, session_by
+from ucfrec.recommending.histories import Histories, session_by
 from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -17,7 +17,7 @@ from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
 from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.record import RUN, RunRecord, Update, store_of
+from ucfrec.runs.record import RUN, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -151,13 +151,9 @@ def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
         raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
     if trained.record.policy is None:
         raise InputError(f"{run} is not finished; train it to its end first")
-    store = store_of(run, trained.record)
-    if store is None:
-        raise InputError(
-            f"{run}: its store {trained.record.store} is gone or has changed; move the run "
-            "together with its store, or prepare all logs and train again"
-        )
-    return store
+    return trained.require_store(
+        "move the run together with its store, or prepare all logs and train again"
+    )
 
 
 def _from_nothing(record: RunRecord) -> Config:

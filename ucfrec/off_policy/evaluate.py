@@ -265,9 +265,8 @@ def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
 
 def _too_many_items(trained: TrainedPolicy, evaluated: EvaluatedSteps) -> list[str]:
     steps = evaluated.steps
-    assert trained.item_ids is not None
     assert steps.groups is not None
-    items = len(trained.item_ids)
+    items = len(trained.items)
     found = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
     if found is None or found.passed:
         return []

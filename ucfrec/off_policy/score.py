@@ -229,8 +229,7 @@ def scored_steps(
     Yields:
         Batches of scored steps.
     """
-    assert trained.item_ids is not None
-    n_items = len(trained.item_ids)
+    n_items = len(trained.items)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
     total, scorer = store.n_steps, trained.scorer(rule)
     with progress(total, "score", "steps") as bar:
@@ -285,8 +284,7 @@ def score(
         one), `probability` of the logged item under the rule, its `rank` (from 1) among all items,
         and `greedy_item_id`, the best one.
     """
-    store, item_ids = logged.store, trained.item_ids
-    assert item_ids is not None
+    store, item_ids = logged.store, trained.items.ids
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
     names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
     for batch in scored_steps(trained, store, rule, logged.rows if filter_seen else None):

@@ -143,13 +143,12 @@ def as_known(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
         trained: the run; users and items that it does not know become −1.
     """
     assert trained.item_states is not None
-    assert trained.item_ids is not None
     places = view.all_steps()
     steps: dict[str, Array] = {
         name: view.step_values(name, *places) for name in view.record.columns
     }
     items = steps[schema.ITEM]
-    steps[schema.ITEM] = np.where(items < len(trained.item_ids), items, -1)
+    steps[schema.ITEM] = np.where(items < len(trained.items), items, -1)
     users = view.episode_values(schema.USER)
     episodes = {
         schema.USER: np.where(users < len(trained.user_ids), users, -1),

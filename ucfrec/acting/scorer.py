@@ -274,7 +274,8 @@ class Scorer:
     ) -> Tensor:
         """`scores` of a query of the history."""
         if self.rule.policy_weight == 1 and not self.rule.looks_ahead:
-            scores = self._products(self.weighted(query), query.outputs)
+            factors, weighted = self.weighted(query), bool(self.rule.reward_weight)
+            scores = self._items.scores(factors, query.outputs, self.has_factors, weighted)
         else:
             scores = self._composed(query, history)
         return self._left(scores, history.shown, left_out, excluded, empty)
@@ -345,10 +346,6 @@ class Scorer:
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)
-
-    def _products(self, factors: Factors, outputs: Tensor | None = None) -> Tensor:
-        weighted = bool(self.rule.reward_weight)
-        return self._items.scores(factors, outputs, self.has_factors, weighted)
 
     def _left(
         self,

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-_SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate")
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec rank`."""
@@ -71,6 +69,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
+    from ucfrec.results.table import Ranking
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     runs = runs_given(options)
@@ -89,10 +88,10 @@ def run(options: argparse.Namespace) -> None:
     else:
         warnings = [[] for _ in trained]
         rows = _rows(options, trained, train, held_out_sessions(trained), liked)
-    columns = (*_SHOWN, "coverage")
-    lines = [dict.fromkeys(columns) | {"policy": row.method} | dict(row.metrics) for row in rows]
-    print(format_rows(lines, ("policy", *columns)))
-    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
+    lines = [{**dict.fromkeys(Ranking.shown), "policy": row.method, **row.metrics} for row in rows]
+    print(format_rows(lines, ("policy", *Ranking.shown)))
+    *shown, _ = Ranking.shown  # the last, coverage, is none of MEASURES
+    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in shown))
     about = rows[0].conditions
     print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
@@ -100,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
-        card_of_ranking(policy.folder, row, _SHOWN, on, said)
+        card_of_ranking(policy.folder, row, shown, on, said)
     if options.json is not None:
         write_results(options.json, rows)
     print(_conclusion(rows, trained))

@@ -117,7 +117,7 @@ class TrainedPolicy:
             _ids(folder / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(folder / USERS, schema.USER_ID),
             _returns(folder / RETURNS),
-            _rule(folder / RULE),
+            read_rule(folder / RULE),
             reward_model,
             TrainingCounts.load(folder / COUNTS) if (folder / COUNTS).exists() else None,
             load_session_end(models, reward_model),
@@ -306,7 +306,12 @@ class TrainedPolicy:
         )
 
 
-def _rule(path: Path) -> DecisionRule:
+def read_rule(path: Path) -> DecisionRule:
+    """The decision rule in a file of a run.
+
+    Raises:
+        InputError: it is something else.
+    """
     values = read_json(path)
     if not isinstance(values, Mapping):
         raise InputError(f"{path} is not a decision rule; train the policy again")

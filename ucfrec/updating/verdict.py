@@ -11,6 +11,7 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.ranking import mean_ranks
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.results.statistics import effective_number
@@ -101,11 +102,9 @@ class _Logged:
         """One pass over a view whose unknown items are −1."""
         chances, gains = [], []
         for batch in scored_steps(trained, view, None, seen):
-            items, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
-            chance = batch.log_probabilities.gather(1, items)[:, 0].double().exp()
-            own = batch.scores.gather(1, items)
-            above, equal = ((batch.scores > own).sum(1), (batch.scores == own).sum(1))
-            rank = 1 + above.double() + (equal - 1).double() / 2
+            items, unknown = batch.items.clamp(min=0), batch.items < 0
+            chance = batch.log_probabilities.gather(1, items.unsqueeze(1))[:, 0].double().exp()
+            rank = mean_ranks(batch.scores, items)
             gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
             chances.append(chance.masked_fill(unknown, 0.0).numpy())
             gains.append(gain.masked_fill(unknown, 0.0).numpy())

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.exposures import ExposureLog
-    from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -338,22 +337,6 @@ def spark_given(options: argparse.Namespace) -> str | None:
     return None
 
 
-def limits_given(options: argparse.Namespace) -> "Limits":
-    """The limits that `limit_options` name.
-
-    Raises:
-        InputError: one is out of range.
-    """
-    from ucfrec.recommending.requests import Limits
-
-    return Limits(
-        bytes=options.max_bytes,
-        k=options.max_k,
-        history=options.max_history,
-        candidates=options.max_candidates,
-    )
-
-
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
     """What answers requests, by `--k`, `item_options`, `draw_options`, `engine_option`,
     `limit_options` and `rule_options`.
@@ -361,11 +344,18 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
     """
+    from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
 
+    limits = Limits(
+        bytes=options.max_bytes,
+        k=options.max_k,
+        history=options.max_history,
+        candidates=options.max_candidates,
+    )
     return Responder(
         trained,
-        limits_given(options),
+        limits,
         rule=rule_given(options, trained),
         k=options.k,
         filter_seen=not options.keep_seen,

@@ -146,7 +146,6 @@ def _rows(
     policies = [
         PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
     ]
-    assert later.rows is not None
     steps = Later(later.store, later.rows, not options.keep_seen)
     about = steps, later.users, options.k, options.seed
     rows = ranking_rows(policies, trained[0], train, *about, liked)

@@ -4,7 +4,6 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -68,11 +67,8 @@ class InputsFile:
     A context manager; the file is removed at its end.
     """
 
-    def __init__(self, folder: Path | None = None) -> None:
-        """Args:
-        folder: where the file lies; None for the system's temporary folder.
-        """
-        self._file = tempfile.TemporaryFile(prefix="ucfrec-", dir=folder)  # noqa: SIM115
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile(prefix="ucfrec-")  # noqa: SIM115
         self._sizes: tuple[int, int, int] | None = None
 
     def __enter__(self) -> "InputsFile":

@@ -48,15 +48,15 @@ class LoggedSessions:
     report: dict[str, Any]
     """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`; of a split of
     a store, only "dropped"."""
+    rows: UserRows
+    """The rows of the users, those of the run's store too."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
-    rows: UserRows | None = None
-    """The rows of the users, those of the run's store too; None if they were not collected."""
 
     @property
     def history_lacking(self) -> str:
         """A warning where users are taken to have no earlier rows; empty otherwise."""
-        if self.rows is None or self.rows.earlier is not None:
+        if self.rows.earlier is not None:
             return ""
         return (
             "the store of the run is gone or has changed: users are ranked without what they were "
@@ -165,22 +165,20 @@ def prepared_sessions(
         _note_unknown_users(str(files[0]), store, report["users"], trained)
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        logged = LoggedSessions(store, users, report, unknown)
-        yield _with_history(trained, logged, readable_store(trained))
+        store, rows = _with_history(trained, store, users, readable_store(trained))
+        yield LoggedSessions(store, users, report, rows, unknown)
 
 
 def _with_history(
-    trained: TrainedPolicy, logged: LoggedSessions, earlier: EpisodeStore | None
-) -> LoggedSessions:
-    """The sessions with the earlier rows of their users; those of a session that goes on are a
-    part of it, as in `recommend`. Session ids of the store are not kept: such sessions begin
-    with the logs."""
+    trained: TrainedPolicy, store: EpisodeStore, users: Array, earlier: EpisodeStore | None
+) -> tuple[EpisodeStore, UserRows]:
+    """The sessions and all rows of their users; earlier rows of a session that goes on are a part
+    of it, as in `recommend`. Session ids of the store are not kept: such sessions begin with the
+    logs."""
     record = trained.record
-    seen = None if earlier is None else _as_seen(earlier, trained)
-    rows = UserRows.of(logged.store, logged.users, seen)
+    rows = UserRows.of(store, users, None if earlier is None else _as_seen(earlier, trained))
     by_id = record.session_by == schema.SESSION_ID
-    store = logged.store if by_id else rows.continued(record.session_gap_ms)
-    return replace(logged, store=store, rows=rows)
+    return store if by_id else rows.continued(record.session_gap_ms), rows
 
 
 def _unknown_items(store: EpisodeStore) -> int:
@@ -329,9 +327,9 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     if not test.n_episodes:
         raise InputError(f"{store.path} has no test split; name later logs")
     users = test.episode_values(schema.USER)
-    logged = LoggedSessions(_as_seen(test, first), users, {"dropped": {}})
     before = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
-    return _with_history(first, logged, store.select(before))
+    sessions, rows = _with_history(first, _as_seen(test, first), users, store.select(before))
+    return LoggedSessions(sessions, users, {"dropped": {}}, rows)
 
 
 def require_items(trained: TrainedPolicy) -> None:

@@ -59,7 +59,7 @@ from ucfrec.python_api.given_data import (
     split_given,
     store_given,
 )
-from ucfrec.python_api.run_folders import Scratch, completed, kept_beside
+from ucfrec.python_api.run_folders import Scratch, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
@@ -68,6 +68,7 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
@@ -93,8 +94,6 @@ _checked: Final = checked(
     }
 )
 """Decorator of methods: the check of each argument by its name."""
-_FRAME = "a frame"
-"""What a data frame is called in model cards."""
 
 
 class Recommender:
@@ -238,7 +237,10 @@ class Recommender:
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 with in_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            trained = completed(store, out, refit)
+            if refit:
+                refit_within(store, out)
+            write_card(out)
+            trained = TrainedPolicy.load(out)
             kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
         self._trained, self._scratch = trained, kept
         return self
@@ -399,7 +401,6 @@ class Recommender:
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
             said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
             said += [logged.history_lacking] if logged.history_lacking else []
-            assert logged.rows is not None
             later = Later(logged.store, logged.rows, filter_seen)
             about = later, logged.users, k, seed
             rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
@@ -638,7 +639,7 @@ def _named(logs: Logs | None) -> str:
     if logs is None:
         return "the test split"
     if isinstance(logs, pd.DataFrame):
-        return _FRAME
+        return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
     listed = [files] if isinstance(files, (str, Path)) else files
     return ", ".join(without_folders(str(file)) for file in listed)

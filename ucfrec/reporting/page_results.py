@@ -110,7 +110,7 @@ def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
     drawn = []
     for one in results.estimates:
         rows = [*([one.logged] if one.logged else []), *one.rows]
-        names = [_estimator(row) for row in rows]
+        names = ["logged sessions" if row.method == LOGGED else row.method for row in rows]
         body = [
             (name, [interval(row), *(shown(row.as_line().get(column)) for column in _WEIGHTS)])
             for name, row in zip(names, rows, strict=True)
@@ -120,10 +120,6 @@ def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
         chart = _bars(f"Mean return of a session: {one.name}, with 95% intervals", names, rows)
         drawn.append((one, chart, table))
     return drawn
-
-
-def _estimator(row: ResultRow) -> str:
-    return "logged sessions" if row.method == LOGGED else row.method
 
 
 def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> BarChart:

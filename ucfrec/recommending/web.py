@@ -280,9 +280,9 @@ _DESCRIBED: Final = {
     }
 }
 _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
-    status: {
-        "description": text,
-        "content": {_JSON: {"schema": _ERROR if status > 200 else _ANSWER}},
-    }
-    for status, text in {200: "The items.", **_FAULTS}.items()
+    200: {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}},
+    **{
+        status: {"description": text, "content": {_JSON: {"schema": _ERROR}}}
+        for status, text in _FAULTS.items()
+    },
 }

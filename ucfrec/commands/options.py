@@ -3,9 +3,9 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
@@ -154,13 +154,6 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
-    _score_options(rule)
-    _draw_options(rule)
-    _filter_options(rule)
-
-
-def _score_options(rule: argparse._ArgumentGroup) -> None:
-    """Add what the score of an item is made of."""
     target = rule.add_mutually_exclusive_group()
     target.add_argument(
         "--target-return",
@@ -180,45 +173,8 @@ def _score_options(rule: argparse._ArgumentGroup) -> None:
         action="store_true",
         help="target return: the largest that the policy expects in each state",
     )
-    rule.add_argument(
-        "--minimum-target",
-        type=float,
-        metavar="RETURN",
-        help="lower bound of the target, also once a session has reached it",
-    )
-    rule.add_argument(
-        "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
-    )
-    rule.add_argument(
-        "--policy-weight", type=float, metavar="W", help="weight of the policy; 0 for none"
-    )
-    rule.add_argument(
-        "--lookahead",
-        type=float,
-        metavar="RETURN",
-        help="expected return after a step that does not end the session; 0 for none",
-    )
-
-
-def _draw_options(rule: argparse._ArgumentGroup) -> None:
-    """Add how items are drawn by their scores."""
-    rule.add_argument(
-        "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
-    )
-    rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
-    rule.add_argument(
-        "--explore",
-        type=float,
-        metavar="SHARE",
-        help="share of the requests that draw uniformly from all items that are allowed",
-    )
-    rule.add_argument(
-        "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
-    )
-
-
-def _filter_options(rule: argparse._ArgumentGroup) -> None:
-    """Add which items are left out."""
+    for name, kind, unit, text in _NUMBERS_OF_RULES:
+        rule.add_argument(name, type=kind, metavar=unit, help=text)
     rule.add_argument(
         "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
@@ -234,6 +190,28 @@ def _filter_options(rule: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="exclude items of one main tag once the last N had it and were liked",
     )
+
+
+_NUMBERS_OF_RULES: Final = (
+    (
+        *("--minimum-target", float, "RETURN"),
+        "lower bound of the target, also once a session has reached it",
+    ),
+    ("--reward-weight", float, "BETA", "weight of the reward model; 0 for none"),
+    ("--policy-weight", float, "W", "weight of the policy; 0 for none"),
+    (
+        *("--lookahead", float, "RETURN"),
+        "expected return after a step that does not end the session; 0 for none",
+    ),
+    ("--temperature", float, "TEMPERATURE", "draw items at this temperature; 0 takes the best"),
+    ("--top-k", int, "N", "draw from the N best items only"),
+    (
+        *("--explore", float, "SHARE"),
+        "share of the requests that draw uniformly from all items that are allowed",
+    ),
+    ("--explore-top", int, "N", "these draw from the N best items only"),
+)
+"""Option, type, unit and meaning of numbers that a rule has."""
 
 
 def keep_seen_option(parser: argparse.ArgumentParser) -> None:
@@ -388,20 +366,8 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
     target = options.target_return
     if options.target_quantile is not None:
         target = trained.target_return(options.target_quantile)
-    parts = {
-        "target": target,
-        "minimum_target": options.minimum_target,
-        "reward_weight": options.reward_weight,
-        "policy_weight": options.policy_weight,
-        "lookahead": options.lookahead,
-        "temperature": options.temperature,
-        "top_k": options.top_k,
-        "explore": options.explore,
-        "explore_top": options.explore_top,
-        "exclude_seen": options.exclude_seen or None,
-        "tag_window": options.tag_window,
-        "tag_run": options.tag_run,
-    }
+    parts = {each.name: getattr(options, each.name, None) for each in fields(trained.rule)}
+    parts |= {"target": target, "exclude_seen": options.exclude_seen or None}
     given = {name: value for name, value in parts.items() if value is not None}
     if options.max_return:
         given["target"] = None

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +16,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
 from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.session_metrics import session_metrics
+from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
@@ -106,23 +105,21 @@ def _row(
     if isinstance(env.single_action_space, spaces.Discrete):
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
-    found = asdict(session_metrics(played, seed))
-    low, high, count = (found.pop(name) for name in ("R_cum_low", "R_cum_high", "episodes"))
     row = ResultRow(
         suite=SUITE,
         table=SUITE,
         task=environment.title,
         environment=environment.title,
         evaluation_seed=seed,
-        conditions={"episodes": count},
+        conditions={"episodes": episodes},
         metric="R_cum",
         metrics={},
-        interval=(low, high),
+        interval=bootstrap_interval(played.returns, seed),
         wall_time_s=seconds,
         **about,
         **provenance(),
     )
-    return row.extended({**found, **variety})
+    return row.extended({**session_metrics(played), **variety})
 
 
 def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:

@@ -54,23 +54,23 @@ class Diagnosis:
     users: int
     left_out: int
     """Sessions with a step of unknown propensity: no part of what follows."""
-    overlap: float | None
+    overlap: float | None = None
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
-    tests: tuple[WeightTest, ...]
-    effective_by_step: tuple[float, ...]
+    tests: tuple[WeightTest, ...] = ()
+    effective_by_step: tuple[float, ...] = ()
     """(T,) effective users at each step, of the products up to it; empty of steps that are sums of
     sessions."""
-    effective_users: float
+    effective_users: float = 0.0
     """Of the session products, summed by user."""
-    largest_weight: float
+    largest_weight: float = 1.0
     """Share of the heaviest user in all weight."""
-    rewarded_users: int
+    rewarded_users: int = 0
     """Users with a session that has both weight and reward."""
-    mean_weight: float | None
+    mean_weight: float | None = None
     """Mean session product, 1 in expectation."""
-    tail: float | None
+    tail: float | None = None
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
-    bounds: tuple[float, float] | None
+    bounds: tuple[float, float] | None = None
     """Between these lies the value if the propensities are true, whatever the choices that the logs
     lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
@@ -96,8 +96,7 @@ def diagnose(
     """
     lacking, users = steps.lacking, int(steps.users.max()) + 1
     if lacking.all():
-        nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
-        return Diagnosis(len(lacking), users, len(lacking), *nothing)
+        return Diagnosis(len(lacking), users, left_out=len(lacking))
     known = steps.known()
     by_user = np.bincount(known.users, known.session_weights).astype(np.float64)
     rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))

@@ -137,14 +137,13 @@ def _difference(
     measure: str, above: Float64Array, below: Float64Array, user: IntArray, seed: int, doubt: str
 ) -> Difference:
     """The ratio of sums over steps (N, 1), with its interval over users."""
-    value = float(above.sum() / below.sum())
+    low = high = value = float(above.sum() / below.sum())
     (interval,) = cluster_intervals(above, below, user, seed)
-    if interval is None or not np.isfinite([interval.low, interval.high]).all():
-        doubt = doubt or ("the users do not differ enough" if value else "")
-        return Difference(measure=measure, value=value, low=value, high=value, doubt=doubt)
-    return Difference(
-        measure=measure, value=value, low=interval.low, high=interval.high, doubt=doubt
-    )
+    if interval is not None and np.isfinite([interval.low, interval.high]).all():
+        low, high = interval.low, interval.high
+    elif value and not doubt:
+        doubt = "the users do not differ enough"
+    return Difference(measure=measure, value=value, low=low, high=high, doubt=doubt)
 
 
 def _doubt(weights: Float64Array, user: IntArray) -> str:

@@ -262,18 +262,13 @@ def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
 def limit_options(parser: argparse.ArgumentParser) -> None:
     """Add the limits of a request for recommendations."""
     limits = parser.add_argument_group("request limits", "larger requests are rejected")
-    limits.add_argument(
-        "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
-    )
-    limits.add_argument(
-        "--max-k", type=int, default=1000, metavar="N", help="items requested (default: 1,000)"
-    )
-    limits.add_argument(
-        "--max-history", type=int, default=5000, metavar="N", help="rows (default: 5,000)"
-    )
-    limits.add_argument(
-        "--max-candidates", type=int, default=10_000, metavar="N", help="items (default: 10,000)"
-    )
+    for name, most, text in (
+        ("--max-bytes", 2**21, "bytes of JSON (default: 2 MiB)"),
+        ("--max-k", 1000, "items requested (default: 1,000)"),
+        ("--max-history", 5000, "rows (default: 5,000)"),
+        ("--max-candidates", 10_000, "items (default: 10,000)"),
+    ):
+        limits.add_argument(name, type=int, default=most, metavar="N", help=text)
 
 
 def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = "") -> None:

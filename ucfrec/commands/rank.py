@@ -90,8 +90,8 @@ def run(options: argparse.Namespace) -> None:
         rows = _rows(options, trained, train, held_out_sessions(trained), liked)
     lines = [{**dict.fromkeys(Ranking.shown), "policy": row.method, **row.metrics} for row in rows]
     print(format_rows(lines, ("policy", *Ranking.shown)))
-    *shown, _ = Ranking.shown  # the last, coverage, is none of MEASURES
-    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in shown))
+    described = [name for name in Ranking.shown if name in MEASURES]
+    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in described))
     about = rows[0].conditions
     print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
-        card_of_ranking(policy.folder, row, shown, on, said)
+        card_of_ranking(policy.folder, row, on, said)
     if options.json is not None:
         write_results(options.json, rows)
     print(_conclusion(rows, trained))
@@ -143,9 +143,7 @@ def _rows(
     from ucfrec.evaluation.ranking_baselines import PolicyRanker
     from ucfrec.evaluation.ranking_table import ranking_rows
 
-    policies = [
-        PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
-    ]
+    policies = [PolicyRanker(policy, rule_given(options, policy)) for policy in trained]
     steps = Later(later.store, later.rows, not options.keep_seen)
     about = steps, later.users, options.k, options.seed
     rows = ranking_rows(policies, trained[0], train, *about, liked)

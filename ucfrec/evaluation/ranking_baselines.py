@@ -33,8 +33,8 @@ _Factors = Literal["als", "bpr"]
 class PolicyRanker:
     """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
 
-    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
-        self.name, self.trained, self._scorer = name, trained, trained.scorer(rule)
+    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None = None) -> None:
+        self.name, self.trained, self._scorer = trained.name, trained, trained.scorer(rule)
         self.rule = self._scorer.rule
 
     def scores(self, steps: Steps) -> Tensor:

@@ -391,13 +391,11 @@ class Recommender:
         """
         beside = several("others", others, "a Recommender", Recommender)
         trained, *rest = (each._evaluated(logs) for each in (self, *beside))
-        all_trained = [trained, *rest]
-        require_one_catalogue(all_trained)
+        require_one_catalogue([trained, *rest])
         with in_words_of_python():
             wanted = liked and Expression(liked, "--liked")
             by = LikedExpression(wanted, trained.record.reward) if wanted else None
-        rankers = [PolicyRanker(each, None, each.name) for each in all_trained]
-        rankers[0] = PolicyRanker(trained, rule, trained.name)
+        rankers = [PolicyRanker(trained, rule), *map(PolicyRanker, rest)]
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
             said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
             said += [logged.history_lacking] if logged.history_lacking else []
@@ -405,7 +403,7 @@ class Recommender:
             about = later, logged.users, k, seed
             rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
         rows = [replace(row, checkpoint="best") for row in rows]
-        card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
+        card_of_ranking(trained.folder, rows[0], _named(logs), said)
         return Ranking(rows, said)
 
     @_checked

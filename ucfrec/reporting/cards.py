@@ -9,6 +9,7 @@ from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.provenance import without_folders
 from ucfrec.reporting.model_card import add_measurement
 from ucfrec.results.row import ResultRow
+from ucfrec.results.table import Ranking
 
 
 def card_of_evaluation(run: Path, row: ResultRow) -> None:
@@ -34,13 +35,11 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -
     add_measurement(run, "ucfrec ope", of, values, said)
 
 
-def card_of_ranking(
-    run: Path, row: ResultRow, measures: Iterable[str], on: str, said: Sequence[str] = ()
-) -> None:
+def card_of_ranking(run: Path, row: ResultRow, on: str, said: Sequence[str] = ()) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     intervals = row.details["intervals"]
     values: dict[str, object] = {}
-    for name in (*measures, "coverage"):
+    for name in Ranking.shown:
         values[name] = row.metrics.get(name)
         if name in row.metrics and name in intervals:
             low, high = intervals[name]

@@ -71,7 +71,7 @@ def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -
     assert trained.item_states is not None
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users, LikedByRange(trained.item_states))
-    ranker, k = PolicyRanker(trained, None, trained.name), min(k, period.n_items)
+    ranker, k = PolicyRanker(trained), min(k, period.n_items)
     rows = UserRows.of(validation, users, store.split("train"))
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
     above, below = measure(period, ranked, k)[_MEASURES[metric]]

@@ -12,6 +12,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Actor, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
@@ -141,9 +142,7 @@ def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) ->
     ids = trained.item_ids
     if ids is None or ids.dtype.kind not in "iu":
         raise _misfit(environment, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
-    order = np.argsort(known)
-    nearest = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
-    numbers = np.where(known[nearest] == ids, nearest, -1)
+    numbers = IdLookup(known).numbers(ids)
     if (numbers < 0).all():
         raise _misfit(environment, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
     return numbers

@@ -14,7 +14,7 @@ import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.off_policy.estimators import step_totals
-from ucfrec.off_policy.intervals import cluster_means
+from ucfrec.off_policy.intervals import cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
@@ -146,8 +146,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     for name, values, sessions in groups:
         user = steps.users[sessions]
         if len(np.unique(user)) >= ENOUGH_TO_TEST:
-            (mean,), (error,) = cluster_means(values[:, None], user)
-            found.append((name, float(mean), float(error)))
+            found.append((name, *cluster_mean(values, user)))
     found += _group_weights(steps, ratios)
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(found), 1)))
     return tuple(
@@ -169,8 +168,8 @@ def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, 
         if len(np.unique(user[here])) < ENOUGH_TO_TEST or share < LEAST_SHOWN:
             continue
         beyond = (np.where(here, ratios, 0.0) - expected) / share
-        (mean,), (error,) = cluster_means(beyond[:, None], user)
-        found.append((f"item group {number}", 1 + float(mean), float(error)))
+        mean, error = cluster_mean(beyond, user)
+        found.append((f"item group {number}", 1 + mean, error))
     return found
 
 
@@ -192,10 +191,10 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
     if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
         return None
     shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
-    (mean,), (error,) = cluster_means(shares[:, None], user[known])
+    mean, error = cluster_mean(shares, user[known])
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
-    passed = bool(mean - 1 <= max(_TOLERANCE, limit * error))
-    return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
+    passed = mean - 1 <= max(_TOLERANCE, limit * error)
+    return WeightTest(ITEMS_TO_CHOOSE_FROM, mean, error, passed)
 
 
 def pareto_tail(weights: Float64Array) -> float | None:

@@ -31,7 +31,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_means
+from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
@@ -327,12 +327,12 @@ def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
         "lift": Terms(doubly_robust - reward, ones, weight),
     }
     found = summaries(terms, user, seed)
-    (mean,), (error,) = cluster_means(weight[:, None], user)
+    mean_weight, error = cluster_mean(weight, user)
     return StepValue(
         lift=found.pop("lift"),
         estimates=found,
         steps=len(reward),
         of=len(known),
-        mean_weight=float(mean),
-        mean_weight_error=float(error),
+        mean_weight=mean_weight,
+        mean_weight_error=error,
     )

@@ -45,11 +45,6 @@ class StepInputs:
         )
         return of_chosen, of_shown
 
-    def flat(self) -> Float32Array:
-        """(B, C + 2 D + 2), for `from_flat`."""
-        parts = (self.context, self.chosen, self.shown, self.scores)
-        return np.asarray(torch.cat(parts, dim=1), dtype=np.float32)
-
 
 def context_of(batch: ScoredSteps) -> Tensor:
     """(B, C) state, return left of the target, and last-layer features of the policy's window.
@@ -80,7 +75,8 @@ class InputsFile:
     def append(self, inputs: StepInputs) -> None:
         """Write the next steps."""
         self._sizes = (inputs.context.shape[1], inputs.state_size, inputs.chosen.shape[1])
-        self._file.write(inputs.flat().tobytes())
+        parts = (inputs.context, inputs.chosen, inputs.shown, inputs.scores)
+        self._file.write(np.asarray(torch.cat(parts, dim=1), dtype=np.float32).tobytes())
 
     def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
         """All steps in order, some thousand at once, as `StepInputs.features`."""

@@ -12,7 +12,7 @@ from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import mean_ranks
-from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
+from ucfrec.off_policy.intervals import cluster_intervals, cluster_mean
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
@@ -148,8 +148,8 @@ def _difference(
 
 def _doubt(weights: Float64Array, user: IntArray) -> str:
     """Why not to rely on weights (N, 2) of the new and the old run; empty if nothing is found."""
-    means, errors = cluster_means(weights, user)
-    for name, mean, error in zip(("new", "old"), means, errors, strict=True):
+    for name, column in zip(("new", "old"), weights.T, strict=True):
+        mean, error = cluster_mean(column, user)
         if not abs(mean - 1) <= _ERRORS * error:
             return (
                 f"the mean weight of the {name} run is {mean:.3g} ± {error:.2g} where 1 is "

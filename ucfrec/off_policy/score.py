@@ -21,7 +21,6 @@ from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.engine import BATCH_ROWS
 from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping
@@ -183,12 +182,7 @@ def _with_history(
 
 def _unknown_items(store: EpisodeStore) -> int:
     """Number of steps that show an item which the run does not know."""
-    steps = (
-        np.arange(begin, min(begin + BATCH_ROWS, store.n_steps))
-        for begin in range(0, store.n_steps, BATCH_ROWS)
-    )
-    items = (store.step_values(schema.ITEM, *store.locate(each)) for each in steps)
-    return sum(int((each < 0).sum()) for each in items)
+    return sum(int((items < 0).sum()) for (items,) in store.column_batches(schema.ITEM))
 
 
 def _note_unknown_users(name: str, store: EpisodeStore, users: int, trained: TrainedPolicy) -> None:

@@ -47,8 +47,7 @@ def compare_runs(
         seen: rows of the users of the grown store, if items that a user was shown before are
             excluded.
     """
-    places = rows.all_steps()
-    user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
+    user = rows.episode_values(schema.USER).astype(np.int64)[rows.all_steps()[0]]
     found = _Logged.of(new, rows, seen), _Logged.of(old, as_known(rows, old), seen)
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)

@@ -96,7 +96,7 @@ def write_report(
                 warnings += [(run.name, text) for text in _warnings(run)]
         with damage_explained(group[0].folder / RUN, _REMEDY):
             sections.append(_section(group, features))
-    page = _template().render(
+    page = template("ucfrec.reporting", "report.html").render(
         version=__version__,
         warnings=warnings,
         sections=sections,
@@ -110,12 +110,16 @@ def write_report(
 
 
 @cache
-def _template() -> Template:
-    loader = PackageLoader("ucfrec.reporting", "")
+def template(package: str, name: str) -> Template:
+    """A template of HTML in a package, which escapes all values."""
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader(package, ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 def _read_runs(folders: Sequence[Path]) -> list[_Run]:

@@ -175,11 +175,9 @@ def evaluate_off_policy(
         **diagnosis_columns(diagnosis),
         **evaluated.models.columns(),
     }
-    read = (
-        logged.store.record.fingerprint,
-        conditions(trained.folder, len(steps.first), len(steps.reward), options),
-    )
-    subject = Subject(trained, rule, seed, *read, about)
+    fingerprint = logged.store.record.fingerprint
+    read = conditions(trained.folder, len(steps.first), len(steps.reward), options)
+    subject = Subject(trained, rule, seed, fingerprint, read, about)
     return OffPolicyReport(
         subject.rows(found),
         warnings,

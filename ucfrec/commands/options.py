@@ -143,6 +143,34 @@ def memory_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+_NUMBERS_OF_RULES: Final = (
+    (
+        "--minimum-target",
+        float,
+        "RETURN",
+        "lower bound of the target, also once a session has reached it",
+    ),
+    ("--reward-weight", float, "BETA", "weight of the reward model; 0 for none"),
+    ("--policy-weight", float, "W", "weight of the policy; 0 for none"),
+    (
+        "--lookahead",
+        float,
+        "RETURN",
+        "expected return after a step that does not end the session; 0 for none",
+    ),
+    ("--temperature", float, "TEMPERATURE", "draw items at this temperature; 0 takes the best"),
+    ("--top-k", int, "N", "draw from the N best items only"),
+    (
+        "--explore",
+        float,
+        "SHARE",
+        "share of the requests that draw uniformly from all items that are allowed",
+    ),
+    ("--explore-top", int, "N", "these draw from the N best items only"),
+)
+"""Option, type, unit and meaning of numbers that a rule has."""
+
+
 def rule_options(parser: argparse.ArgumentParser) -> None:
     """Add --checkpoint and the parts of a decision rule that replace those of the run's own."""
     parser.add_argument(
@@ -190,28 +218,6 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="exclude items of one main tag once the last N had it and were liked",
     )
-
-
-_NUMBERS_OF_RULES: Final = (
-    (
-        *("--minimum-target", float, "RETURN"),
-        "lower bound of the target, also once a session has reached it",
-    ),
-    ("--reward-weight", float, "BETA", "weight of the reward model; 0 for none"),
-    ("--policy-weight", float, "W", "weight of the policy; 0 for none"),
-    (
-        *("--lookahead", float, "RETURN"),
-        "expected return after a step that does not end the session; 0 for none",
-    ),
-    ("--temperature", float, "TEMPERATURE", "draw items at this temperature; 0 takes the best"),
-    ("--top-k", int, "N", "draw from the N best items only"),
-    (
-        *("--explore", float, "SHARE"),
-        "share of the requests that draw uniformly from all items that are allowed",
-    ),
-    ("--explore-top", int, "N", "these draw from the N best items only"),
-)
-"""Option, type, unit and meaning of numbers that a rule has."""
 
 
 def keep_seen_option(parser: argparse.ArgumentParser) -> None:

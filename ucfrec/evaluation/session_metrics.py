@@ -14,7 +14,8 @@ def session_metrics(played: Episodes) -> dict[str, float]:
     Returns:
         `R_cum`: mean episode return (called R_tra in some papers). `R_avg_pooled`: sum of all
         rewards divided by the number of all steps (called R_each in some papers). `R_avg_episode`:
-        mean over episodes of the episode's mean reward per step. `length`: mean number of steps.
+        mean over episodes of the episode's mean reward per step. `length`: mean number of steps of
+        an episode.
     """
     returns, lengths = played.returns, played.lengths
     return {

@@ -239,10 +239,8 @@ def _rule_given(trained: TrainedPolicy, given: Mapping[str, str]) -> DecisionRul
     rule = trained.rule
     if given.get("custom") is None:
         return rule
-    changes: dict[str, Any] = {}
-    for name in ("target", "reward_weight", "temperature"):
-        if name in given:
-            changes[name] = _number(given, name, 0.0, -1e12, 1e12)
+    names = [name for name in ("target", "reward_weight", "temperature") if name in given]
+    changes: dict[str, Any] = {name: _number(given, name, 0.0, -1e12, 1e12) for name in names}
     if "tag_window" in given:
         changes["tag_window"] = round(_number(given, "tag_window", 0, 0, 10))
     return replace(rule, **changes)

@@ -169,15 +169,17 @@ def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
         if each.value is not None and each.evidence and each.evidence.effective_users is not None
     ]
     highest, curve, body = -math.inf, dict[float, float](), []
-    for users, value, rule, interval in sorted(known, key=lambda one: (-one[0], -one[1])):
+    for users, value, rule, ends in sorted(known, key=lambda one: (-one[0], -one[1])):
         if value > highest:
             highest = curve[users] = value
-            ends = f"{interval[0]:.4g} to {interval[1]:.4g}" if interval else "-"
-            body.append((str(rule), [shown(value), f"{users:.0f}", ends]))
+            between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
+            body.append((str(rule), [shown(value), f"{users:.0f}", between]))
     if not curve:
         return None
-    chosen = ({users: value} for users, value, rule, _ in known if rule == record.rule.rule)
-    curves = [("best rule", 0, curve), *(("chosen rule", 1, point) for point in [*chosen][:1])]
+    curves = [("best rule", 0, curve)]
+    chosen = [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]
+    if chosen:
+        curves.append(("chosen rule", 1, dict(chosen[:1])))
     title = "Estimated value against evidence"
     chart = line_chart(title, "effective users of the log", curves)
     head = ["estimated value", "effective users", "off-policy interval"]

@@ -20,6 +20,7 @@ from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import RUN, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
+from ucfrec.runs.screened import without_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.runs.warm_start import SHARE, warm_settings
 from ucfrec.updating.drift import drift
@@ -85,9 +86,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = EpisodeStore.open(grown)
-    if trained.dropped:
-        opened = opened.without_observation_dimensions(trained.dropped)
+    opened = without_columns(EpisodeStore.open(grown), trained.dropped)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:

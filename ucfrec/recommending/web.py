@@ -162,7 +162,7 @@ def application(
     """
     hosts = [_host(each) for each in allowed_hosts]
     metrics = ServingMetrics(responder.drift, shared_metrics)
-    batcher = Batcher(responder, metrics, limits.batch, limits.queue)
+    batcher = Batcher(responder.answers, metrics, limits.batch, limits.queue)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

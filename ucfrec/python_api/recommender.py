@@ -74,17 +74,16 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
-_TEXT: Final = of_kind("text", str)
-_PATH: Final = of_kind("a path", str, Path)
-_FUNCTION: Final = of_kind("a function", Callable)
 _checked: Final = checked(
     {
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
-        **dict.fromkeys(("reward", "session_by", "dataset", "screen", "liked"), _TEXT),
-        **dict.fromkeys(("out", "run", "folder", "file"), _PATH),
-        **dict.fromkeys(("on_step", "on_validation"), _FUNCTION),
+        **dict.fromkeys(
+            ("reward", "session_by", "dataset", "screen", "liked"), of_kind("text", str)
+        ),
+        **dict.fromkeys(("out", "run", "folder", "file"), of_kind("a path", str, Path)),
+        **dict.fromkeys(("on_step", "on_validation"), of_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
         "split": split_given,
         "histories": of_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),

@@ -334,7 +334,7 @@ def test_played_scored_ranked_and_recommended_alike(
     more = latest.assign(timestamp=latest.timestamp + 1000, item_id=5, reward=1.0)
     pd.concat([log, more]).to_parquet(tmp_path / "log.parquet")
     with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
-        store, ranker = logged.store, PolicyRanker(trained, given, "ucf")
+        store, ranker = logged.store, PolicyRanker(trained, given)
         batches = list(scored_steps(trained, store, given))
         (batch,) = batches
         later = Later(store, UserRows.of(store, np.array(logged.users), None))

@@ -259,9 +259,8 @@ def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
     trained = policy.trained
     assert trained.item_ids is not None
     rule = replace(trained.rule, temperature=0.0)  # does not draw
-    ranker = PolicyRanker(trained, rule, "ucf")
+    ranker = PolicyRanker(trained, rule)
     with logged_sessions(trained, [tmp_path / "after.parquet"], LogMapping()) as logged:
-        assert logged.rows is not None
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)
         assert (logged.store.lengths.sum() > logged.store.n_steps) is np.True_

@@ -36,7 +36,7 @@ def inputs_of(steps: int, seed: int) -> StepInputs:
 
 def test_a_file_gives_back_what_was_written(tmp_path: Path) -> None:
     sizes = [3, ROWS_AT_ONCE, 500]
-    with InputsFile(tmp_path) as file:
+    with InputsFile() as file:
         for seed, steps in enumerate(sizes):
             file.append(inputs_of(steps, seed))
         for _ in range(2):  # as often as it is read

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ucfrec.off_policy.intervals import MOST_CLUSTERS, cluster_intervals, cluster_means
+from ucfrec.off_policy.intervals import MOST_CLUSTERS, cluster_intervals, cluster_mean
 
 
 def column(values: np.ndarray) -> np.ndarray:
@@ -81,9 +81,9 @@ def test_more_clusters_than_are_drawn_from_change_no_error() -> None:
 
 
 def test_means_have_clustered_errors() -> None:
-    values = column(np.repeat([0.0, 1.0, 5.0], 4))
-    mean, error = cluster_means(values, np.repeat([7, 3, 9], 4))
-    assert mean[0] == pytest.approx(2.0)
-    assert error[0] == pytest.approx(np.std([0, 1, 5], ddof=1) / 3**0.5)
-    weights = column(np.repeat([1.0, 1.0, 0.0], 4))
-    assert cluster_means(values, np.repeat([7, 3, 9], 4), weights)[0][0] == pytest.approx(0.5)
+    values = np.repeat([0.0, 1.0, 5.0], 4)
+    mean, error = cluster_mean(values, np.repeat([7, 3, 9], 4))
+    assert mean == pytest.approx(2.0)
+    assert error == pytest.approx(np.std([0, 1, 5], ddof=1) / 3**0.5)
+    weights = np.repeat([1.0, 1.0, 0.0], 4)
+    assert cluster_mean(values, np.repeat([7, 3, 9], 4), weights)[0] == pytest.approx(0.5)

@@ -16,7 +16,6 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_product import Factors, ItemProduct, Part
 from ucfrec.acting.sessions import History, Sessions, seen_before
 from ucfrec.arrays import Float32Array, IntArray
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
@@ -274,10 +273,23 @@ class Scorer:
     ) -> Tensor:
         """`scores` of a query of the history."""
         if self.rule.policy_weight == 1 and not self.rule.looks_ahead:
-            scores = self._products(self.weighted(query), query.outputs)
+            factors, weighted = self.weighted(query), bool(self.rule.reward_weight)
+            scores = self._items.scores(factors, query.outputs, self.has_factors, weighted)
         else:
             scores = self._composed(query, history)
-        return self._left(scores, history.shown, left_out, excluded, empty)
+        if not torch.compiler.is_exporting():
+            _require_scores(scores, empty=True)
+        if left_out is not None:
+            scores[left_out] = -torch.inf
+        if excluded is not None:
+            scores = scores.masked_fill_(excluded, -torch.inf)
+        for without in self._items.without_tags(self.rule, history.shown):
+            left = scores.masked_fill(without, -torch.inf)
+            # A filter gives way where nothing would remain.
+            some = left.amax(1, keepdim=True) > -torch.inf
+            every = not torch.compiler.is_exporting() and bool(some.all())
+            scores = left if every else torch.where(some, left, scores)
+        return scores if empty else _require_scores(scores, empty)
 
     @torch.no_grad()
     def rewards(self, history: History) -> Tensor:
@@ -345,33 +357,6 @@ class Scorer:
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)
-
-    def _products(self, factors: Factors, outputs: Tensor | None = None) -> Tensor:
-        weighted = bool(self.rule.reward_weight)
-        return self._items.scores(factors, outputs, self.has_factors, weighted)
-
-    def _left(
-        self,
-        scores: Tensor,
-        shown: Shown,
-        left_out: tuple[Tensor, Tensor] | None,
-        excluded: Tensor | None,
-        empty: bool,
-    ) -> Tensor:
-        """The scores with −∞ for what is excluded; the given ones are overwritten."""
-        if not torch.compiler.is_exporting():
-            _require_scores(scores, empty=True)
-        if left_out is not None:
-            scores[left_out] = -torch.inf
-        if excluded is not None:
-            scores = scores.masked_fill_(excluded, -torch.inf)
-        for without in self._items.without_tags(self.rule, shown):
-            left = scores.masked_fill(without, -torch.inf)
-            # A filter gives way where nothing would remain.
-            some = left.amax(1, keepdim=True) > -torch.inf
-            every = not torch.compiler.is_exporting() and bool(some.all())
-            scores = left if every else torch.where(some, left, scores)
-        return scores if empty else _require_scores(scores, empty)
 
 
 def logged_history(

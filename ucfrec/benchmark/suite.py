@@ -15,7 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
 from ucfrec.files.atomic import read_json
 from ucfrec.results.row import ResultRow
-from ucfrec.runs.trained_policy import RUN
+from ucfrec.runs.record import RUN
 
 
 @dataclass(frozen=True)

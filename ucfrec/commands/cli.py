@@ -81,11 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(program: Program, arguments: Sequence[str] | None) -> int:
     """Run one command of `program`; returns the exit status as `main` does."""
-    debug = "--debug" in (sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
     name = program.name
     try:
         with interruptions_raised(), notes_on_one_line(program.name):
-            arguments = sys.argv[1:] if arguments is None else arguments
             options = build_parser(program, arguments).parse_args(arguments)
             name = f"{program.name} {options.command}"
             with local_paths(options) as options:
@@ -104,7 +103,7 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         return 0
     except Exception as error:
         message = explanation(error)
-        if message is None or debug:
+        if message is None or "--debug" in arguments:
             raise
         print(one_line(f"{name}: {message}"), file=sys.stderr)
         return 2

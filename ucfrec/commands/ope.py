@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.verdict import Verdict
+    from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -190,7 +191,6 @@ def _evaluated(
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.scored import evaluate_scored
     from ucfrec.reporting.cards import card_of_estimates
-    from ucfrec.reporting.tables import format_rows
 
     trained = candidate.trained
     arguments = {"rule": candidate.rule, "seed": options.seed, "options": given}
@@ -199,21 +199,11 @@ def _evaluated(
     else:
         with _logged(options, trained) as logged:
             found = evaluate_off_policy(trained, logged, **arguments)
-    shown = ("estimator", "policy", "choice", "R_cum", "effective_sessions", "sessions")
-    lines = [{**dict.fromkeys(shown), **r.as_line(), "estimator": r.method} for r in found.rows]
-    print(f"\n{format_rows(lines, shown)}")
+    print(f"\n{_table(found.rows, ('R_cum', 'effective_sessions', 'sessions'))}")
     if found.per_step is not None:
-        per_step = ("estimator", "policy", "choice", "R_step", "effective_steps", "steps")
-        lines = [
-            {
-                **dict.fromkeys(per_step),
-                **row.as_line(),
-                "estimator": row.method,
-                "steps": found.per_step.steps,
-            }
-            for row in found.step_rows
-        ]
-        print(f"\n{format_rows(lines, per_step)}\n{found.per_step}\n")
+        columns = ("R_step", "effective_steps", "steps")
+        table = _table(found.step_rows, columns, steps=found.per_step.steps)
+        print(f"\n{table}\n{found.per_step}\n")
     print("R_cum: return per session, with a 95% interval where an estimator has one")
     if found.models is not None:
         print(f"models: {found.models}")
@@ -223,6 +213,17 @@ def _evaluated(
     print(_next_step(found.verdict))
     card_of_estimates(trained.folder, options.logs or ["the test split"], found)
     return found
+
+
+def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object) -> str:
+    """The rows of estimators, with the columns and what is the same in all of them."""
+    from ucfrec.reporting.tables import format_rows
+
+    shown = ("estimator", "policy", "choice", *columns)
+    lines = [
+        {**dict.fromkeys(shown), **row.as_line(), "estimator": row.method, **more} for row in rows
+    ]
+    return format_rows(lines, shown)
 
 
 def _next_step(verdict: "Verdict") -> str:

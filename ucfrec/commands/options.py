@@ -3,9 +3,9 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.exposures import ExposureLog
-    from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -124,7 +123,7 @@ def runs_given(options: argparse.Namespace) -> list[Path]:
     Raises:
         InputError: there is none.
     """
-    from ucfrec.runs.trained_policy import RUN
+    from ucfrec.runs.record import RUN
 
     runs = [Path(path) for path in options.logs if (Path(path) / RUN).is_file()]
     options.logs = [path for path in options.logs if Path(path) not in runs]
@@ -144,6 +143,34 @@ def memory_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+_NUMBERS_OF_RULES: Final = (
+    (
+        "--minimum-target",
+        float,
+        "RETURN",
+        "lower bound of the target, also once a session has reached it",
+    ),
+    ("--reward-weight", float, "BETA", "weight of the reward model; 0 for none"),
+    ("--policy-weight", float, "W", "weight of the policy; 0 for none"),
+    (
+        "--lookahead",
+        float,
+        "RETURN",
+        "expected return after a step that does not end the session; 0 for none",
+    ),
+    ("--temperature", float, "TEMPERATURE", "draw items at this temperature; 0 takes the best"),
+    ("--top-k", int, "N", "draw from the N best items only"),
+    (
+        "--explore",
+        float,
+        "SHARE",
+        "share of the requests that draw uniformly from all items that are allowed",
+    ),
+    ("--explore-top", int, "N", "these draw from the N best items only"),
+)
+"""Option, type, unit and meaning of numbers that a rule has."""
+
+
 def rule_options(parser: argparse.ArgumentParser) -> None:
     """Add --checkpoint and the parts of a decision rule that replace those of the run's own."""
     parser.add_argument(
@@ -155,13 +182,6 @@ def rule_options(parser: argparse.ArgumentParser) -> None:
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
-    _score_options(rule)
-    _draw_options(rule)
-    _filter_options(rule)
-
-
-def _score_options(rule: argparse._ArgumentGroup) -> None:
-    """Add what the score of an item is made of."""
     target = rule.add_mutually_exclusive_group()
     target.add_argument(
         "--target-return",
@@ -181,45 +201,8 @@ def _score_options(rule: argparse._ArgumentGroup) -> None:
         action="store_true",
         help="target return: the largest that the policy expects in each state",
     )
-    rule.add_argument(
-        "--minimum-target",
-        type=float,
-        metavar="RETURN",
-        help="lower bound of the target, also once a session has reached it",
-    )
-    rule.add_argument(
-        "--reward-weight", type=float, metavar="BETA", help="weight of the reward model; 0 for none"
-    )
-    rule.add_argument(
-        "--policy-weight", type=float, metavar="W", help="weight of the policy; 0 for none"
-    )
-    rule.add_argument(
-        "--lookahead",
-        type=float,
-        metavar="RETURN",
-        help="expected return after a step that does not end the session; 0 for none",
-    )
-
-
-def _draw_options(rule: argparse._ArgumentGroup) -> None:
-    """Add how items are drawn by their scores."""
-    rule.add_argument(
-        "--temperature", type=float, help="draw items at this temperature; 0 takes the best"
-    )
-    rule.add_argument("--top-k", type=int, metavar="N", help="draw from the N best items only")
-    rule.add_argument(
-        "--explore",
-        type=float,
-        metavar="SHARE",
-        help="share of the requests that draw uniformly from all items that are allowed",
-    )
-    rule.add_argument(
-        "--explore-top", type=int, metavar="N", help="these draw from the N best items only"
-    )
-
-
-def _filter_options(rule: argparse._ArgumentGroup) -> None:
-    """Add which items are left out."""
+    for name, kind, unit, text in _NUMBERS_OF_RULES:
+        rule.add_argument(name, type=kind, metavar=unit, help=text)
     rule.add_argument(
         "--exclude-seen", action="store_true", help="exclude items that the session has shown"
     )
@@ -285,18 +268,13 @@ def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
 def limit_options(parser: argparse.ArgumentParser) -> None:
     """Add the limits of a request for recommendations."""
     limits = parser.add_argument_group("request limits", "larger requests are rejected")
-    limits.add_argument(
-        "--max-bytes", type=int, default=2**21, metavar="N", help="bytes of JSON (default: 2 MiB)"
-    )
-    limits.add_argument(
-        "--max-k", type=int, default=1000, metavar="N", help="items requested (default: 1,000)"
-    )
-    limits.add_argument(
-        "--max-history", type=int, default=5000, metavar="N", help="rows (default: 5,000)"
-    )
-    limits.add_argument(
-        "--max-candidates", type=int, default=10_000, metavar="N", help="items (default: 10,000)"
-    )
+    for name, most, text in (
+        ("--max-bytes", 2**21, "bytes of JSON (default: 2 MiB)"),
+        ("--max-k", 1000, "items requested (default: 1,000)"),
+        ("--max-history", 5000, "rows (default: 5,000)"),
+        ("--max-candidates", 10_000, "items (default: 10,000)"),
+    ):
+        limits.add_argument(name, type=int, default=most, metavar="N", help=text)
 
 
 def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = "") -> None:
@@ -338,22 +316,6 @@ def spark_given(options: argparse.Namespace) -> str | None:
     return None
 
 
-def limits_given(options: argparse.Namespace) -> "Limits":
-    """The limits that `limit_options` name.
-
-    Raises:
-        InputError: one is out of range.
-    """
-    from ucfrec.recommending.requests import Limits
-
-    return Limits(
-        bytes=options.max_bytes,
-        k=options.max_k,
-        history=options.max_history,
-        candidates=options.max_candidates,
-    )
-
-
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
     """What answers requests, by `--k`, `item_options`, `draw_options`, `engine_option`,
     `limit_options` and `rule_options`.
@@ -361,11 +323,18 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
     """
+    from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
 
+    limits = Limits(
+        bytes=options.max_bytes,
+        k=options.max_k,
+        history=options.max_history,
+        candidates=options.max_candidates,
+    )
     return Responder(
         trained,
-        limits_given(options),
+        limits,
         rule=rule_given(options, trained),
         k=options.k,
         filter_seen=not options.keep_seen,
@@ -398,20 +367,8 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
     target = options.target_return
     if options.target_quantile is not None:
         target = trained.target_return(options.target_quantile)
-    parts = {
-        "target": target,
-        "minimum_target": options.minimum_target,
-        "reward_weight": options.reward_weight,
-        "policy_weight": options.policy_weight,
-        "lookahead": options.lookahead,
-        "temperature": options.temperature,
-        "top_k": options.top_k,
-        "explore": options.explore,
-        "explore_top": options.explore_top,
-        "exclude_seen": options.exclude_seen or None,
-        "tag_window": options.tag_window,
-        "tag_run": options.tag_run,
-    }
+    parts = {each.name: getattr(options, each.name, None) for each in fields(trained.rule)}
+    parts |= {"target": target, "exclude_seen": options.exclude_seen or None}
     given = {name: value for name, value in parts.items() if value is not None}
     if options.max_return:
         given["target"] = None

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-_SHOWN = ("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate")
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec rank`."""
@@ -63,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
             test split to rank that none of the runs was trained on.
     """
     from ucfrec.evaluation.ranking import MEASURES
-    from ucfrec.evaluation.ranking_table import require_one_catalogue, training_store
+    from ucfrec.evaluation.ranking_table import require_one_catalogue
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
@@ -71,6 +69,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
+    from ucfrec.results.table import Ranking
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     runs = runs_given(options)
@@ -78,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--k is {options.k}; recommend at least 1 item")
     trained = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]
     require_one_catalogue(trained)
-    train, liked = training_store(trained[0]), _liked(options, trained[0])
+    train, liked = trained[0].training_store(), _liked(options, trained[0])
     if options.logs:
         files, mapping = logs_given(options, trained[0])
         with logged_sessions(trained[0], files, mapping) as logged:
@@ -89,10 +88,10 @@ def run(options: argparse.Namespace) -> None:
     else:
         warnings = [[] for _ in trained]
         rows = _rows(options, trained, train, held_out_sessions(trained), liked)
-    columns = (*_SHOWN, "coverage")
-    lines = [dict.fromkeys(columns) | {"policy": row.method} | dict(row.metrics) for row in rows]
-    print(format_rows(lines, ("policy", *columns)))
-    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in _SHOWN))
+    lines = [{**dict.fromkeys(Ranking.shown), "policy": row.method, **row.metrics} for row in rows]
+    print(format_rows(lines, ("policy", *Ranking.shown)))
+    described = [name for name in Ranking.shown if name in MEASURES]
+    print("\n" + "\n".join(f"{name:<16}{MEASURES[name]}" for name in described))
     about = rows[0].conditions
     print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
@@ -100,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
-        card_of_ranking(policy.folder, row, _SHOWN, on, said)
+        card_of_ranking(policy.folder, row, on, said)
     if options.json is not None:
         write_results(options.json, rows)
     print(_conclusion(rows, trained))
@@ -144,10 +143,7 @@ def _rows(
     from ucfrec.evaluation.ranking_baselines import PolicyRanker
     from ucfrec.evaluation.ranking_table import ranking_rows
 
-    policies = [
-        PolicyRanker(policy, rule_given(options, policy), policy.name) for policy in trained
-    ]
-    assert later.rows is not None
+    policies = [PolicyRanker(policy, rule_given(options, policy)) for policy in trained]
     steps = Later(later.store, later.rows, not options.keep_seen)
     about = steps, later.users, options.k, options.seed
     rows = ranking_rows(policies, trained[0], train, *about, liked)

@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
         InputError: no run is named, or a run, result or item file cannot be used.
     """
     from ucfrec.reporting.page import write_report
-    from ucfrec.runs.trained_policy import RUN
+    from ucfrec.runs.record import RUN
 
     # A run that follows `--results FILE` is still a run.
     runs = [*options.runs, *(path for path in options.results if (path / RUN).is_file())]

@@ -64,7 +64,8 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.prepare import parse_split
     from ucfrec.reporting.model_card import write_card
     from ucfrec.runs.promoted import promoted
-    from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+    from ucfrec.runs.record import RUN
+    from ucfrec.runs.trained_policy import TrainedPolicy
     from ucfrec.updating import drift, verdict
     from ucfrec.updating.update import UpdateOptions, update_run
 

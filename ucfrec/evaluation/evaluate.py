@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
@@ -13,11 +12,12 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Actor, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
 from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.session_metrics import session_metrics
+from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
@@ -106,23 +106,21 @@ def _row(
     if isinstance(env.single_action_space, spaces.Discrete):
         variety = variety_columns(env, recommended, counts, numbers)
     env.close()
-    found = asdict(session_metrics(played, seed))
-    low, high, count = (found.pop(name) for name in ("R_cum_low", "R_cum_high", "episodes"))
     row = ResultRow(
         suite=SUITE,
         table=SUITE,
         task=environment.title,
         environment=environment.title,
         evaluation_seed=seed,
-        conditions={"episodes": count},
+        conditions={"episodes": episodes},
         metric="R_cum",
         metrics={},
-        interval=(low, high),
+        interval=bootstrap_interval(played.returns, seed),
         wall_time_s=seconds,
         **about,
         **provenance(),
     )
-    return row.extended({**found, **variety})
+    return row.extended({**session_metrics(played), **variety})
 
 
 def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:
@@ -144,9 +142,7 @@ def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) ->
     ids = trained.item_ids
     if ids is None or ids.dtype.kind not in "iu":
         raise _misfit(environment, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
-    order = np.argsort(known)
-    nearest = order[np.minimum(np.searchsorted(known, ids, sorter=order), len(known) - 1)]
-    numbers = np.where(known[nearest] == ids, nearest, -1)
+    numbers = IdLookup(known).numbers(ids)
     if (numbers < 0).all():
         raise _misfit(environment, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
     return numbers

@@ -23,7 +23,6 @@ from ucfrec.schema import ITEM_ID, USER_IDS
 REWARD: Final = "reward"
 """Column of the environment's rewards in logs."""
 
-_Floats = Float64Array
 Items = Callable[[gymnasium.Env[Any, Any], int], pa.Table]
 """Reads the item table from an environment and its number of items."""
 _Observed = tuple[tuple[str | None, spaces.Space[Any]], ...]
@@ -103,7 +102,7 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     def step(
         self, actions: Any
-    ) -> tuple[Float32Array, _Floats, BoolArray, BoolArray, dict[str, Any]]:
+    ) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
         """Take one item or vector as action in each session, (N,) or (N, A); see
         `VectorEnv.step`."""
         played = super().step(actions)

@@ -121,7 +121,7 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
     """
     top = _top(recommended, k)
     _require(history, "history", *_PAIR)
-    _require_comparable(top[ITEM_ID], "recommended", history[ITEM_ID], "history")
+    _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
     users = history.groupby(ITEM_ID)[USER_ID].nunique()
     share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
     bits = pd.Series(-np.log2(share.to_numpy(np.float64)), top.index)
@@ -180,9 +180,9 @@ def serendipity(
     n = _size(catalogue, top)
     _require(relevant, "relevant", *_PAIR)
     _require(history, "history", ITEM_ID)
-    _require_comparable(top[ITEM_ID], "recommended", history[ITEM_ID], "history")
+    _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
     for name in _PAIR:
-        _require_comparable(top[name], "recommended", relevant[name], "relevant")
+        _require_comparable(top[name], relevant[name], "relevant")
     popularity = history[ITEM_ID].value_counts().rank(method="dense", ascending=False)
     by_all = ((n + 1 - top[ITEM_ID].map(popularity)) / n).fillna(0.0)
     earlier = ((n + 1 - top[_RANK]) / n - by_all).clip(lower=0.0)
@@ -206,7 +206,7 @@ def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataF
     _require(relevant, "relevant", *_PAIR)
     top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
     for name in _PAIR:
-        _require_comparable(recommended[name], "recommended", relevant[name], "relevant")
+        _require_comparable(recommended[name], relevant[name], "relevant")
     return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
 
 
@@ -215,7 +215,7 @@ def _size(catalogue: Collection[Any], top: pd.DataFrame) -> int:
     items = pd.Series(list(catalogue), dtype=None if len(catalogue) else object).drop_duplicates()
     if items.empty:
         raise InputError("catalogue is empty; give the item_ids of all items")
-    _require_comparable(top[ITEM_ID], "recommended", items, "catalogue")
+    _require_comparable(top[ITEM_ID], items, "catalogue")
     lacking = top[ITEM_ID][~top[ITEM_ID].isin(items)]
     if len(lacking):
         raise InputError(
@@ -237,13 +237,13 @@ def _require_features(features: pd.DataFrame) -> None:
             raise InputError(f"features: {name} holds lists; give one column per value of them")
 
 
-def _require_comparable(ids: pd.Series, of: str, others: pd.Series, of_others: str) -> None:
-    """Check that ids of two frames are of one kind: 7 and "7" are different."""
+def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> None:
+    """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
     kinds = [_KINDS.get(infer_dtype(np.asarray(each), skipna=True), "") for each in (ids, others)]
     if {*kinds} == {"numbers", "text"}:
         raise InputError(
-            f"{ids.name} holds {kinds[0]} in {of}, but {kinds[1]} in {of_others}; convert one of "
-            "them with astype"
+            f"{ids.name} holds {kinds[0]} in recommended, but {kinds[1]} in {of_others}; convert "
+            "one of them with astype"
         )
 
 

@@ -152,11 +152,16 @@ def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
     return found
 
 
+def mean_ranks(scores: Tensor, items: Tensor) -> Tensor:
+    """(B,) float64 rank of items (B,) by scores (B, n_items), from 1; tied ones share the mean."""
+    own = scores.gather(1, items.unsqueeze(1))
+    above, equal = (scores > own).sum(1), (scores == own).sum(1)
+    return 1 + above.double() + (equal - 1).double() / 2
+
+
 def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
-    of_shown = scores.gather(1, shown.unsqueeze(1))
-    above, equal = (scores > of_shown).sum(1), (scores == of_shown).sum(1)
-    ranks = 1 + above.double() + (equal - 1).double() / 2
-    ranks[torch.isneginf(of_shown[:, 0])] = torch.inf
+    ranks = mean_ranks(scores, shown)
+    ranks[torch.isneginf(scores.gather(1, shown.unsqueeze(1))[:, 0])] = torch.inf
     best, top = scores.topk(k, dim=1)
     return ranks.numpy(), top.masked_fill(torch.isneginf(best), -1).numpy()
 

@@ -21,6 +21,7 @@ from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
 from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.item_rate import liked_rates
 from ucfrec.policies.recent import RecentClicksPolicy, RecentRatePolicy, decayed_counts
+from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _KNN_HISTORY: Final = 20
@@ -32,8 +33,8 @@ _Factors = Literal["als", "bpr"]
 class PolicyRanker:
     """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
 
-    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None, name: str) -> None:
-        self.name, self.trained, self._scorer = name, trained, trained.scorer(rule)
+    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None = None) -> None:
+        self.name, self.trained, self._scorer = trained.name, trained, trained.scorer(rule)
         self.rule = self._scorer.rule
 
     def scores(self, steps: Steps) -> Tensor:
@@ -82,11 +83,6 @@ class Random:
         return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
 
 
-def _sizes(train: EpisodeStore) -> dict[str, int]:
-    items, size = train.item_states.embeddings.shape
-    return {"state": train.state_size, "action": size, "items": items}
-
-
 class ItemNeighbours:
     """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
 
@@ -96,7 +92,7 @@ class ItemNeighbours:
     name = "item-knn"
 
     def __init__(self, train: EpisodeStore, popularity: Tensor) -> None:
-        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), _sizes(train))
+        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
         self._knn.start_from(train)
         self._tie_break = 1e-6 * popularity / popularity.max()
 
@@ -113,7 +109,7 @@ class BoostedClicks:
 
     def __init__(self, train: EpisodeStore, seed: int) -> None:
         config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
-        self._policy = BoostedPolicy(config, _sizes(train))
+        self._policy = BoostedPolicy(config, policy_sizes(train))
         self._policy.start_from(train)
         self._policy.closed_form(train, None, Path(), seed)()
 

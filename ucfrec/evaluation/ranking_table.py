@@ -29,7 +29,6 @@ from ucfrec.evaluation.ranking_baselines import (
 )
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
-from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "rank"
@@ -53,11 +52,6 @@ def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
                 f"{policy.folder} was trained on another store than {trained[0].folder}; rank "
                 "them one by one"
             )
-
-
-def training_store(trained: TrainedPolicy) -> EpisodeStore | None:
-    """The store that the run was trained on; None where it is gone or changed."""
-    return store_of(trained.folder, trained.record)
 
 
 def ranking_rows(

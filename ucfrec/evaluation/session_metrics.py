@@ -1,7 +1,5 @@
 """Metrics of simulated episodes (R_cum, two versions of R_avg, length) and bootstrap intervals."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ucfrec.acting.rollout import Episodes
@@ -10,38 +8,22 @@ from ucfrec.arrays import Float64Array
 _RESAMPLES = 2000
 
 
-@dataclass(frozen=True)
-class SessionMetrics:
-    """Metrics of a set of episodes; rewards and returns in reward units."""
+def session_metrics(played: Episodes) -> dict[str, float]:
+    """Metrics of simulated episodes; rewards and returns in reward units.
 
-    R_cum: float
-    """Mean episode return (called R_tra in some papers)."""
-    R_cum_low: float
-    """Lower end of the 95% percentile bootstrap interval of R_cum, over episodes."""
-    R_cum_high: float
-    """Upper end of the same interval."""
-    R_avg_pooled: float
-    """Sum of all rewards divided by the number of all steps (called R_each in some papers)."""
-    R_avg_episode: float
-    """Mean over episodes of the episode's mean reward per step."""
-    length: float
-    """Mean number of steps per episode."""
-    episodes: int
-    """Number of episodes."""
-
-
-def session_metrics(played: Episodes, seed: int) -> SessionMetrics:
-    """Metrics of the simulated episodes; `seed` seeds the bootstrap."""
-    low, high = bootstrap_interval(played.returns, seed)
-    return SessionMetrics(
-        R_cum=float(played.returns.mean()),
-        R_cum_low=low,
-        R_cum_high=high,
-        R_avg_pooled=float(played.returns.sum() / played.lengths.sum()),
-        R_avg_episode=float((played.returns / played.lengths).mean()),
-        length=float(played.lengths.mean()),
-        episodes=len(played.returns),
-    )
+    Returns:
+        `R_cum`: mean episode return (called R_tra in some papers). `R_avg_pooled`: sum of all
+        rewards divided by the number of all steps (called R_each in some papers). `R_avg_episode`:
+        mean over episodes of the episode's mean reward per step. `length`: mean number of steps of
+        an episode.
+    """
+    returns, lengths = played.returns, played.lengths
+    return {
+        "R_cum": float(returns.mean()),
+        "R_avg_pooled": float(returns.sum() / lengths.sum()),
+        "R_avg_episode": float((returns / lengths).mean()),
+        "length": float(lengths.mean()),
+    }
 
 
 def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:

@@ -77,8 +77,7 @@ def explain(
         InputError: the rule does not fit the policy, or an item of the history is not known.
     """
     (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen)
-    sessions, ids = _session(trained, user), trained.item_ids
-    assert ids is not None
+    sessions = _session(trained, user)
     parts = _parts(trained.scorer(rule), sessions)
     numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
     cards = tuple(
@@ -193,7 +192,6 @@ def _excluded(
             filtered = trained.scorer(_plain(rule, **{name: limit})).scores(sessions, empty=True)[0]
             exclude(torch.isneginf(filtered).nonzero()[:, 0], words)
     order = torch.argsort(scores, descending=True).tolist()
-    ids = trained.item_ids
-    assert ids is not None
+    ids = trained.items.ids
     ranked = [(rank, number) for rank, number in enumerate(order, start=1) if number in reasons]
     return [Excluded(ids[number], rank, reasons[number]) for rank, number in ranked[:_EXCLUDED]]

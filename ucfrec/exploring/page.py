@@ -4,13 +4,12 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -23,12 +22,12 @@ from ucfrec.recommending.recommend import some_of
 from ucfrec.reporting import charts
 from ucfrec.reporting.charts import LineChart
 from ucfrec.reporting.forest import quoted
-from ucfrec.reporting.page import write_report
+from ucfrec.reporting.page import template, write_report
 from ucfrec.reporting.page_results import results_of
 from ucfrec.results.row import ResultRow
-from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
+_PACKAGE: Final = "ucfrec.exploring"
 _TITLES: Final = ("title", "name")
 _IMAGES: Final = ("image", "image_url", "picture")
 _NUMBER: Final = re.compile(r"-?\d{1,12}(\.\d{1,12})?")
@@ -81,7 +80,7 @@ class Explorer:
         Args:
             given: fields of the form by name; unknown ones are ignored.
         """
-        return _template("explore.html").render(
+        return template(_PACKAGE, "explore.html").render(
             **self._shown(given),
             given=given,
             runs=[(run.folder.name, run, self._card(run)) for run in self.runs],
@@ -94,7 +93,7 @@ class Explorer:
 
     def results(self, given: Mapping[str, str]) -> str:
         """The part of the page that changes with the form."""
-        return _template("explore_results.html").render(**self._shown(given))
+        return template(_PACKAGE, "explore_results.html").render(**self._shown(given))
 
     @cached_property
     def values(self) -> list[tuple[float, str, ResultRow]]:
@@ -226,7 +225,7 @@ def _stored(trained: TrainedPolicy, user: str) -> Histories:
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
         )
-    if store_of(trained.folder, trained.record) is None:
+    if trained.training_store() is None:
         raise InputError(
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"
@@ -240,10 +239,8 @@ def _rule_given(trained: TrainedPolicy, given: Mapping[str, str]) -> DecisionRul
     rule = trained.rule
     if given.get("custom") is None:
         return rule
-    changes: dict[str, Any] = {}
-    for name in ("target", "reward_weight", "temperature"):
-        if name in given:
-            changes[name] = _number(given, name, 0.0, -1e12, 1e12)
+    names = [name for name in ("target", "reward_weight", "temperature") if name in given]
+    changes: dict[str, Any] = {name: _number(given, name, 0.0, -1e12, 1e12) for name in names}
     if "tag_window" in given:
         changes["tag_window"] = round(_number(given, "tag_window", 0, 0, 10))
     return replace(rule, **changes)
@@ -260,15 +257,3 @@ def _number(given: Mapping[str, str], name: str, default: float, low: float, hig
     if not low <= value <= high:
         raise InputError(f"{name} is {text[:40]!r}; give a number from {low:g} to {high:g}")
     return value
-
-
-@cache
-def _template(name: str) -> Template:
-    environment = Environment(
-        loader=PackageLoader("ucfrec.exploring", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(name)

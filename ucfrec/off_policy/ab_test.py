@@ -20,7 +20,7 @@ from ucfrec.logs.engine import engine
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quoted
-from ucfrec.off_policy.intervals import cluster_means
+from ucfrec.off_policy.intervals import cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
@@ -153,7 +153,8 @@ def compare_arms(
             InputNote,
             stacklevel=2,
         )
-    values, errors = zip(*(_mean(found[name]) for name in names), strict=True)
+    counts = [found[name].T for name in names]
+    values, errors = zip(*(cluster_mean(s / n, None, n) for s, n in counts), strict=True)
     difference, variance = values[1] - values[0], errors[0] ** 2 + errors[1] ** 2
     error = math.sqrt(variance)
     always = difference, difference
@@ -175,13 +176,6 @@ def compare_arms(
         difference + _NORMAL * error,
         *always,
     )
-
-
-def _mean(rows: Float64Array) -> tuple[float, float]:
-    """The mean per shown item and its standard error, from sums and counts (U, 2) of users."""
-    counts = rows[:, 1:]
-    means, errors = cluster_means(rows[:, :1] / counts, None, counts)
-    return float(means[0]), float(errors[0])
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ logs, as much as predicts best: all of it where the state predicts nothing.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -191,18 +190,17 @@ def _calibrated(
     sample: IntArray,
 ) -> tuple[float, float]:
     """The temperature and the mixed-in share of least held-out loss."""
-    choices = list(product(_TEMPERATURES, _SHARES))
-    losses = np.zeros(len(choices))
+    mixed_in = np.array(_SHARES)[:, None]
+    losses = np.zeros((len(_TEMPERATURES), len(_SHARES)))
     for fold, model in enumerate(models):
         mine = sample[folds[sample] == fold][:_MOST_ROWS]
         states, rows = tables(mine), np.arange(len(mine))
         shares = model.shares[group[mine]]
-        for temperature in _TEMPERATURES:
+        for loss, temperature in zip(losses, _TEMPERATURES, strict=True):
             likely = model(states, temperature, 0.0)[rows, group[mine]]
-            for share in _SHARES:
-                mixed = (1 - share) * likely + share * shares
-                losses[choices.index((temperature, share))] -= np.log(mixed).sum()
-    return choices[int(np.argmin(losses))]
+            loss -= np.log((1 - mixed_in) * likely + mixed_in * shares).sum(axis=1)
+    best, share = np.unravel_index(losses.argmin(), losses.shape)
+    return _TEMPERATURES[best], _SHARES[share]
 
 
 def _within(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.off_policy.estimators import step_totals
-from ucfrec.off_policy.intervals import cluster_means
+from ucfrec.off_policy.intervals import cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
@@ -54,23 +54,23 @@ class Diagnosis:
     users: int
     left_out: int
     """Sessions with a step of unknown propensity: no part of what follows."""
-    overlap: float | None
+    overlap: float | None = None
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
-    tests: tuple[WeightTest, ...]
-    effective_by_step: tuple[float, ...]
+    tests: tuple[WeightTest, ...] = ()
+    effective_by_step: tuple[float, ...] = ()
     """(T,) effective users at each step, of the products up to it; empty of steps that are sums of
     sessions."""
-    effective_users: float
+    effective_users: float = 0.0
     """Of the session products, summed by user."""
-    largest_weight: float
+    largest_weight: float = 1.0
     """Share of the heaviest user in all weight."""
-    rewarded_users: int
+    rewarded_users: int = 0
     """Users with a session that has both weight and reward."""
-    mean_weight: float | None
+    mean_weight: float | None = None
     """Mean session product, 1 in expectation."""
-    tail: float | None
+    tail: float | None = None
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
-    bounds: tuple[float, float] | None
+    bounds: tuple[float, float] | None = None
     """Between these lies the value if the propensities are true, whatever the choices that the logs
     lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
@@ -96,8 +96,7 @@ def diagnose(
     """
     lacking, users = steps.lacking, int(steps.users.max()) + 1
     if lacking.all():
-        nothing = (None, (), (), 0.0, 1.0, 0, None, None, None)
-        return Diagnosis(len(lacking), users, len(lacking), *nothing)
+        return Diagnosis(len(lacking), users, left_out=len(lacking))
     known = steps.known()
     by_user = np.bincount(known.users, known.session_weights).astype(np.float64)
     rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
@@ -147,8 +146,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     for name, values, sessions in groups:
         user = steps.users[sessions]
         if len(np.unique(user)) >= ENOUGH_TO_TEST:
-            (mean,), (error,) = cluster_means(values[:, None], user)
-            found.append((name, float(mean), float(error)))
+            found.append((name, *cluster_mean(values, user)))
     found += _group_weights(steps, ratios)
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(found), 1)))
     return tuple(
@@ -170,8 +168,8 @@ def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, 
         if len(np.unique(user[here])) < ENOUGH_TO_TEST or share < LEAST_SHOWN:
             continue
         beyond = (np.where(here, ratios, 0.0) - expected) / share
-        (mean,), (error,) = cluster_means(beyond[:, None], user)
-        found.append((f"item group {number}", 1 + float(mean), float(error)))
+        mean, error = cluster_mean(beyond, user)
+        found.append((f"item group {number}", 1 + mean, error))
     return found
 
 
@@ -193,10 +191,10 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
     if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
         return None
     shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
-    (mean,), (error,) = cluster_means(shares[:, None], user[known])
+    mean, error = cluster_mean(shares, user[known])
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
-    passed = bool(mean - 1 <= max(_TOLERANCE, limit * error))
-    return WeightTest(ITEMS_TO_CHOOSE_FROM, float(mean), float(error), passed)
+    passed = mean - 1 <= max(_TOLERANCE, limit * error)
+    return WeightTest(ITEMS_TO_CHOOSE_FROM, mean, error, passed)
 
 
 def pareto_tail(weights: Float64Array) -> float | None:

@@ -30,8 +30,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_means
+from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.off_policy.intervals import Interval, cluster_intervals, cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.pages import independent_terms
 from ucfrec.off_policy.shrinkage import shrunk
@@ -313,39 +313,26 @@ def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
     known = ~np.isnan(steps.propensity)
     if steps.model is None or known.all() or known.sum() < 2:
         return None
-    reward, weight, terms = _terms(steps, known)
+    reward, weight = steps.reward[known], (steps.target / steps.propensity)[known]
     if not weight.any():
         return None
     ones, user = np.ones(len(reward)), steps.users[steps.session[known]]
-    lifts = Terms(terms[BEST].above - reward, ones, weight)
-    found = summaries({LOGGED: Terms(reward, ones, ones), **terms, "lift": lifts}, user, seed)
-    (mean,), (error,) = cluster_means(weight[:, None], user)
+    left = reward - steps.model.logged_reward[known]
+    doubly_robust = steps.model.reward[known] + weight * left
+    terms = {
+        LOGGED: Terms(reward, ones, ones),
+        "IPS": Terms(weight * reward, ones, weight),
+        "SNIPS": Terms(weight * reward, weight, weight),
+        BEST: Terms(doubly_robust, ones, weight),
+        "lift": Terms(doubly_robust - reward, ones, weight),
+    }
+    found = summaries(terms, user, seed)
+    mean_weight, error = cluster_mean(weight, user)
     return StepValue(
         lift=found.pop("lift"),
         estimates=found,
         steps=len(reward),
         of=len(known),
-        mean_weight=float(mean),
-        mean_weight_error=float(error),
-    )
-
-
-def _terms(
-    steps: LoggedSteps, known: BoolArray
-) -> tuple[Float64Array, Float64Array, dict[str, Terms]]:
-    """Rewards and weights (N',) of the steps that are known, and the terms of the estimates."""
-    assert steps.model is not None
-    rows: IntArray = np.flatnonzero(known)
-    reward, ones = steps.reward[rows], np.ones(len(rows))
-    weight = steps.target[rows] / steps.propensity[rows]
-    left = reward - steps.model.logged_reward[rows]
-    doubly = steps.model.reward[rows] + weight * left
-    return (
-        reward,
-        weight,
-        {
-            "IPS": Terms(weight * reward, ones, weight),
-            "SNIPS": Terms(weight * reward, weight, weight),
-            BEST: Terms(doubly, ones, weight),
-        },
+        mean_weight=mean_weight,
+        mean_weight_error=error,
     )

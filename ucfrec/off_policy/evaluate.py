@@ -175,11 +175,9 @@ def evaluate_off_policy(
         **diagnosis_columns(diagnosis),
         **evaluated.models.columns(),
     }
-    read = (
-        logged.store.record.fingerprint,
-        conditions(trained.folder, len(steps.first), len(steps.reward), options),
-    )
-    subject = Subject(trained, rule, seed, *read, about)
+    fingerprint = logged.store.record.fingerprint
+    read = conditions(trained.folder, len(steps.first), len(steps.reward), options)
+    subject = Subject(trained, rule, seed, fingerprint, read, about)
     return OffPolicyReport(
         subject.rows(found),
         warnings,
@@ -218,13 +216,12 @@ def of_sessions(
 
 def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
     """(N,) page of each step, and its position there where the observation is one-hot."""
-    episodes, steps = logged.store.all_steps()
-    users = np.unique(logged.users, return_inverse=True)[1][episodes]
-    times = logged.store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
-    page, size = pages_of(users, times), logged.store.observation_size
-    if size < 2:
+    store = logged.store
+    users = np.unique(logged.users, return_inverse=True)[1][store.all_steps()[0]]
+    page = pages_of(users, store.column(schema.TIMESTAMP).astype(np.int64))
+    if store.observation_size < 2:
         return page, None
-    seen = logged.store.step_values(schema.OBSERVATION, episodes, steps)
+    seen = store.column(schema.OBSERVATION)
     one_hot = np.isin(seen, (0, 1)).all() and (seen.sum(axis=1) == 1).all()
     return page, seen.argmax(axis=1) if one_hot else None
 
@@ -241,7 +238,7 @@ def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]
 
 def _quarters(store: EpisodeStore, steps: LoggedSteps) -> IntArray:
     """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
-    times = store.step_values(schema.TIMESTAMP, *store.all_steps())[steps.first]
+    times = store.column(schema.TIMESTAMP)[steps.first]
     quarters = np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
     return np.asarray(1 + quarters)
 
@@ -265,9 +262,8 @@ def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
 
 def _too_many_items(trained: TrainedPolicy, evaluated: EvaluatedSteps) -> list[str]:
     steps = evaluated.steps
-    assert trained.item_ids is not None
     assert steps.groups is not None
-    items = len(trained.item_ids)
+    items = len(trained.items)
     found = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
     if found is None or found.passed:
         return []
@@ -335,7 +331,7 @@ def logged_steps(
     """
     store, plain = logged.store, _logged_only(logged, options)
     _require_two_users(logged, plain)
-    items = store.step_values(schema.ITEM, *store.all_steps()).astype(np.int64)
+    items = store.column(schema.ITEM).astype(np.int64)
     group_of = _item_groups(trained, options, seed)
     group = np.where(items >= 0, group_of[items], -1)
     one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
@@ -368,15 +364,14 @@ def logged_steps(
 def _logged_only(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
     """What the logs say, without any policy. Checks the propensities before the slow scoring."""
     store = logged.store
-    episodes, places = store.all_steps()
-    propensity = np.full(len(episodes), np.nan)
+    propensity = np.full(store.n_steps, np.nan)
     if schema.PROPENSITY in store.record.columns:
-        propensity = store.step_values(schema.PROPENSITY, episodes, places).astype(np.float64)
+        propensity = store.column(schema.PROPENSITY).astype(np.float64)
     return LoggedSteps(
-        session=episodes,
-        reward=store.step_values(schema.REWARD, episodes, places).astype(np.float64),
+        session=store.all_steps()[0],
+        reward=store.column(schema.REWARD).astype(np.float64),
         propensity=propensity,
-        target=np.zeros(len(episodes)),
+        target=np.zeros(store.n_steps),
         user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
         discount=options.discount,
     )

@@ -4,7 +4,6 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -46,11 +45,6 @@ class StepInputs:
         )
         return of_chosen, of_shown
 
-    def flat(self) -> Float32Array:
-        """(B, C + 2 D + 2), for `from_flat`."""
-        parts = (self.context, self.chosen, self.shown, self.scores)
-        return np.asarray(torch.cat(parts, dim=1), dtype=np.float32)
-
 
 def context_of(batch: ScoredSteps) -> Tensor:
     """(B, C) state, return left of the target, and last-layer features of the policy's window.
@@ -68,11 +62,8 @@ class InputsFile:
     A context manager; the file is removed at its end.
     """
 
-    def __init__(self, folder: Path | None = None) -> None:
-        """Args:
-        folder: where the file lies; None for the system's temporary folder.
-        """
-        self._file = tempfile.TemporaryFile(prefix="ucfrec-", dir=folder)  # noqa: SIM115
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile(prefix="ucfrec-")  # noqa: SIM115
         self._sizes: tuple[int, int, int] | None = None
 
     def __enter__(self) -> "InputsFile":
@@ -84,7 +75,8 @@ class InputsFile:
     def append(self, inputs: StepInputs) -> None:
         """Write the next steps."""
         self._sizes = (inputs.context.shape[1], inputs.state_size, inputs.chosen.shape[1])
-        self._file.write(inputs.flat().tobytes())
+        parts = (inputs.context, inputs.chosen, inputs.shown, inputs.scores)
+        self._file.write(np.asarray(torch.cat(parts, dim=1), dtype=np.float32).tobytes())
 
     def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
         """All steps in order, some thousand at once, as `StepInputs.features`."""

@@ -122,22 +122,21 @@ def resample(
     return Resampled(value, error * unit, shift * unit, errors * unit, spreads)
 
 
-def cluster_means(
+def cluster_mean(
     values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
-) -> tuple[Float64Array, Float64Array]:
-    """Means (K,) of the columns of values (S, K) and their standard errors over clusters.
+) -> tuple[float, float]:
+    """Mean of values (S,) and its standard error over clusters.
 
     Args:
-        cluster: (S,); None where each row is its own.
-        weights: (S, K) how often each value counts; None for once each.
+        cluster: (S,); None where each value is its own.
+        weights: (S,) how often each value counts; None for once each.
     """
     names, clusters = _numbered(cluster, len(values))
-    counts = np.ones_like(values) if weights is None else weights
-    above = _by_cluster(values * counts, names, clusters)
-    below = _by_cluster(counts, names, clusters)
-    means = above.sum(axis=0) / below.sum(axis=0)
-    spread = ((above - means * below) ** 2).sum(axis=0)
-    return means, np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum(axis=0)
+    above = np.bincount(names, values if weights is None else values * weights, clusters)
+    below = np.bincount(names, weights, clusters)
+    mean = above.sum() / below.sum()
+    spread = np.square(above - mean * below).sum()
+    return float(mean), float(np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum())
 
 
 def _numbered(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:

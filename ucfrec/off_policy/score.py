@@ -21,14 +21,13 @@ from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.engine import BATCH_ROWS
-from ucfrec.logs.expressions import Expression
 from ucfrec.logs.ids import EPISODE_USERS
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.off_policy.training_rows import readable_store
 from ucfrec.progress import progress
-from ucfrec.runs.record import RUN, store_of
+from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
@@ -48,15 +47,15 @@ class LoggedSessions:
     report: dict[str, Any]
     """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`; of a split of
     a store, only "dropped"."""
+    rows: UserRows
+    """The rows of the users, those of the run's store too."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
-    rows: UserRows | None = None
-    """The rows of the users, those of the run's store too; None if they were not collected."""
 
     @property
     def history_lacking(self) -> str:
         """A warning where users are taken to have no earlier rows; empty otherwise."""
-        if self.rows is None or self.rows.earlier is not None:
+        if self.rows.earlier is not None:
             return ""
         return (
             "the store of the run is gone or has changed: users are ranked without what they were "
@@ -130,20 +129,16 @@ def as_trained(
         mapping: which columns of the logs mean what; what it leaves open is as in the training
             logs.
     """
-    record, source = trained.record, str(trained.folder / RUN)
-    mapping = mapping.over(LogMapping.of_source(record.data, source))
-    if not trained.logged_observation_size:
-        mapping = LogMapping({schema.OBSERVATION: ""}).over(mapping)
-    reward = Expression(record.reward, source)
+    record = trained.record
     options = PrepareOptions(
-        reward,
+        reward_of(trained),
         record.session_by,
         duplicates=record.data.duplicates,
         memory_limit=memory_limit,
     )
     if record.session_gap_ms is not None:
         options = replace(options, gap_minutes=record.session_gap_ms / 60_000)
-    return mapping, options
+    return columns_used(trained, mapping), options
 
 
 @contextmanager
@@ -169,38 +164,25 @@ def prepared_sessions(
         _note_unknown_users(str(files[0]), store, report["users"], trained)
         store = _as_seen(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        yield _with_history(trained, LoggedSessions(store, users, report, unknown), _store(trained))
-
-
-def _store(trained: TrainedPolicy) -> EpisodeStore | None:
-    try:
-        return store_of(trained.folder, trained.record)
-    except InputError:
-        return None
+        store, rows = _with_history(trained, store, users, readable_store(trained))
+        yield LoggedSessions(store, users, report, rows, unknown)
 
 
 def _with_history(
-    trained: TrainedPolicy, logged: LoggedSessions, earlier: EpisodeStore | None
-) -> LoggedSessions:
-    """The sessions with the earlier rows of their users; those of a session that goes on are a
-    part of it, as in `recommend`. Session ids of the store are not kept: such sessions begin
-    with the logs."""
+    trained: TrainedPolicy, store: EpisodeStore, users: Array, earlier: EpisodeStore | None
+) -> tuple[EpisodeStore, UserRows]:
+    """The sessions and all rows of their users; earlier rows of a session that goes on are a part
+    of it, as in `recommend`. Session ids of the store are not kept: such sessions begin with the
+    logs."""
     record = trained.record
-    seen = None if earlier is None else _as_seen(earlier, trained)
-    rows = UserRows.of(logged.store, logged.users, seen)
+    rows = UserRows.of(store, users, None if earlier is None else _as_seen(earlier, trained))
     by_id = record.session_by == schema.SESSION_ID
-    store = logged.store if by_id else rows.continued(record.session_gap_ms)
-    return replace(logged, store=store, rows=rows)
+    return store if by_id else rows.continued(record.session_gap_ms), rows
 
 
 def _unknown_items(store: EpisodeStore) -> int:
     """Number of steps that show an item which the run does not know."""
-    steps = (
-        np.arange(begin, min(begin + BATCH_ROWS, store.n_steps))
-        for begin in range(0, store.n_steps, BATCH_ROWS)
-    )
-    items = (store.step_values(schema.ITEM, *store.locate(each)) for each in steps)
-    return sum(int((each < 0).sum()) for each in items)
+    return sum(int((items < 0).sum()) for (items,) in store.column_batches(schema.ITEM))
 
 
 def _note_unknown_users(name: str, store: EpisodeStore, users: int, trained: TrainedPolicy) -> None:
@@ -239,8 +221,7 @@ def scored_steps(
     Yields:
         Batches of scored steps.
     """
-    assert trained.item_ids is not None
-    n_items = len(trained.item_ids)
+    n_items = len(trained.items)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
     total, scorer = store.n_steps, trained.scorer(rule)
     with progress(total, "score", "steps") as bar:
@@ -295,8 +276,7 @@ def score(
         one), `probability` of the logged item under the rule, its `rank` (from 1) among all items,
         and `greedy_item_id`, the best one.
     """
-    store, item_ids = logged.store, trained.item_ids
-    assert item_ids is not None
+    store, item_ids = logged.store, trained.items.ids
     names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
     names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
     for batch in scored_steps(trained, store, rule, logged.rows if filter_seen else None):
@@ -336,19 +316,14 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
                 f"{policy.folder} is a refit, trained on the test split too; name later logs"
             )
     first = trained[0]
-    store = store_of(first.folder, first.record)
-    if store is None:
-        raise InputError(
-            f"{first.folder}: its store {first.record.store} is gone or has changed; move the "
-            "run together with its store, or name later logs"
-        )
+    store = first.require_store("move the run together with its store, or name later logs")
     test = store.split("test")
     if not test.n_episodes:
         raise InputError(f"{store.path} has no test split; name later logs")
     users = test.episode_values(schema.USER)
-    logged = LoggedSessions(_as_seen(test, first), users, {"dropped": {}})
     before = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
-    return _with_history(first, logged, store.select(before))
+    sessions, rows = _with_history(first, _as_seen(test, first), users, store.select(before))
+    return LoggedSessions(sessions, users, {"dropped": {}}, rows)
 
 
 def require_items(trained: TrainedPolicy) -> None:

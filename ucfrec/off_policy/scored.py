@@ -5,7 +5,6 @@ needs models of the reward (DM, FQE, DR) or the probabilities of other items (MI
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -165,17 +164,9 @@ def _batches(files: Sequence[Path], names: Sequence[str]) -> Iterator[dict[str, 
             ) from None
 
 
-@dataclass(frozen=True)
-class _Chunk:
-    """Some whole sessions."""
-
-    steps: LoggedSteps
-    users: IntArray
-    """(S,) number of each session's user, over all chunks."""
-
-
-def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
-    """The sessions of all files, in order.
+def _chunks(files: Sequence[Path], discount: float) -> Iterator[tuple[LoggedSteps, IntArray]]:
+    """The sessions of all files, in order, some whole ones at once; with the number (S,) of each
+    session's user, over all of them.
 
     Raises:
         InputError: they are not in the order in which `score` writes them.
@@ -191,7 +182,7 @@ def _chunks(files: Sequence[Path], discount: float) -> Iterator[_Chunk]:
         owners = rows[schema.USER_ID][rises == 1]
         new = np.append(owners[0] != user, owners[1:] != owners[:-1])
         numbers = users - 1 + np.cumsum(new)
-        yield _Chunk(_steps(rows, rows[SESSION] - rows[SESSION][0], discount), numbers)
+        yield _steps(rows, rows[SESSION] - rows[SESSION][0], discount), numbers
         session, user, users = rows[SESSION][-1], owners[-1], int(numbers[-1]) + 1
 
 
@@ -229,12 +220,12 @@ def _summed(files: Sequence[Path], options: EstimateOptions) -> LoggedSteps:
     """Each session as one step, with the session's return, weight and terms of the estimates."""
     chunks = partial(_chunks, files, options.discount)
     sums: StepSums | None = None
-    for chunk in chunks():
-        if not chunk.steps.lacking.all():
-            known = chunk.steps.known()
+    for steps, _ in chunks():
+        if not steps.lacking.all():
+            known = steps.known()
             own = StepSums.of(known, known.reward)
             sums = own if sums is None else sums + own
-    parts = [(each.users, *_terms(each.steps, sums)) for each in chunks()]
+    parts = [(users, *_terms(steps, sums)) for steps, users in chunks()]
     if not parts:
         raise InputError(f"{files[0]} has no rows; give logs with rows of known items to score")
     users, returns, weights, per_decision, by_step = (

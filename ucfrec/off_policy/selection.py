@@ -162,22 +162,19 @@ class Choice:
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
         found: dict[str, Any] = {"selection": self.headline}
-        if self.selection is None:
+        standings = () if self.selection is None else self.selection.standings
+        one = next((each for each in standings if each.name == name), None)
+        if self.selection is None or one is None:
             return found
-        for one in self.selection.standings:
-            if one.name == name:
-                found |= {
-                    "band_low": one.low,
-                    "band_high": one.high,
-                    "probability_best": one.probability_best,
-                    "rank": one.rank,
-                    "candidates": len(self.selection.standings),
-                }
-                if one.rank == 1:
-                    found |= {
-                        "corrected": self.selection.corrected,
-                        "regret": self.selection.regret,
-                    }
+        found |= {
+            "band_low": one.low,
+            "band_high": one.high,
+            "probability_best": one.probability_best,
+            "rank": one.rank,
+            "candidates": len(standings),
+        }
+        if one is self.selection.chosen:
+            found |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
         return found
 
 

@@ -11,7 +11,6 @@ from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import mixed
-from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 MOST_SEEN: Final = 0.05
@@ -45,10 +44,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
 
 def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
     """`share_seen` of rows by their `row_keys`."""
-    try:
-        store = store_of(trained.folder, trained.record)
-    except InputError:
-        return None
+    store = readable_store(trained)
     if store is None:
         return None
     keys, rows = np.unique(keys, return_counts=True)
@@ -59,6 +55,14 @@ def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
             places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
             seen[places[keys[places] == learnt]] = True
     return float(rows[seen].sum() / rows.sum())
+
+
+def readable_store(trained: TrainedPolicy) -> EpisodeStore | None:
+    """The store that the run was trained on; None where it is gone, changed or damaged."""
+    try:
+        return trained.training_store()
+    except InputError:
+        return None
 
 
 def seen_too_often(seen: float | None) -> list[str]:

@@ -29,7 +29,6 @@ from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_se
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
 from ucfrec.runs.later_logs import later_logs
-from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
@@ -227,12 +226,7 @@ def histories_given(
 
 def _stored(trained: TrainedPolicy, users: Array | None) -> pd.DataFrame:
     """The rows of the run's store, of some users or all."""
-    store = store_of(trained.folder, trained.record)
-    if store is None:
-        raise InputError(
-            f"{trained.folder}: its store {trained.record.store} is gone or has changed; give the "
-            "histories of the users as a frame"
-        )
+    store = trained.require_store("give the histories of the users as a frame")
     if users is not None:
         numbers = trained.users.numbers(users)
         kept = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])

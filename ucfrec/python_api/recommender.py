@@ -29,7 +29,7 @@ from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.liked import LikedExpression
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue, training_store
+from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
@@ -59,7 +59,7 @@ from ucfrec.python_api.given_data import (
     split_given,
     store_given,
 )
-from ucfrec.python_api.run_folders import Scratch, completed, kept_beside
+from ucfrec.python_api.run_folders import Scratch, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
@@ -68,22 +68,22 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
+from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
-_TEXT: Final = of_kind("text", str)
-_PATH: Final = of_kind("a path", str, Path)
-_FUNCTION: Final = of_kind("a function", Callable)
 _checked: Final = checked(
     {
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
-        **dict.fromkeys(("reward", "session_by", "dataset", "screen", "liked"), _TEXT),
-        **dict.fromkeys(("out", "run", "folder", "file"), _PATH),
-        **dict.fromkeys(("on_step", "on_validation"), _FUNCTION),
+        **dict.fromkeys(
+            ("reward", "session_by", "dataset", "screen", "liked"), of_kind("text", str)
+        ),
+        **dict.fromkeys(("out", "run", "folder", "file"), of_kind("a path", str, Path)),
+        **dict.fromkeys(("on_step", "on_validation"), of_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
         "split": split_given,
         "histories": of_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
@@ -93,8 +93,6 @@ _checked: Final = checked(
     }
 )
 """Decorator of methods: the check of each argument by its name."""
-_FRAME = "a frame"
-"""What a data frame is called in model cards."""
 
 
 class Recommender:
@@ -238,7 +236,10 @@ class Recommender:
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 with in_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            trained = completed(store, out, refit)
+            if refit:
+                refit_within(store, out)
+            write_card(out)
+            trained = TrainedPolicy.load(out)
             kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
         self._trained, self._scratch = trained, kept
         return self
@@ -389,22 +390,19 @@ class Recommender:
         """
         beside = several("others", others, "a Recommender", Recommender)
         trained, *rest = (each._evaluated(logs) for each in (self, *beside))
-        all_trained = [trained, *rest]
-        require_one_catalogue(all_trained)
+        require_one_catalogue([trained, *rest])
         with in_words_of_python():
             wanted = liked and Expression(liked, "--liked")
             by = LikedExpression(wanted, trained.record.reward) if wanted else None
-        rankers = [PolicyRanker(each, None, each.name) for each in all_trained]
-        rankers[0] = PolicyRanker(trained, rule, trained.name)
+        rankers = [PolicyRanker(trained, rule), *map(PolicyRanker, rest)]
         with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
             said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
             said += [logged.history_lacking] if logged.history_lacking else []
-            assert logged.rows is not None
             later = Later(logged.store, logged.rows, filter_seen)
             about = later, logged.users, k, seed
-            rows = ranking_rows(rankers, trained, training_store(trained), *about, by)
+            rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
         rows = [replace(row, checkpoint="best") for row in rows]
-        card_of_ranking(trained.folder, rows[0], Ranking.shown[:-1], _named(logs), said)
+        card_of_ranking(trained.folder, rows[0], _named(logs), said)
         return Ranking(rows, said)
 
     @_checked
@@ -638,7 +636,7 @@ def _named(logs: Logs | None) -> str:
     if logs is None:
         return "the test split"
     if isinstance(logs, pd.DataFrame):
-        return _FRAME
+        return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
     listed = [files] if isinstance(files, (str, Path)) else files
     return ", ".join(without_folders(str(file)) for file in listed)

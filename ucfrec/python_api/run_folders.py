@@ -7,9 +7,6 @@ from typing import Any, Self
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.reporting.model_card import write_card
-from ucfrec.runs.refit import refit_within
-from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import STORE_SUFFIX
 
 
@@ -43,11 +40,3 @@ def kept_beside(run: Path, store: EpisodeStore) -> EpisodeStore:
             "remove both"
         )
     return kept
-
-
-def completed(store: EpisodeStore, out: Path, refit: bool) -> TrainedPolicy:
-    """The policy of a trained run, refitted to all rows if asked for, with its model card."""
-    if refit:
-        refit_within(store, out)
-    write_card(out)
-    return TrainedPolicy.load(out)

@@ -3,29 +3,16 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ucfrec.errors import InputError
+from ucfrec.recommending.metrics import ServingMetrics
 from ucfrec.recommending.requests import Request
 from ucfrec.recommending.responder import Answer
 
 Outcome = Answer | InputError
-
-
-class Answers(Protocol):
-    """Answers requests of several users at once, as `Responder` does."""
-
-    def answers(self, requests: Sequence[Request]) -> list[Outcome]: ...
-
-
-class Watcher(Protocol):
-    """Receives every batch, and how many requests wait whenever that changes."""
-
-    def batch(self, requests: int, seconds: float) -> None: ...
-
-    def waiting(self, requests: int) -> None: ...
 
 
 class QueueFullError(Exception):
@@ -44,15 +31,21 @@ class Batcher:
     for the end of the forward pass and share the next.
     """
 
-    def __init__(self, answers: Answers, watcher: Watcher, largest: int, queue: int) -> None:
+    def __init__(
+        self,
+        answers: Callable[[Sequence[Request]], list[Outcome]],
+        metrics: ServingMetrics,
+        largest: int,
+        queue: int,
+    ) -> None:
         """
         Args:
-            answers: computes a batch.
-            watcher: receives what happens.
+            answers: computes a batch, see `Responder.answers`.
+            metrics: receives every batch, and how many requests wait whenever that changes.
             largest: most requests of a batch.
             queue: most requests that wait.
         """
-        self._answers, self._watcher = answers, watcher
+        self._answers, self._metrics = answers, metrics
         self._largest, self._most = largest, queue
         self._queue: deque[_Waiting] = deque()
         self._thread = ThreadPoolExecutor(1, "forward")
@@ -68,7 +61,7 @@ class Batcher:
             raise QueueFullError
         outcome: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self._queue.append(_Waiting(request, outcome))
-        self._watcher.waiting(len(self._queue))
+        self._metrics.waiting(len(self._queue))
         if self._running is None or self._running.done():
             self._running = asyncio.create_task(self._run())
         return await outcome
@@ -86,11 +79,11 @@ class Batcher:
             loop = asyncio.get_running_loop()
             try:
                 outcomes: Sequence[Outcome | Exception] = await loop.run_in_executor(
-                    self._thread, self._answers.answers, requests
+                    self._thread, self._answers, requests
                 )
             except Exception as error:  # a bug, or out of memory; every caller receives it
                 outcomes = [error] * len(batch)
-            self._watcher.batch(len(batch), time.perf_counter() - began)
+            self._metrics.batch(len(batch), time.perf_counter() - began)
             for each, outcome in zip(batch, outcomes, strict=True):
                 if each.outcome.done():
                     continue
@@ -105,5 +98,5 @@ class Batcher:
             waiting = self._queue.popleft()
             if not waiting.outcome.done():
                 batch.append(waiting)
-        self._watcher.waiting(len(self._queue))
+        self._metrics.waiting(len(self._queue))
         return batch

@@ -107,13 +107,12 @@ def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
 def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
     rule, record = graph.scorer.rule, trained.record
-    assert trained.item_ids is not None
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
         "inputs": _inputs(graph.scorer, record.observation_size),
-        "outputs": _outputs(len(trained.item_ids), graph.k),
+        "outputs": _outputs(len(trained.items), graph.k),
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, policy_weight, reward_weight, "
@@ -126,7 +125,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
         "fingerprint": record.fingerprint,
-        "item_ids": trained.item_ids.tolist(),
+        "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),
     }
 

@@ -322,17 +322,7 @@ class _Network(nn.Module):
         super().__init__()
         self._scorer, self._parts = scorer, _modules(scorer)
 
-    def forward(
-        self,
-        items: Tensor,
-        rewards: Tensor,
-        steps: Tensor,
-        collected: Tensor,
-        users: Tensor,
-        *others: Tensor,
-    ) -> Tensor:
-        """Scores; the arguments are those of `Sessions`, perhaps its observations, and what may
-        not be shown."""
-        *observations, excluded = others
-        session = Sessions(items, rewards, steps, collected, users, *observations)
-        return self._scorer.scores(session, excluded=excluded, empty=True)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
+        *session, excluded = inputs
+        return self._scorer.scores(Sessions(*session), excluded=excluded, empty=True)

@@ -4,7 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -29,8 +29,7 @@ _MOST_WAITING: Final = 20
 
 def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
     """Columns of exposures: users are text, as any client names them; items as in the run."""
-    assert trained.item_ids is not None
-    item = pa.int64() if trained.item_ids.dtype.kind in "iu" else pa.string()
+    item = pa.int64() if trained.items.ids.dtype.kind in "iu" else pa.string()
     return pa.schema(
         [
             (schema.USER_ID, pa.string()),
@@ -56,24 +55,19 @@ def exposures_written(
         frames: of `recommend`.
     """
     columns, now = exposure_schema(trained), int(time.time() * 1000)
+    about: dict[str, str | int] = {
+        schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
+    }  # fmt: skip
 
     def passed() -> Iterator[pd.DataFrame]:
         for frame in frames:
-            shown = frame.rename(columns={RANK: schema.POSITION})
-            shown[schema.RUN], shown[schema.RULE], shown[schema.TIMESTAMP] = (
-                trained.fingerprint,
-                rule,
-                now,
-            )
-            shown[schema.ARM] = ""
+            shown = frame.rename(columns={RANK: schema.POSITION}).assign(**about)
             shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
             table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
             writer.write_table(table)
             yield frame
 
-    with ExitStack() as stack:
-        scratch = stack.enter_context(atomic_file(path))
-        writer = stack.enter_context(pq.ParquetWriter(scratch, columns))
+    with atomic_file(path) as scratch, pq.ParquetWriter(scratch, columns) as writer:
         yield passed()
 
 

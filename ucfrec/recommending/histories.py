@@ -16,11 +16,12 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
-from ucfrec.logs.expressions import Expression, computes_with_reward
+from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.later_logs import columns_used, reward_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
@@ -281,29 +282,12 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     return [rewards, *keys] if fine else None
 
 
-def _remembered(trained: TrainedPolicy) -> LogMapping:
-    return LogMapping.of_source(trained.record.data, str(trained.folder / RUN))
-
-
 def _concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
     """Whether what the run remembers of its training log may mean columns of the frame."""
     source, names = trained.record.data, {str(n).casefold() for n in getattr(frame, "columns", ())}
     texts = [*source.mapping.values(), source.where or ""]
     words = {word.casefold() for text in texts for word in _WORD.findall(text)}
     return source.earliest is not None or bool(words & names)
-
-
-def reward_of(trained: TrainedPolicy) -> Expression:
-    """The run's reward, an SQL expression over the columns of its logs."""
-    return Expression(trained.record.reward, str(trained.folder / RUN))
-
-
-def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
-    """The mapping with what the run remembers of its training log."""
-    mapping = mapping.over(_remembered(trained))
-    if trained.record.observation_size:
-        return mapping
-    return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
 def session_by(trained: TrainedPolicy) -> str:

@@ -32,18 +32,16 @@ class AllowedHosts:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
-        if self._any or scope["type"] != "http" or self._allows(given := _given(scope)):
-            await self._app(scope, receive, send)
-            return
-        message = f"requests for the host {given[:_SHOWN]!r} are not answered; {self._remedy}"
-        refusal = Response(json_text({"error": message}), 400, media_type="application/json")
-        await refusal(scope, receive, send)
+        answer = self._app
+        if scope["type"] == "http" and not self._any:
+            given = Headers(scope=scope).get("host", "")
+            if not self._allows(given):
+                message = f"requests for the host {given[:_SHOWN]!r} are not answered; "
+                error = json_text({"error": message + self._remedy})
+                answer = Response(error, 400, media_type="application/json")
+        await answer(scope, receive, send)
 
     def _allows(self, given: str) -> bool:
         match = _HOST.fullmatch(given.lower())
         host = match.group(1) if match else ""
         return host in self._names or host.endswith(self._endings)
-
-
-def _given(scope: Scope) -> str:
-    return Headers(scope=scope).get("host", "")

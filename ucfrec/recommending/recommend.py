@@ -130,13 +130,12 @@ class _Choice:
         items, values, propensities = (
             np.concatenate(each)[back] for each in zip(*parts, strict=True)
         )
-        kept, item_ids = np.isfinite(values), self.trained.item_ids
-        assert item_ids is not None
+        kept = np.isfinite(values)
         return pd.DataFrame(
             {
                 schema.USER_ID: np.repeat(batch.users, kept.sum(1)),
                 RANK: np.cumsum(kept, axis=1)[kept],
-                schema.ITEM_ID: item_ids[items[kept]],
+                schema.ITEM_ID: self.trained.items.ids[items[kept]],
                 SCORE: values[kept],
                 schema.PROPENSITY: propensities[kept],
                 schema.REQUEST_ID: np.repeat(requests, kept.sum(1)),
@@ -157,18 +156,13 @@ class _Choice:
             part = latest.of_users(numbers)
             users = self.trained.users.numbers(part.users)
             sessions = sessions_of(self.trained, part, users, self.scorer.length)
-            known = part.seen_ids >= 0
-            left_out = [part.seen_owner[known]], [part.seen_ids[known]]
-            if rule.exclude_seen:
-                left_out[0].append(part.owner)
-                left_out[1].append(part.item_ids)
-            rows, out = (torch.from_numpy(np.concatenate(each)) for each in left_out)
+            left_out = left_out_of(rule, part)
             if self.index is not None:
                 k = min(self.k, len(self.trained.items))
-                found = self.index.best(sessions, (rows, out), self.excluded, k)
+                found = self.index.best(sessions, left_out, self.excluded, k)
                 yield found[0].numpy(), found[1].numpy(), np.ones(found[0].shape)
                 continue
-            scores = self.scorer.scores(sessions, (rows, out), self.excluded, empty=True)
+            scores = self.scorer.scores(sessions, left_out, self.excluded, empty=True)
             n_items = scores.shape[1]
             drawn = None
             if rule.draws:
@@ -276,6 +270,21 @@ def sessions_of(
         observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
     rows = histories.owner, histories.item_ids, histories.rewards
     return Sessions.of_rows(*rows, users, length, observations)
+
+
+def left_out_of(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:
+    """Rows (N,) and items (N,) of what is not recommended: the known ones of `seen_ids`, and what
+    the latest sessions have shown, if the rule excludes it.
+
+    Args:
+        histories: see `sessions_of`; `seen_ids` are numbers of items, −1 for unknown ones.
+    """
+    known = histories.seen_ids >= 0
+    rows, items = [histories.seen_owner[known]], [histories.seen_ids[known]]
+    if rule.exclude_seen:
+        rows.append(histories.owner)
+        items.append(histories.item_ids)
+    return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(items))
 
 
 def request_ids(batch: Histories, seed: int) -> Array:

@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Final, NamedTuple, NotRequired
 
 import numpy as np
+import pandas as pd
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -28,6 +29,7 @@ from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import DAY_MS, kept_in_order
 from ucfrec.recommending.row_rewards import RowRewards
+from ucfrec.runs.later_logs import reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
@@ -159,8 +161,8 @@ class UserHistory(NamedTuple):
     """(n,) in reward units."""
     timestamps: IntArray
     """(n,) milliseconds."""
-    session_ids: list[Any] | None
-    """(n,); None if sessions are not split by them."""
+    session_ids: Array | None
+    """(n,) integers or text; None if sessions are not split by them."""
     seen: Array
     """(m,) all items of the request's rows, also of those before the n."""
     observation: list[float] | None
@@ -277,7 +279,7 @@ class HistoryReader:
             trained.record.data.duplicates,
             trained.record.session_by == schema.SESSION_ID,
             trained.record.observation_size,
-            RowRewards.of(trained),
+            RowRewards(reward_of(trained)),
         )
 
     def read(self, rows: Sequence[Row], user_id: int | str) -> UserHistory:
@@ -288,17 +290,17 @@ class HistoryReader:
         """
         if self.observation_size and not rows:
             raise InputError("the policy needs the last observation; give a row of history with it")
-        ids = _ids([row["item_id"] for row in rows])
+        items = id_array([row["item_id"] for row in rows])
         columns = {
             "user": np.zeros(len(rows), dtype=np.int64),
             schema.TIMESTAMP: np.asarray(_times(rows), dtype=np.int64),
-            schema.ITEM: np.asarray(ids, dtype=_type(ids)),
+            schema.ITEM: items,
             "row": np.arange(len(rows)),
         }
         sessions = None
         if self.by_session_id:
             _require(rows, schema.SESSION_ID)
-            sessions = _ids([row["session_id"] for row in rows])
+            sessions = id_array([row["session_id"] for row in rows])
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
             given = [row.get("observation") or () for row in rows]
@@ -310,11 +312,11 @@ class HistoryReader:
         if self.observation_size:
             observation = self._observation(rows, int(order[-1]))
         return UserHistory(
-            columns[schema.ITEM][order],
+            items[order],
             columns[schema.REWARD][order].astype(np.float32),
             columns[schema.TIMESTAMP][order],
-            None if sessions is None else [sessions[n] for n in order],
-            np.asarray(list(dict.fromkeys(ids)), dtype=_type(ids)),
+            None if sessions is None else sessions[order],
+            pd.unique(items),
             observation,
         )
 
@@ -348,13 +350,11 @@ def _times(rows: Sequence[Row]) -> list[int]:
     return times
 
 
-def _ids(ids: list[Any]) -> list[Any]:
-    """Identifiers of one type: all text, if some are."""
-    return ids if all(isinstance(each, int) for each in ids) else list(map(str, ids))
-
-
-def _type(ids: Sequence[Any]) -> Any:
-    return object if ids and isinstance(ids[0], str) else np.int64
+def id_array(ids: Sequence[int | str]) -> Array:
+    """Identifiers as int64 if all are integers, otherwise as text."""
+    if all(isinstance(each, int) for each in ids):
+        return np.asarray(ids, dtype=np.int64)
+    return np.asarray(list(map(str, ids)), dtype=object)
 
 
 def _require(rows: Sequence[Mapping[str, Any]], name: str) -> None:

@@ -10,18 +10,19 @@ import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import (
     best_of,
     candidate_numbers,
+    left_out_of,
     sessions_of,
     some_of,
     uniforms,
     users_at_once,
 )
-from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory
+from ucfrec.recommending.requests import HistoryReader, Limits, Request, UserHistory, id_array
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TORCH: Final = "torch"
@@ -81,15 +82,14 @@ class _Prepared(NamedTuple):
 
     number: int
     """Of the request in its batch."""
-    user_id: int | str
+    request: Request
     request_id: str
     k: int
     history: UserHistory
-    new_session: bool
     known: IntArray
     """(n,) index of each item of the history, −1 for items that the policy does not know."""
-    left_out: IntArray
-    """(m,) index of items that are not recommended."""
+    seen: IntArray
+    """(m,) index of items that are not recommended; −1 as above."""
     allowed: IntArray | None
     """(c,) index of the only items to recommend; None for all."""
 
@@ -209,21 +209,11 @@ class Responder:
         allowed = (
             None
             if request.candidates is None
-            else candidate_numbers(self._items, _array(request.candidates))
+            else candidate_numbers(self._items, id_array(request.candidates))
         )
         k = self._k if request.k is None else request.k
         request_id = request.request_id or uuid4().hex
-        return _Prepared(
-            number,
-            request.user_id,
-            request_id,
-            k,
-            history,
-            request.new_session,
-            known,
-            seen[seen >= 0],
-            allowed,
-        )
+        return _Prepared(number, request, request_id, k, history, known, seen, allowed)
 
     def _scored(self, prepared: Sequence[_Prepared]) -> list[Answer]:
         latest = self._latest(prepared)
@@ -231,17 +221,8 @@ class Responder:
         self._requests[0] += int((users < 0).sum())
         self._requests[1] += len(users)
         sessions = sessions_of(self.trained, latest, users, self._scorer.length)
-        left_out = [one.left_out for one in prepared]
-        rows = [np.repeat(np.arange(len(prepared)), [len(each) for each in left_out])]
-        if self.rule.exclude_seen:
-            rows.append(latest.owner)
-            left_out.append(latest.item_ids)
-        scores = self._scorer.scores(
-            sessions,
-            (torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(left_out))),
-            self._excluded(prepared),
-            empty=True,
-        )
+        left_out = left_out_of(self.rule, latest)
+        scores = self._scorer.scores(sessions, left_out, self._excluded(prepared), empty=True)
         return self._best(prepared, scores)
 
     def _excluded(self, prepared: Sequence[_Prepared]) -> Tensor | None:
@@ -257,37 +238,35 @@ class Responder:
 
     def _latest(self, prepared: Sequence[_Prepared]) -> Histories:
         """The latest sessions of the requests, with the policy's numbers of items."""
-        histories = [one.history for one in prepared]
+        histories, rows = [one.history for one in prepared], np.arange(len(prepared))
         observations = None
         if self.trained.record.observation_size:
             observations = np.asarray([each.observation for each in histories], dtype=np.float32)
         sessions = None
         if histories[0].session_ids is not None:
-            flat = [each for history in histories for each in history.session_ids or ()]
-            sessions = _array(flat)
+            sessions = np.concatenate([each.session_ids for each in histories])
         batch = Histories(
-            users=_array([one.user_id for one in prepared]),
-            owner=np.repeat(np.arange(len(prepared)), [len(one.known) for one in prepared]),
+            users=id_array([one.request.user_id for one in prepared]),
+            owner=np.repeat(rows, [len(one.known) for one in prepared]),
             item_ids=np.concatenate([one.known for one in prepared]),
             rewards=np.concatenate([each.rewards for each in histories]),
             timestamps=np.concatenate([each.timestamps for each in histories]),
             session_ids=sessions,
-            seen_owner=np.empty(0, np.int64),
-            seen_ids=np.empty(0, np.int64),
+            seen_owner=np.repeat(rows, [len(one.seen) for one in prepared]),
+            seen_ids=np.concatenate([one.seen for one in prepared]),
             observations=observations,
         )
         known = batch.item_ids >= 0
         return (batch if known.all() else batch.rows(known)).latest_session(
-            self.trained.record.session_gap_ms, np.asarray([one.new_session for one in prepared])
+            self.trained.record.session_gap_ms,
+            np.asarray([one.request.new_session for one in prepared]),
         )
 
     def _best(self, prepared: Sequence[_Prepared], scores: Tensor) -> list[Answer]:
         n_items, drawn = scores.shape[1], None
         if self.rule.draws:
-            users, requests = (
-                _array([getattr(one, name) for one in prepared])
-                for name in ("user_id", "request_id")
-            )
+            users = id_array([one.request.user_id for one in prepared])
+            requests = id_array([one.request_id for one in prepared])
             drawn = uniforms(users, requests, n_items + 1, self._seed)
         answers: dict[int, Answer] = {}
         sizes = [min(one.k, n_items) for one in prepared]
@@ -305,10 +284,3 @@ class Responder:
                 shown = items[:count], logs[:count], shares[:count]
                 answers[row] = Answer(*shown, prepared[row].request_id, *self._source)
         return [answers[row] for row in range(len(prepared))]
-
-
-def _array(ids: Sequence[Any]) -> Array:
-    """Identifiers as int64 if all are integers, otherwise as text."""
-    if all(isinstance(each, int) for each in ids):
-        return np.asarray(ids, dtype=np.int64)
-    return np.asarray(list(map(str, ids)), dtype=object)

@@ -16,7 +16,6 @@ from ucfrec.logs.engine import engine_in_memory
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.tables import is_number
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
 
 _ROWS: Final = "history"
 """Name of the rows in messages and in the engine."""
@@ -37,11 +36,6 @@ class RowRewards:
         self._expression, self._computed = expression, computes_with_reward(expression)
         self._stack = ExitStack()
         self._connection: duckdb.DuckDBPyConnection | None = None
-
-    @classmethod
-    def of(cls, trained: TrainedPolicy) -> "RowRewards":
-        """The rewards of a policy's run."""
-        return cls(Expression(trained.record.reward, str(trained.folder / RUN)))
 
     def close(self) -> None:
         """Close the engine."""

@@ -239,12 +239,8 @@ def _require_alike(new: TrainedPolicy, old: TrainedPolicy) -> None:
     Raises:
         InputError: items are text in one run and numbers in the other.
     """
-    kinds = [
-        trained.item_ids.dtype.kind in "iu"
-        for trained in (new, old)
-        if trained.item_ids is not None
-    ]
-    if len(set(kinds)) != 1:
+    of_new, of_old = (trained.items.ids.dtype.kind in "iu" for trained in (new, old))
+    if of_new != of_old:
         raise InputError(f"{new.folder}: items are not of the same type as in {old.folder}")
 
 

@@ -41,8 +41,7 @@ def similar_items(
     k = require_whole("k", k)
     given = None if items is None else require_ids("items", items, schema.ITEM_ID)
     vectors = F.normalize(_vectors(trained), dim=1)
-    ids = trained.item_ids
-    assert ids is not None
+    ids = trained.items.ids
     wanted = np.arange(len(ids)) if given is None else trained.items.numbers(given)
     if given is not None and (wanted < 0).any():
         raise InputError(

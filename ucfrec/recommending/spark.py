@@ -1,9 +1,12 @@
 """Recommend next items to the users of a log with Apache Spark, for users of any number."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arguments import require_whole
@@ -14,8 +17,9 @@ from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.recommending.exposures import exposures_written
-from ucfrec.recommending.histories import Histories, columns_used, reward_of, session_by
+from ucfrec.recommending.histories import Histories, session_by
 from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -62,18 +66,18 @@ def recommend_with_spark(
     with ExitStack() as stack:
         folders = [out] if exposures is None else [out, exposures]
         parts = [stack.enter_context(atomic_folder(each)).absolute() for each in folders]
-        part = _RecommendPart(
-            RunOnWorkers.of(trained, checkpoint),
-            parts[0],
-            None if exposures is None else parts[1],
-            memory_limit,
-            rule,
-            k,
-            filter_seen,
-            skip_unknown,
-            new_session,
-            seed,
+        recommended = partial(
+            recommend,
+            k=k,
+            rule=rule,
+            filter_seen=filter_seen,
+            skip_unknown=skip_unknown,
+            new_session=new_session,
+            seed=seed,
         )
+        shown = None if exposures is None else parts[1]
+        run = RunOnWorkers.of(trained, checkpoint)
+        part = _RecommendPart(run, parts[0], shown, memory_limit, rule.hash, recommended)
         return sum(by_users(given, parts[0].parent, master, part))
 
 
@@ -88,12 +92,9 @@ class _RecommendPart:
     """Folder for the parts of the exposures; None for none."""
     memory_limit: str
     """Of a worker while it reads its rows."""
-    rule: DecisionRule
-    k: int
-    filter_seen: bool
-    skip_unknown: bool
-    new_session: bool
-    seed: int
+    rule: str
+    """Hash of the decision rule."""
+    recommend: Callable[[TrainedPolicy, Iterable[Histories]], Iterator[pd.DataFrame]]
 
     def __call__(self, part: int, rows: Path, mapping: LogMapping) -> int:
         """Write the files of a part; returns the number of recommended items."""
@@ -107,18 +108,9 @@ class _RecommendPart:
             session_by(trained),
             trained.record.data.duplicates,
         )
-        frames = recommend(
-            trained,
-            map(Histories.from_batch, histories),
-            self.k,
-            rule=self.rule,
-            filter_seen=self.filter_seen,
-            skip_unknown=self.skip_unknown,
-            new_session=self.new_session,
-            seed=self.seed,
-        )
+        frames = self.recommend(trained, map(Histories.from_batch, histories))
         with ExitStack() as stack:
             if self.exposures is not None:
-                given = self.exposures / name, trained, self.rule.hash, frames
+                given = self.exposures / name, trained, self.rule, frames
                 frames = stack.enter_context(exposures_written(*given))
             return write_frames(self.out / name, frames)

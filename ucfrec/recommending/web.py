@@ -138,10 +138,8 @@ class _Direct:
             await self._app(scope, receive, send)
 
 
-class _RefusalError(Exception):
-    def __init__(self, status: int, message: str) -> None:
-        super().__init__(message)
-        self.status = status
+class _TooLargeError(Exception):
+    """The body of a request has too many bytes."""
 
 
 def application(
@@ -164,7 +162,7 @@ def application(
     """
     hosts = [_host(each) for each in allowed_hosts]
     metrics = ServingMetrics(responder.drift, shared_metrics)
-    batcher = Batcher(responder, metrics, limits.batch, limits.queue)
+    batcher = Batcher(responder.answers, metrics, limits.batch, limits.queue)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -180,7 +178,7 @@ def application(
     async def refused(_: HTTPRequest, error: HTTPException) -> Response:
         return _response(error.status_code, {"error": str(error.detail)}, error.headers)
 
-    @app.post(_PATH, openapi_extra=_DESCRIBED, responses=_responses())
+    @app.post(_PATH, openapi_extra=_DESCRIBED, responses=_RESPONSES)
     async def recommendations(http: HTTPRequest) -> Response:
         """The next items for one user."""
         began = time.perf_counter()
@@ -220,8 +218,8 @@ async def _answered(
             arrived = True
             request: Request = parsed(Request, body, responder.limits)
             outcome = await batcher.answer(request)
-    except _RefusalError as error:
-        return error.status, {"error": str(error)}
+    except _TooLargeError as error:
+        return 413, {"error": str(error)}
     except InputError as error:
         return 400, {"error": str(error)}
     except QueueFullError:
@@ -243,7 +241,7 @@ async def _answered(
 
 async def _body(http: HTTPRequest, most: int) -> bytes:
     """The body of a request, of which no more than `most` bytes are read."""
-    too_large = _RefusalError(413, f"the body has more than {most:,} bytes; send fewer rows")
+    too_large = _TooLargeError(f"the body has more than {most:,} bytes; send fewer rows")
     stated = http.headers.get("content-length", "")
     if stated.isdecimal() and int(stated[:20]) > most:
         raise too_large
@@ -281,12 +279,10 @@ _DESCRIBED: Final = {
         "content": {_JSON: {"schema": _inline(Request.model_json_schema())}},
     }
 }
-
-
-def _responses() -> dict[int | str, dict[str, Any]]:
-    faults: dict[int | str, dict[str, Any]] = {
+_RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}},
+    **{
         status: {"description": text, "content": {_JSON: {"schema": _ERROR}}}
         for status, text in _FAULTS.items()
-    }
-    answer: dict[str, Any] = {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}}
-    return {200: answer, **faults}
+    },
+}

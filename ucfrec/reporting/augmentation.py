@@ -9,9 +9,9 @@ from ucfrec.reporting import charts
 from ucfrec.reporting.tables import Table, shown
 
 
-def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
-    """Quality of the reward model and of the edits, one column per run (name, report)."""
-    reports = [report for _, report in runs]
+def augmentation_table(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Table:
+    """Quality of the reward model and of the edits, one column per run (name, style, report)."""
+    reports = [report for _, _, report in runs]
     models, moves = [r.reward_model for r in reports], [r.moves for r in reports]
     actions = [r.actions for r in reports]
     rows: list[tuple[str, list[Any]]] = [
@@ -44,7 +44,7 @@ def augmentation_table(runs: Sequence[tuple[str, AugmentationReport]]) -> Table:
     caption = (
         "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
     )
-    return Table(caption, "", [name for name, _ in runs], body)
+    return Table(caption, "", [name for name, _, _ in runs], body)
 
 
 def moves_chart(runs: Sequence[tuple[str, int, AugmentationReport]]) -> charts.LineChart | None:

@@ -9,13 +9,14 @@ from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.provenance import without_folders
 from ucfrec.reporting.model_card import add_measurement
 from ucfrec.results.row import ResultRow
+from ucfrec.results.table import Ranking
 
 
 def card_of_evaluation(run: Path, row: ResultRow) -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
     of = f"{row.environment}, {_rule(row)}, checkpoint {row.checkpoint}"
-    values = {**_values(row, "R_cum", names), "seed": row.evaluation_seed}
+    values = {**_values(row, names), "seed": row.evaluation_seed}
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
@@ -29,18 +30,16 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -
     of += ", pages" if row.conditions["pages"] else ""
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
-    values = _values(row, "R_cum", names) | {"logged": rows[LOGGED].value}
+    values = _values(row, names) | {"logged": rows[LOGGED].value}
     said = (str(report.verdict), *(w for w in report.warnings if w not in report.verdict.reasons))
     add_measurement(run, "ucfrec ope", of, values, said)
 
 
-def card_of_ranking(
-    run: Path, row: ResultRow, measures: Iterable[str], on: str, said: Sequence[str] = ()
-) -> None:
+def card_of_ranking(run: Path, row: ResultRow, on: str, said: Sequence[str] = ()) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     intervals = row.details["intervals"]
     values: dict[str, object] = {}
-    for name in (*measures, "coverage"):
+    for name in Ranking.shown:
         values[name] = row.metrics.get(name)
         if name in row.metrics and name in intervals:
             low, high = intervals[name]
@@ -54,11 +53,11 @@ def _rule(row: ResultRow) -> str:
     return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
 
 
-def _values(row: ResultRow, main: str, names: Iterable[str]) -> dict[str, object]:
-    """The named values, `main` with its interval."""
+def _values(row: ResultRow, names: Iterable[str]) -> dict[str, object]:
+    """The named values, `R_cum` with its interval."""
     line = row.as_line()
     found = {name: line[name] for name in names if line.get(name) is not None}
-    if row.interval is not None and main in found:
+    if row.interval is not None and "R_cum" in found:
         low, high = row.interval
-        found[main] = f"{found[main]:.4g} [{low:.4g}, {high:.4g}]"
+        found["R_cum"] = f"{found['R_cum']:.4g} [{low:.4g}, {high:.4g}]"
     return found

@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
 from ucfrec.files.locks import claim
 from ucfrec.files.record import CARD, MEASURED
@@ -19,7 +18,7 @@ from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import Table, markdown_table, shown
 from ucfrec.runs.record import REFIT, RunRecord, read_record
-from ucfrec.runs.trained_policy import RULE
+from ucfrec.runs.trained_policy import RULE, read_rule
 
 
 def write_card(run: Path) -> Path:
@@ -132,10 +131,9 @@ def _day(milliseconds: int) -> str:
 def _rule(run: Path) -> str:
     if not (run / RULE).exists():
         return "Its decision rule is not chosen yet."
-    rule = DecisionRule.from_dict(read_json(run / RULE), str(run / RULE))
     return (
-        f"Its decision rule: {rule}. `evaluate`, `ope`, `rank` and `recommend` act by it unless "
-        "another is named; each measurement below names its own."
+        f"Its decision rule: {read_rule(run / RULE)}. `evaluate`, `ope`, `rank` and "
+        "`recommend` act by it unless another is named; each measurement below names its own."
     )
 
 

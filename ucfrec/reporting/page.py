@@ -89,15 +89,17 @@ def write_report(
             "forest": forest(evidence),
         }
     features = None if items is None else read_features(items)
-    page = _template().render(
+    warnings, sections = [], []
+    for group in by_data.values():
+        for run in group:
+            with damage_explained(run.folder / RUN, _REMEDY):
+                warnings += [(run.name, text) for text in _warnings(run)]
+        with damage_explained(group[0].folder / RUN, _REMEDY):
+            sections.append(_section(group, features))
+    page = template("ucfrec.reporting", "report.html").render(
         version=__version__,
-        warnings=[
-            (run.name, text)
-            for group in by_data.values()
-            for run in group
-            for text in _warnings(run)
-        ],
-        sections=[_section(group, features) for group in by_data.values()],
+        warnings=warnings,
+        sections=sections,
         layout=charts,
         points=POINTS,
         **evaluated,
@@ -108,12 +110,16 @@ def write_report(
 
 
 @cache
-def _template() -> Template:
-    loader = PackageLoader("ucfrec.reporting", "")
+def template(package: str, name: str) -> Template:
+    """A template of HTML in a package, which escapes all values."""
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader(package, ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 def _read_runs(folders: Sequence[Path]) -> list[_Run]:
@@ -133,11 +139,6 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
 
 def _warnings(run: _Run) -> list[str]:
     """Reasons why the results of a run may be unreliable."""
-    with damage_explained(run.folder / RUN, _REMEDY):
-        return _warnings_of(run)
-
-
-def _warnings_of(run: _Run) -> list[str]:
     report = run.augmentation
     warnings = [run.status] if run.record.policy is None else []
     if report is not None:
@@ -151,15 +152,9 @@ def _warnings_of(run: _Run) -> list[str]:
 
 def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
-    with damage_explained(runs[0].folder / RUN, _REMEDY):
-        return _variables(runs, features)
-
-
-def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     names = [run.name for run in runs]
-    edited = [(run.name, run.augmentation) for run in runs if run.augmentation is not None]
     item_runs = [run for run in runs if run.record.sizes["items"]]
-    styled = [
+    edited = [
         (run.name, style, run.augmentation)
         for style, run in enumerate(runs)
         if run.augmentation is not None
@@ -174,9 +169,9 @@ def _variables(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any
         "unlogged": [run.name for run in runs if not run.logged],
         "finished": any(run.record.policy is not None for run in runs),
         "references": any(run.references for run in runs),
-        "verdicts": [(name, report.verdict) for name, report in edited],
+        "verdicts": [(name, report.verdict) for name, _, report in edited],
         "copies": augmentation_table(edited) if edited else None,
-        "moves": moves_chart(styled),
+        "moves": moves_chart(edited),
         "user_models": _named(item_runs, user_model_table),
         "frontiers": _named(item_runs, frontier),
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],

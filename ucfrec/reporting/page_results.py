@@ -1,5 +1,6 @@
 """Results of `ucfrec evaluate` and `ucfrec ope` in the report, and rules by their evidence."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,11 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity import COLUMNS
 from ucfrec.off_policy.columns import SUITE
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.reporting import charts
-from ucfrec.reporting.charts import LineChart, line_chart
+from ucfrec.reporting.charts import BarChart, LineChart, bar_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, shown
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
-from ucfrec.runs.record import Candidate, RunRecord
+from ucfrec.runs.record import RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
@@ -89,12 +89,12 @@ def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
     return Estimates(name, logged, rows, tuple(dict.fromkeys(said)))
 
 
-def environments(results: Results) -> list[tuple[charts.BarChart, Table]]:
+def environments(results: Results) -> list[tuple[BarChart, Table]]:
     """Bar chart and table of each environment."""
     return [_environment(environment, rows) for environment, rows in results.environments.items()]
 
 
-def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[charts.BarChart, Table]:
+def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[BarChart, Table]:
     names, lines = _row_names(rows), [evaluation_line(row) for row in rows]
     columns = [c for c in (*_METRICS, *_SEEDS) if any(line.get(c) is not None for line in lines)]
     body = [
@@ -105,12 +105,12 @@ def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[charts.Ba
     return _bars(f"R_cum in {environment}, with 95% intervals", names, rows), table
 
 
-def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]]:
+def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
     """Bar chart and table of each policy with estimates from logs."""
     drawn = []
     for one in results.estimates:
         rows = [*([one.logged] if one.logged else []), *one.rows]
-        names = [_estimator(row) for row in rows]
+        names = ["logged sessions" if row.method == LOGGED else row.method for row in rows]
         body = [
             (name, [interval(row), *(shown(row.as_line().get(column)) for column in _WEIGHTS)])
             for name, row in zip(names, rows, strict=True)
@@ -122,17 +122,13 @@ def estimates(results: Results) -> list[tuple[Estimates, charts.BarChart, Table]
     return drawn
 
 
-def _estimator(row: ResultRow) -> str:
-    return "logged sessions" if row.method == LOGGED else row.method
-
-
-def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> charts.BarChart:
+def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> BarChart:
     bars = [
         (name, row.value, row.interval[0], row.interval[1])
         for name, row in zip(names, rows, strict=True)
         if row.interval is not None
     ]
-    return charts.bar_chart(title, bars)
+    return bar_chart(title, bars)
 
 
 def interval(row: ResultRow) -> str:
@@ -165,34 +161,26 @@ def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
 
     None where the log has no propensities.
     """
-    best = list[Candidate]()
-    known = [each for each in _candidates(record) if _users(each) is not None]
-    for each in sorted(known, key=lambda one: (-(_users(one) or 0.0), -(one.value or 0.0))):
-        if not best or (each.value or 0.0) > (best[-1].value or 0.0):
-            best.append(each)
-    if not best or record.rule is None:
+    if record.rule is None:
         return None
-    curve: Mapping[float, float] = {_users(each) or 0.0: each.value or 0.0 for each in best}
-    chosen = next((each for each in known if each.rule == record.rule.rule), None)
+    known = [
+        (each.evidence.effective_users, each.value, each.rule, each.evidence.interval)
+        for each in record.rule.candidates
+        if each.value is not None and each.evidence and each.evidence.effective_users is not None
+    ]
+    highest, curve, body = -math.inf, dict[float, float](), []
+    for users, value, rule, ends in sorted(known, key=lambda one: (-one[0], -one[1])):
+        if value > highest:
+            highest = curve[users] = value
+            between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
+            body.append((str(rule), [shown(value), f"{users:.0f}", between]))
+    if not curve:
+        return None
     curves = [("best rule", 0, curve)]
-    if chosen is not None:
-        curves.append(("chosen rule", 1, {_users(chosen) or 0.0: chosen.value or 0.0}))
+    chosen = [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]
+    if chosen:
+        curves.append(("chosen rule", 1, dict(chosen[:1])))
     title = "Estimated value against evidence"
     chart = line_chart(title, "effective users of the log", curves)
     head = ["estimated value", "effective users", "off-policy interval"]
-    return chart, Table(title, "rule", head, [(str(each.rule), _numbers(each)) for each in best])
-
-
-def _candidates(record: RunRecord) -> tuple[Candidate, ...]:
-    return () if record.rule is None else record.rule.candidates
-
-
-def _users(candidate: Candidate) -> float | None:
-    evidence = candidate.evidence
-    return None if evidence is None or candidate.value is None else evidence.effective_users
-
-
-def _numbers(candidate: Candidate) -> list[str]:
-    interval = None if candidate.evidence is None else candidate.evidence.interval
-    ends = "-" if interval is None else f"{interval[0]:.4g} to {interval[1]:.4g}"
-    return [shown(candidate.value), f"{_users(candidate) or 0.0:.0f}", ends]
+    return chart, Table(title, "rule", head, body)

@@ -1,12 +1,15 @@
-"""Which files and columns later logs of a trained policy are, by the dataset of its training."""
+"""How later logs of a trained policy are read: files, columns and rewards as in its training."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ucfrec import schema
 from ucfrec.errors import InputError
+from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import Dataset, LogMapping
 from ucfrec.plugins import load_plugin, plugin_names
+from ucfrec.runs.record import RUN
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -33,3 +36,16 @@ def later_logs(
         files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
     columns = {name: text for name, text in found.columns.items() if name not in given.columns}
     return files, replace(given, remembered=LogMapping(columns))
+
+
+def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+    """The mapping with what the run remembers of its training log."""
+    mapping = mapping.over(LogMapping.of_source(trained.record.data, str(trained.folder / RUN)))
+    if trained.record.observation_size:
+        return mapping
+    return LogMapping({schema.OBSERVATION: ""}).over(mapping)
+
+
+def reward_of(trained: TrainedPolicy) -> Expression:
+    """The run's reward, an SQL expression over the columns of its logs."""
+    return Expression(trained.record.reward, str(trained.folder / RUN))

@@ -19,7 +19,7 @@ from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import ITEM_STATES
+from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
@@ -28,12 +28,12 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, versions
-from ucfrec.runs.record import REFIT, RunRecord, read_record, refit_of_run
+from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
 
-RUN, AUGMENTATION = RunRecord.FILE, "augmentation.json"
+AUGMENTATION = "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
 COUNTS = "training_counts.safetensors"
 RETURNS = "training_returns.safetensors"
@@ -117,7 +117,7 @@ class TrainedPolicy:
             _ids(folder / ITEMS, schema.ITEM_ID) if states.exists() else None,
             _ids(folder / USERS, schema.USER_ID),
             _returns(folder / RETURNS),
-            _rule(folder / RULE),
+            read_rule(folder / RULE),
             reward_model,
             TrainingCounts.load(folder / COUNTS) if (folder / COUNTS).exists() else None,
             load_session_end(models, reward_model),
@@ -203,6 +203,30 @@ class TrainedPolicy:
         """What the returns-to-go of the training counted."""
         return self.record.return_to_go
 
+    def training_store(self) -> EpisodeStore | None:
+        """The store that the run was trained on; None where it is gone or changed.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        return store_of(self.folder, self.record)
+
+    def require_store(self, remedy: str) -> EpisodeStore:
+        """`training_store`, which must be there.
+
+        Args:
+            remedy: what to do where it is not, for the message.
+
+        Raises:
+            InputError: it is gone, changed or damaged.
+        """
+        store = self.training_store()
+        if store is None:
+            raise InputError(
+                f"{self.folder}: its store {self.record.store} is gone or has changed; {remedy}"
+            )
+        return store
+
     def target_return(self, quantile: float) -> float:
         """The `quantile` (0 to 1) of `training_returns`, exact, in reward units.
 
@@ -282,7 +306,12 @@ class TrainedPolicy:
         )
 
 
-def _rule(path: Path) -> DecisionRule:
+def read_rule(path: Path) -> DecisionRule:
+    """The decision rule in a file of a run.
+
+    Raises:
+        InputError: it is something else.
+    """
     values = read_json(path)
     if not isinstance(values, Mapping):
         raise InputError(f"{path} is not a decision rule; train the policy again")

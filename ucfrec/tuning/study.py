@@ -71,7 +71,7 @@ def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -
     assert trained.item_states is not None
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users, LikedByRange(trained.item_states))
-    ranker, k = PolicyRanker(trained, None, trained.name), min(k, period.n_items)
+    ranker, k = PolicyRanker(trained), min(k, period.n_items)
     rows = UserRows.of(validation, users, store.split("train"))
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
     above, below = measure(period, ranked, k)[_MEASURES[metric]]
@@ -307,10 +307,8 @@ def _hopeless(study: "Study", number: int, policy: str) -> bool:
 def _keep_best(study: "Study", plan: Plan) -> None:
     """Move the best run to its place and delete those of the other trials."""
     if not _complete(study):
-        errors = dict.fromkeys(
-            t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error")
-        )
-        reason = next(iter(errors), "all were ended early; search more of them")
+        errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
+        reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
     name = f"{TRIAL}{config_hash(asdict(config_of(plan, study.best_trial)))}"
     if (plan.out / name).is_dir():

@@ -71,12 +71,12 @@ def drift(
     """
     few = added.select(_some_episodes(added, seed))
     known = as_known(few, old)
-    items = known.step_values(schema.ITEM, *known.all_steps())
+    items = known.column(schema.ITEM)
     assert old.counts is not None
     shown = old.counts.shown.numpy()
     rows = np.sort(np.random.default_rng(seed).integers(before.n_steps, size=_MOST_STEPS))
     rewards = before.step_values(schema.REWARD, *before.locate(rows)).astype(np.float64)
-    new = known.step_values(schema.REWARD, *known.all_steps()).astype(np.float64)
+    new = known.column(schema.REWARD).astype(np.float64)
     steps = max(counts["steps"], 1)
     found: dict[str, Any] = {
         "unknown_items": counts["new_item_steps"] / steps,
@@ -143,13 +143,9 @@ def as_known(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
         trained: the run; users and items that it does not know become −1.
     """
     assert trained.item_states is not None
-    assert trained.item_ids is not None
-    places = view.all_steps()
-    steps: dict[str, Array] = {
-        name: view.step_values(name, *places) for name in view.record.columns
-    }
+    steps = {name: view.column(name) for name in view.record.columns}
     items = steps[schema.ITEM]
-    steps[schema.ITEM] = np.where(items < len(trained.item_ids), items, -1)
+    steps[schema.ITEM] = np.where(items < len(trained.items), items, -1)
     users = view.episode_values(schema.USER)
     episodes = {
         schema.USER: np.where(users < len(trained.user_ids), users, -1),

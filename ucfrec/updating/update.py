@@ -17,9 +17,10 @@ from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
 from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.record import RUN, RunRecord, Update, store_of
+from ucfrec.runs.record import RUN, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
+from ucfrec.runs.screened import without_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.runs.warm_start import SHARE, warm_settings
 from ucfrec.updating.drift import drift
@@ -85,9 +86,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with claimed(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
-    opened = EpisodeStore.open(grown)
-    if trained.dropped:
-        opened = opened.without_observation_dimensions(trained.dropped)
+    opened = without_columns(EpisodeStore.open(grown), trained.dropped)
     full = _from_nothing(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:
@@ -151,13 +150,9 @@ def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
         raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
     if trained.record.policy is None:
         raise InputError(f"{run} is not finished; train it to its end first")
-    store = store_of(run, trained.record)
-    if store is None:
-        raise InputError(
-            f"{run}: its store {trained.record.store} is gone or has changed; move the run "
-            "together with its store, or prepare all logs and train again"
-        )
-    return store
+    return trained.require_store(
+        "move the run together with its store, or prepare all logs and train again"
+    )
 
 
 def _from_nothing(record: RunRecord) -> Config:

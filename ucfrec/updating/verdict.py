@@ -11,7 +11,8 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.intervals import cluster_intervals, cluster_means
+from ucfrec.evaluation.ranking import mean_ranks
+from ucfrec.off_policy.intervals import cluster_intervals, cluster_mean
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
@@ -46,8 +47,7 @@ def compare_runs(
         seen: rows of the users of the grown store, if items that a user was shown before are
             excluded.
     """
-    places = rows.all_steps()
-    user = rows.episode_values(schema.USER).astype(np.int64)[places[0]]
+    user = rows.episode_values(schema.USER).astype(np.int64)[rows.all_steps()[0]]
     found = _Logged.of(new, rows, seen), _Logged.of(old, as_known(rows, old), seen)
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)
@@ -101,11 +101,9 @@ class _Logged:
         """One pass over a view whose unknown items are −1."""
         chances, gains = [], []
         for batch in scored_steps(trained, view, None, seen):
-            items, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
-            chance = batch.log_probabilities.gather(1, items)[:, 0].double().exp()
-            own = batch.scores.gather(1, items)
-            above, equal = ((batch.scores > own).sum(1), (batch.scores == own).sum(1))
-            rank = 1 + above.double() + (equal - 1).double() / 2
+            items, unknown = batch.items.clamp(min=0), batch.items < 0
+            chance = batch.log_probabilities.gather(1, items.unsqueeze(1))[:, 0].double().exp()
+            rank = mean_ranks(batch.scores, items)
             gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
             chances.append(chance.masked_fill(unknown, 0.0).numpy())
             gains.append(gain.masked_fill(unknown, 0.0).numpy())
@@ -138,20 +136,19 @@ def _difference(
     measure: str, above: Float64Array, below: Float64Array, user: IntArray, seed: int, doubt: str
 ) -> Difference:
     """The ratio of sums over steps (N, 1), with its interval over users."""
-    value = float(above.sum() / below.sum())
+    low = high = value = float(above.sum() / below.sum())
     (interval,) = cluster_intervals(above, below, user, seed)
-    if interval is None or not np.isfinite([interval.low, interval.high]).all():
-        doubt = doubt or ("the users do not differ enough" if value else "")
-        return Difference(measure=measure, value=value, low=value, high=value, doubt=doubt)
-    return Difference(
-        measure=measure, value=value, low=interval.low, high=interval.high, doubt=doubt
-    )
+    if interval is not None and np.isfinite([interval.low, interval.high]).all():
+        low, high = interval.low, interval.high
+    elif value and not doubt:
+        doubt = "the users do not differ enough"
+    return Difference(measure=measure, value=value, low=low, high=high, doubt=doubt)
 
 
 def _doubt(weights: Float64Array, user: IntArray) -> str:
     """Why not to rely on weights (N, 2) of the new and the old run; empty if nothing is found."""
-    means, errors = cluster_means(weights, user)
-    for name, mean, error in zip(("new", "old"), means, errors, strict=True):
+    for name, column in zip(("new", "old"), weights.T, strict=True):
+        mean, error = cluster_mean(column, user)
         if not abs(mean - 1) <= _ERRORS * error:
             return (
                 f"the mean weight of the {name} run is {mean:.3g} ± {error:.2g} where 1 is "

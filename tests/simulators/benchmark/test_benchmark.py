@@ -24,8 +24,8 @@ from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import append_rows, read_rows
-from ucfrec.runs.record import read_record
-from ucfrec.runs.trained_policy import RUN, TrainedPolicy
+from ucfrec.runs.record import RUN, read_record
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
 from ucfrec_simulators.benchmark.budgets import BUDGETS, COSTS
 from ucfrec_simulators.benchmark.measure import measure

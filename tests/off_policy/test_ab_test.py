@@ -39,6 +39,31 @@ def test_a_planted_difference_is_found_with_its_size(
     assert "b is better than a" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        ([0, 0], [1, 1]),
+        ([0, 1, 0], [1, 1, 1, 0]),
+        ([0] * 50, [1] * 50),
+        ([0] * 50, [1, 0] * 25),
+        ([0] * 50, [0] * 50),
+    ],
+)
+def test_users_that_do_not_differ_or_are_few_decide_nothing(
+    tmp_path: Path, a: list[int], b: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arms, users = ["a"] * len(a) + ["b"] * len(b), range(len(a) + len(b))
+    frame = pd.DataFrame({"user_id": users, "arm": arms, "feedback": a + b})
+    frame.to_parquet(tmp_path / "log.parquet")
+    arguments = ["compare", str(tmp_path / "log.parquet"), "--arms", "a,b"]
+    assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert [found[name] for name in ("low", "high", "always_low", "always_high")] == [None] * 4
+    said = capsys.readouterr().out
+    assert "[unknown, unknown] at a planned end" in said
+    assert "nothing can be said yet" in said
+
+
 def test_rows_of_one_user_count_as_one(tmp_path: Path) -> None:
     log(500, 0.0).to_parquet(tmp_path / "log.parquet")
     once = compare_arms([tmp_path / "log.parquet"])

@@ -24,6 +24,8 @@ from ucfrec.off_policy.intervals import cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
+FEWEST: Final = 10
+"""Users of an arm below which their spread says too little for an interval."""
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
 _LARGEST: Final = 1e100
@@ -52,12 +54,13 @@ class Comparison:
     """Of the second arm less the first."""
     error: float
     """Its standard error, over users."""
-    low: float
-    """Ends of the 95% interval, for a test that ends when it was planned to."""
-    high: float
-    always_low: float
+    low: float | None
+    """Ends of the 95% interval, for a test that ends when it was planned to; None, as the others,
+    where an arm has fewer than `FEWEST` users or no user differs from another of the arm."""
+    high: float | None
+    always_low: float | None
     """Ends of the 95% interval that may be looked at as often as one likes, and acted upon."""
-    always_high: float
+    always_high: float | None
 
     def __str__(self) -> str:
         lines = [
@@ -73,10 +76,13 @@ class Comparison:
             lines.append(
                 f"{self.in_several:,} users were in more than one arm; their rows are left out"
             )
-        first, second = self.arms
+        ends = self.low, self.high, self.always_low, self.always_high
+        low, high, always_low, always_high = (
+            "unknown" if end is None else f"{end:+.4g}" for end in ends
+        )
         lines.append(
-            f"{second} − {first}: {self.difference:+.4g} [{self.low:+.4g}, {self.high:+.4g}] at "
-            f"a planned end; [{self.always_low:+.4g}, {self.always_high:+.4g}] always valid"
+            f"{' − '.join(reversed(self.arms))}: {self.difference:+.4g} [{low}, {high}] at a "
+            f"planned end; [{always_low}, {always_high}] always valid"
         )
         return "\n".join(lines)
 
@@ -84,6 +90,11 @@ class Comparison:
     def conclusion(self) -> str:
         """What the always-valid interval says."""
         first, second = self.arms
+        if self.always_low is None or self.always_high is None:
+            return (
+                f"nothing can be said yet: an arm has fewer than {FEWEST} users with a value, or "
+                f"{self.column} is the same for all users of an arm"
+            )
         if self.always_low > 0:
             return f"{second} is better than {first}"
         if self.always_high < 0:
@@ -157,9 +168,10 @@ def compare_arms(
     values, errors = zip(*(cluster_mean(s / n, None, n) for s, n in counts), strict=True)
     difference, variance = values[1] - values[0], errors[0] ** 2 + errors[1] ** 2
     error = math.sqrt(variance)
-    always = difference, difference
-    if variance > 0:
+    ends: tuple[float | None, ...] = (None,) * 4
+    if min(errors) > 0 and min(len(found[name]) for name in names) >= FEWEST:
         always = always_valid(difference, variance, expected or EXPECTED * abs(values[0]) or error)
+        ends = difference - _NORMAL * error, difference + _NORMAL * error, *always
     return Comparison(
         column,
         (first, second),
@@ -172,9 +184,7 @@ def compare_arms(
         log.in_several,
         difference,
         error,
-        difference - _NORMAL * error,
-        difference + _NORMAL * error,
-        *always,
+        *ends,
     )
 
 

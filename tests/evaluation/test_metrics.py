@@ -104,6 +104,18 @@ WRONG: dict[str, tuple[Callable[[], float], str]] = {
         lambda: metrics.ndcg(RECOMMENDED.assign(rank=RECOMMENDED["rank"] - 1), RELEVANT),
         "rank is 0 in a row; ranks count from 1",
     ),
+    "equal ranks": (
+        lambda: metrics.precision(RECOMMENDED.assign(rank=1), RELEVANT),
+        r"in \d+ rows rank is no whole number, or that of another row of the user",
+    ),
+    "halves of ranks": (
+        lambda: metrics.ndcg(RECOMMENDED.assign(rank=RECOMMENDED["rank"] + 0.5), RELEVANT),
+        "rank is no whole number",
+    ),
+    "no score": (
+        lambda: metrics.gauc(SHOWN.assign(score=[np.nan, 1.0])),
+        "score is missing in 1 rows",
+    ),
     "no ranks": (lambda: metrics.mrr(RECOMMENDED.assign(rank=np.nan), RELEVANT), "rank is nan"),
     "text as rank": (lambda: metrics.mrr(RECOMMENDED.assign(rank="1"), RELEVANT), "rank is 1 in"),
     "relevant text": (

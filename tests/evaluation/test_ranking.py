@@ -54,11 +54,12 @@ def test_measures_are_those_of_a_slow_reader(seed: int, n: int, users: int) -> N
     items, liked = rng.integers(N_ITEMS, size=n), rng.random(n) < 0.5
     scores = rng.integers(4, size=(n, N_ITEMS)).astype(float)  # many ties
     own = scores[np.arange(n), items]
-    ranks = 1 + (scores > own[:, None]).sum(1) + ((scores == own[:, None]).sum(1) - 1) / 2
     top = np.argsort(-scores, axis=1, kind="stable")[:, :K]
-    measured = measure(Period(owner, items, liked, N_ITEMS), Ranked(ranks, own, top), K)
+    top[rng.random(top.shape) < 0.2] = -1  # items that are left out
+    measured = measure(Period(owner, items, liked, N_ITEMS), Ranked(own, top))
 
-    hits = [bool(rank <= K) for rank in ranks]
+    ranks = [[*row, item].index(item) + 1 for row, item in zip(top, items, strict=True)]
+    hits = [rank <= K for rank in ranks]
     assert value(measured, "hit_rate_shown") == pytest.approx(np.mean(hits))
     gains = [hit / np.log2(1 + rank) for hit, rank in zip(hits, ranks, strict=True)]
     assert value(measured, "ndcg_shown") == pytest.approx(np.mean(gains))
@@ -79,6 +80,9 @@ def test_measures_are_those_of_a_slow_reader(seed: int, n: int, users: int) -> N
             weights.append(mine.sum())
     if aucs:
         assert value(measured, "gauc") == pytest.approx(np.average(aucs, weights=weights))
+    places = top[top >= 0]
+    if places.size:
+        assert value(measured, "known") == pytest.approx(np.isin(places, items).mean())
     rates = [liked[items == item].mean() for item in top.ravel().tolist() if (items == item).any()]
     if rates:
         assert value(measured, "item_rate") == pytest.approx(np.mean(rates))
@@ -115,7 +119,7 @@ def test_planted_taste_is_found_by_those_who_look_at_the_user(store: EpisodeStor
     rankers = [*baselines(TrainingCounts.of(train), train, seed=0), Oracle()]
     period = Period.of(test, test.episode_values(schema.USER))
     ranked = {ranker.name: rank_steps(ranker, alone(test), 10) for ranker in rankers}
-    found = {row.name: row for row in compare(period, ranked, 10, "oracle", seed=0)}
+    found = {row.name: row for row in compare(period, ranked, "oracle", seed=0)}
     assert found["oracle"].values["gauc"] > 0.9
     for name in ("random", "most shown", "most clicked", "item click rate"):
         assert found[name].values["gauc"] == pytest.approx(0.5, abs=0.12), name
@@ -142,7 +146,7 @@ def test_the_size_of_the_last_batch_changes_nothing(
     monkeypatch.setattr(ranking, "_STEPS_AT_ONCE", (test.n_steps - left) // 2 or 1)
     for ranker, expected in zip(rankers, whole, strict=True):
         found = rank_steps(ranker, later, 10)
-        np.testing.assert_array_equal(found.ranks, expected.ranks)
+        np.testing.assert_array_equal(found.top, expected.top)
         assert found.top.shape == (test.n_steps, 10)
 
 
@@ -155,7 +159,7 @@ def test_one_step_is_ranked(store: EpisodeStore) -> None:
         item_states=store.item_states,
     )
     for ranker in baselines(TrainingCounts.of(train), train, seed=0):
-        assert rank_steps(ranker, alone(one), 10).ranks.shape == (1,)
+        assert rank_steps(ranker, alone(one), 10).top.shape == (1, 10)
 
 
 def test_nothing_of_the_ranked_step_reaches_a_ranker(store: EpisodeStore) -> None:

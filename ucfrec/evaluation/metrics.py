@@ -30,8 +30,8 @@ def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> 
 
     Raises:
         InputError: a column is missing, there are no rows, ids are numbers in one frame and text
-            in the other, ranks begin below 1, or `k` is not a whole number, 1 or more; as all of
-            these.
+            in the other, ranks of a user are not distinct whole numbers from 1, or `k` is not one;
+            as all of these.
     """
     return float(_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].any().mean())
 
@@ -88,7 +88,8 @@ def gauc(scored: pd.DataFrame) -> float:
         scored: `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
 
     Raises:
-        InputError: a column is missing, there are no rows, or `liked` is something else.
+        InputError: a column is missing, there are no rows, a score is missing, or `liked` is
+            something else.
     """
     _require(scored, "scored", USER_ID, "score", "liked")
     if other := (~scored["liked"].isin([0, 1])).sum():
@@ -96,6 +97,8 @@ def gauc(scored: pd.DataFrame) -> float:
             f"scored: liked is neither true nor false in {other:,} rows; give true and false, or 1 "
             "and 0, and leave rows out where it is not known"
         )
+    if missing := scored["score"].isna().sum():
+        raise InputError(f"scored: score is missing in {missing:,} rows; leave them out")
     users, owner = np.unique(scored[USER_ID].to_numpy(), return_inverse=True)
     scores, liked = scored["score"].to_numpy(np.float64), scored["liked"].to_numpy(bool)
     above, below = group_auc(scores, liked, owner, len(users))
@@ -198,6 +201,11 @@ def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
     if not is_numeric_dtype(ranks) or not (ranks >= 1).all():
         lowest = ranks.min() if is_numeric_dtype(ranks) else ranks.iloc[0]
         raise InputError(f"recommended: rank is {lowest} in a row; ranks count from 1, as numbers")
+    if (odd := (ranks % 1 != 0) | recommended.duplicated([USER_ID, _RANK], keep=False)).any():
+        raise InputError(
+            f"recommended: in {odd.sum():,} rows rank is no whole number, or that of another row "
+            "of the user; number the rows of each user 1, 2, 3, …"
+        )
     return recommended[ranks <= k]
 
 

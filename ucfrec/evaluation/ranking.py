@@ -23,7 +23,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.session_metrics import resampled_ratios
-from ucfrec.results.statistics import average_ranks, group_auc
+from ucfrec.results.statistics import group_auc
 
 _SCORES_AT_ONCE = 2**24
 _STEPS_AT_ONCE = 1024
@@ -96,9 +96,6 @@ class Ranker(Protocol):
 class Ranked:
     """One ranker's results at N evaluated steps."""
 
-    ranks: Float64Array
-    """(N,) rank of the shown item, from 1; tied items share their mean rank. Infinite for an item
-    that is left out."""
     scores: Float64Array
     """(N,) score of the shown item at its user's first evaluated step: what was known before any of
     the user's evaluated steps. Scores at the steps themselves would depend on the very rewards that
@@ -111,8 +108,7 @@ class Ranked:
 def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
     """Rank every step of a later log.
 
-    An item that is left out has no rank among the recommended ones, and no place in `top`, which
-    has −1 where too few items are left.
+    An item that is left out has no place in `top`, which has −1 where too few items are left.
 
     Args:
         k: number of recommended items per step, at most n_items.
@@ -123,17 +119,14 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
     for begin in range(0, store.n_steps, at_once):
         numbers = np.arange(begin, min(begin + at_once, store.n_steps))
         batch = later.steps(numbers, later.filter_seen)
-        shown = store.step_values(schema.ITEM, batch.episodes, batch.steps).astype(np.int64)
         scores = ranker.scores(batch)
-        if len(scores) == 1 and batch.left_out is None:
-            parts.append(_ranked_alike(scores[0], shown, k))
-            continue
         if batch.left_out is not None:
-            scores = scores.expand(len(shown), n_items).clone()
+            scores = scores.expand(len(numbers), n_items).clone()
             scores[batch.left_out] = -torch.inf
-        parts.append(_ranked(scores, torch.from_numpy(shown), k))
-    ranks, top = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Ranked(ranks, _first_scores(ranker, later, at_once), top)
+        best, top = scores.topk(k, dim=1)
+        known = top.masked_fill(torch.isneginf(best), -1)
+        parts.append(known.expand(len(numbers), k).numpy())
+    return Ranked(_first_scores(ranker, later, at_once), np.concatenate(parts))
 
 
 def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
@@ -150,27 +143,6 @@ def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
         of_user = owner[rows] - begin if len(scores) > 1 else np.zeros(len(rows), dtype=np.int64)
         found[rows] = scores.double().numpy()[of_user, items[rows]]
     return found
-
-
-def mean_ranks(scores: Tensor, items: Tensor) -> Tensor:
-    """(B,) float64 rank of items (B,) by scores (B, n_items), from 1; tied ones share the mean."""
-    own = scores.gather(1, items.unsqueeze(1))
-    above, equal = (scores > own).sum(1), (scores == own).sum(1)
-    return 1 + above.double() + (equal - 1).double() / 2
-
-
-def _ranked(scores: Tensor, shown: Tensor, k: int) -> tuple[Float64Array, IntArray]:
-    ranks = mean_ranks(scores, shown)
-    ranks[torch.isneginf(scores.gather(1, shown.unsqueeze(1))[:, 0])] = torch.inf
-    best, top = scores.topk(k, dim=1)
-    return ranks.numpy(), top.masked_fill(torch.isneginf(best), -1).numpy()
-
-
-def _ranked_alike(scores: Tensor, shown: IntArray, k: int) -> tuple[Float64Array, IntArray]:
-    """`_ranked` for scores (n_items,) that all steps share, which are sorted only once."""
-    ranks = average_ranks(-scores.double().numpy())
-    top = np.broadcast_to(scores.topk(k).indices.numpy(), (len(shown), k))
-    return ranks[shown], top
 
 
 @dataclass(frozen=True)
@@ -223,7 +195,7 @@ MEASURES: Mapping[str, str] = {
 resampled."""
 
 
-def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Array, Float64Array]]:
+def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Float64Array]]:
     """Every measure as numerators and denominators per user.
 
     Args:
@@ -235,8 +207,9 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Ar
         Σ above / Σ below.
     """
     users, owner = np.unique(period.users, return_inverse=True)
-    hit = ranked.ranks <= k
-    gain = hit / np.log2(1 + ranked.ranks)
+    shown = ranked.top == period.items[:, None]
+    hit = shown.any(axis=1)
+    gain = (shown / np.log2(2 + np.arange(shown.shape[1]))).sum(axis=1)
 
     def by_user(values: Array) -> Float64Array:
         return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
@@ -252,7 +225,7 @@ def measure(period: Period, ranked: Ranked, k: int) -> dict[str, tuple[Float64Ar
         "recall_liked": _recall(period, ranked, owner, len(users)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
         "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(known.sum(1))),
-        "known": (by_user(known.sum(1)), by_user(every * ranked.top.shape[1])),
+        "known": (by_user(known.sum(1)), by_user((ranked.top >= 0).sum(1))),
     }
 
 
@@ -286,7 +259,7 @@ class Compared:
 
 
 def compare(
-    period: Period, ranked: Mapping[str, Ranked], k: int, reference: str, seed: int
+    period: Period, ranked: Mapping[str, Ranked], reference: str, seed: int
 ) -> list[Compared]:
     """Measures of every ranker, with intervals over users and differences from `reference`.
 
@@ -297,7 +270,7 @@ def compare(
     Returns:
         One entry per ranker, in the order of `ranked`.
     """
-    measured = [measure(period, each, k) for each in ranked.values()]
+    measured = [measure(period, each) for each in ranked.values()]
     # (U, rankers, measures), so that one draw of users serves all rankers.
     above, below = (
         np.stack([np.stack([each[m][part] for m in MEASURES], axis=1) for each in measured], axis=1)

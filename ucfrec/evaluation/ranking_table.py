@@ -108,7 +108,7 @@ def ranking_rows(
         **provenance(),
     }
     return [
-        _row(one, own.get(one.name), shared) for one in compare(period, ranked, k, reference, seed)
+        _row(one, own.get(one.name), shared) for one in compare(period, ranked, reference, seed)
     ]
 
 

@@ -74,7 +74,7 @@ def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -
     ranker, k = PolicyRanker(trained), min(k, period.n_items)
     rows = UserRows.of(validation, users, store.split("train"))
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)
-    above, below = measure(period, ranked, k)[_MEASURES[metric]]
+    above, below = measure(period, ranked)[_MEASURES[metric]]
     if not below.any():
         raise InputError(
             f"{store.path}: no validation row is liked, so there is no {metric}; use another "

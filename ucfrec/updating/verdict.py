@@ -11,7 +11,6 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.ranking import mean_ranks
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_mean
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.results.statistics import effective_number
@@ -103,7 +102,7 @@ class _Logged:
         for batch in scored_steps(trained, view, None, seen):
             items, unknown = batch.items.clamp(min=0), batch.items < 0
             chance = batch.log_probabilities.gather(1, items.unsqueeze(1))[:, 0].double().exp()
-            rank = mean_ranks(batch.scores, items)
+            rank = _mean_ranks(batch.scores, items)
             gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
             chances.append(chance.masked_fill(unknown, 0.0).numpy())
             gains.append(gain.masked_fill(unknown, 0.0).numpy())
@@ -130,6 +129,13 @@ def _valued(weights: Float64Array, reward: Float64Array, user: IntArray, seed: i
     """
     lift = ((weights[:, 0] - weights[:, 1]) * (reward - reward.mean()))[:, None]
     return _difference(VALUE, lift, np.ones_like(lift), user, seed, _doubt(weights, user))
+
+
+def _mean_ranks(scores: torch.Tensor, items: torch.Tensor) -> torch.Tensor:
+    """(B,) float64 rank of items (B,) by scores (B, n_items), from 1; tied ones share the mean."""
+    own = scores.gather(1, items.unsqueeze(1))
+    above, equal = (scores > own).sum(1), (scores == own).sum(1)
+    return 1 + above.double() + (equal - 1).double() / 2
 
 
 def _difference(

@@ -204,6 +204,16 @@ def test_words_are_left_out_without_a_note(tmp_path: Path, values: list[str]) ->
     assert report.columns == ("click",)
 
 
+def test_a_parquet_column_of_text_without_a_value_is_left_out_without_a_note(
+    tmp_path: Path,
+) -> None:
+    given = feedback([(1, 10, 7, 1)]).assign(word=pd.array([None], dtype="string"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        report, _ = joined_files(tmp_path, given)
+    assert report.columns == ("click",)
+
+
 def test_a_column_with_numbers_in_one_file_and_words_in_another_is_refused(tmp_path: Path) -> None:
     wanted = r"1\.csv: column CLICK has numbers in .*0\.csv, but here 1 of 2 are not numbers"
     with pytest.raises(InputError, match=wanted):

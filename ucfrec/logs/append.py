@@ -153,7 +153,7 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
     for name, table, file in ID_TABLES:
         before = pq.read_metadata(store / file).num_rows
         ids, new = log.one(
-            f"SELECT count(*), count_if(number >= {before}) FROM kept_{table} "
+            f"SELECT count(*), count(*) FILTER (number >= {before}) FROM kept_{table} "
             f"JOIN {table} USING ({name})"
         )
         # New ids are usual here; only logs without any old one may be written in another way.

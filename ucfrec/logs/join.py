@@ -304,7 +304,8 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
 
     reasons = []
     requests, known, sample, wanted = one(
-        f"SELECT count({_REQUEST}), count_if({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
+        f"SELECT count({_REQUEST}), "
+        f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
         f"min({_REQUEST}), (SELECT min({_REQUEST}) FROM exposures) FROM feedback"
     )
     if requests and not known:

@@ -94,7 +94,8 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
         for n in (1, 2)
     )
     ((*counts,),) = connection.sql(
-        f"SELECT count(x), count_if({number}), count_if({iso}), count_if({other}), "
+        f"SELECT count(x), count(*) FILTER ({number}), count(*) FILTER ({iso}), "
+        f"count(*) FILTER ({other}), "
         f"max({first}), max({second}), min(CASE WHEN {other} THEN x END), "
         f"min(CASE WHEN NOT ({number} OR {iso} OR {other}) THEN x END) "
         f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"

@@ -358,6 +358,28 @@ def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
     assert clicks(LogMapping(earliest="2023-11-14T22:20:20")) == [0, 0, 1, 0]
 
 
+def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
+    """Of an empty arm in Parquet and no arm in CSV, there is one; 1e1 and 10 are two items."""
+    rows = [
+        ("7", item, START, request, 1, 0.5, run, "d", "")
+        for item, request, run in (("1e1", "5e1", "1e3"), ("10", "50", "1000"))
+    ]
+    names = ["user_id", "item_id", "timestamp", "request_id", "position", "propensity", "run"]
+    shown = pd.DataFrame(rows, columns=[*names, "rule", "arm"])
+    (tmp_path / "shown").mkdir()
+    shown.to_csv(tmp_path / "shown" / "one.csv", index=False)
+    shown[:1].to_parquet(tmp_path / "shown" / "two.parquet")
+    clicks = feedback([("7", "1e1", 0, 1)]).assign(request_id="5e1")
+    clicks.to_csv(tmp_path / "clicks.csv", index=False)
+    report = join_feedback(
+        [tmp_path / "shown"], [tmp_path / "clicks.csv"], tmp_path / "log.parquet", MINUTE
+    )
+    assert (report.exposures, report.repeated, report.matched) == (2, 1, 1)
+    log = pd.read_parquet(tmp_path / "log.parquet").set_index("item_id")
+    assert log.click.to_dict() == {"1e1": 1, "10": 0}
+    assert log.loc["1e1", ["request_id", "run"]].tolist() == ["5e1", "1e3"]
+
+
 @pytest.mark.parametrize("name", ["run", "rule", "arm"])
 def test_a_list_of_another_run_or_rule_is_no_repetition(tmp_path: Path, name: str) -> None:
     """`recommend LOGS` gives a user without new rows the same request id again."""

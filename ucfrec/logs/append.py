@@ -204,8 +204,7 @@ class _Grown:
         self._shards = [self._shard(number, cut_ms) for number in range(old.n_shards)]
         self._kept = [shard for shard in self._shards if shard.kept.any()]
         names = [*old.columns]
-        if schema.PROPENSITY in self._log.columns and schema.PROPENSITY not in names:
-            names.append(schema.PROPENSITY)
+        names += [n for n in _FILL if n in self._log.columns and n not in names]
         if schema.OBSERVATION in names and schema.OBSERVATION not in self._log.columns:
             raise InputError(
                 f"{self._log.name} has no observation, {store} has; name its column with --column"

@@ -108,6 +108,8 @@ def _prepare_options(old: StoreRecord, store: Path, options: AppendOptions) -> P
     prepared = PrepareOptions(
         Expression(old.reward, str(store / StoreRecord.FILE)),
         old.source.session_by,
+        min_steps=old.source.min_steps,
+        max_session=old.source.max_session,
         split=options.split,
         duplicates=old.source.duplicates,
         memory_limit=options.memory_limit,

@@ -128,12 +128,27 @@ def test_a_window_forgets_the_sessions_that_ended_before(
     assert pq.read_table(out / "items.parquet")["train_count"].to_pylist() == [*counts]
 
 
-def test_propensities_may_begin_with_the_new_logs(grown: Path, tmp_path: Path) -> None:
-    later_log(propensity=True).to_parquet(tmp_path / "later.parquet")
+def test_propensities_and_random_rows_may_begin_with_the_new_logs(
+    grown: Path, tmp_path: Path
+) -> None:
+    log = later_log(propensity=True)
+    log.assign(is_random=np.arange(len(log)) % 3 == 0).to_parquet(tmp_path / "later.parquet")
     append_logs(grown / "store", [tmp_path / "later.parquet"], tmp_path / "store")
     store = EpisodeStore.open(tmp_path / "store")
     known = ~np.isnan(store.step_values(schema.PROPENSITY, *store.all_steps()))
     assert known.sum() == 300
+    assert store.step_values(schema.IS_RANDOM, *store.all_steps()).sum() == 100
+
+
+def test_sessions_of_the_lengths_that_prepare_left_out_stay_out(tmp_path: Path) -> None:
+    given = {"reward": "reward", "session_by": "gap", "gap_minutes": 20}
+    lengths = {"min_steps": 2, "max_session": 7}
+    store_of(tagged_log(), tmp_path, tagged_mapping(tmp_path), **given, **lengths)
+    later_log().to_parquet(tmp_path / "later.parquet")
+    report = append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
+    assert report["dropped"]["short_episode"] > 0 < report["dropped"]["long_session"]
+    steps = EpisodeStore.open(tmp_path / "grown").lengths
+    assert (steps.min(), steps.max()) == (2, 7)
 
 
 def test_logs_that_are_all_old_are_refused(grown: Path, tmp_path: Path) -> None:

@@ -185,6 +185,22 @@ def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
     assert latest["rewards"] == [wanted]
 
 
+def test_a_later_row_of_csv_with_a_leading_zero_is_text_in_expressions(tmp_path: Path) -> None:
+    """As it is in the first rows, from which types are inferred."""
+    path = csv_of(tmp_path, "visitor", "7", "007")
+    for written, rows in (("7", 24_999), ("007", 1)):
+        mapping = LogMapping(where=f"visitor = '{written}'")
+        users = pa.Table.from_batches(list(read_histories([path], mapping, "1", last=25_000)))
+        assert sum(map(len, users["item_ids"].to_pylist())) == rows
+
+
+def test_the_line_is_named_where_an_identifier_is_also_in_an_expression(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, "visitor", "1", "u7")
+    mapping = LogMapping({"user_id": "visitor"}, where="visitor <> 'bot'")
+    with pytest.raises(InputError, match=r"log.csv, line 25001: column visitor: .*Parquet"):
+        list(read_histories([path], mapping, "1", last=1))
+
+
 @pytest.mark.parametrize("later", ["u7", "99999999999999999999", "9" * 100_000])
 def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
     path = csv_of(tmp_path, "visit", "1", later)

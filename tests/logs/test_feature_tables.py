@@ -42,6 +42,13 @@ def test_ids_of_another_type_are_found(
     assert len(pd.read_parquet(tmp_path / "store" / "items.parquet")) == 3
 
 
+def test_a_key_without_a_character_is_no_item(tmp_path: Path) -> None:
+    mapping = mapping_of(tmp_path, ["a", "b", "c"], ["a", "b", "", "c"])
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store", OPTIONS)
+    items = pd.read_parquet(tmp_path / "store" / "items.parquet")
+    assert items.item_id.tolist() == ["a", "b", "c"]
+
+
 def test_the_index_of_a_frame_is_no_feature(tmp_path: Path) -> None:
     mapping_of(tmp_path, [1, 2, 12], [1, 2, 12])
     features = pd.read_parquet(tmp_path / "features.parquet")

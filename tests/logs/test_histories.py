@@ -1,5 +1,7 @@
 """Histories read from files, by sorting them, are those that SQL finds in a frame."""
 
+from datetime import date, datetime
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 
@@ -63,3 +65,41 @@ def test_logs_without_items_are_refused(tmp_path: Path) -> None:
     log.to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match="its actions are vectors; map item_id"):
         list(read_histories([tmp_path / "log.parquet"], LogMapping(), "reward", 7))
+
+
+def plain_log(**changed: object) -> pd.DataFrame:
+    times = START + np.arange(2)
+    given = {"user_id": [1, 2], "item_id": [3, 4], "timestamp": times, "reward": [0.5, 1.0]}
+    return pd.DataFrame(given | changed)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "told"),
+    [
+        # Arrow makes a column of dates of it, without the time of day.
+        ("timestamp", [date(2024, 1, 1), datetime(2024, 1, 2, 10)], "holds dates and times"),
+        ("user_id", [1, 2**64], "holds whole numbers of more than 64 bits"),
+        ("item_id", [Decimal(1), Decimal("Infinity")], "holds values of several types"),
+    ],
+)
+def test_columns_of_objects_that_arrow_would_change_or_not_take_are_refused(
+    name: str, values: list[object], told: str
+) -> None:
+    frame = plain_log(**{name: pd.Series(values, dtype=object)})
+    with pytest.raises(InputError, match=f"^histories: {name} {told}"):
+        list(frame_histories(frame, LogMapping(), "reward", 7))
+
+
+def test_columns_of_types_that_are_not_read_are_left_out_with_a_note() -> None:
+    kinds = {
+        "halves": pa.array([[np.float16(1)], None]),
+        "wide": pa.array([Decimal(1), None], pa.decimal256(50, 3)),
+        "nothing": pa.array([{}, {}], pa.struct([])),
+        "spans": pa.array([(1, 2, 3), None], pa.month_day_nano_interval()),
+    }
+    for name, values in kinds.items():
+        column = pd.Series(pd.arrays.ArrowExtensionArray(pa.chunked_array([values])))
+        frame = plain_log(reward=np.array([0.5, 1], np.float16), **{name: column})
+        with pytest.warns(InputNote, match=f"column {name} is left out: it is of type"):
+            (batch,) = frame_histories(frame, LogMapping(), "reward", 7)
+        assert batch["rewards"].to_pylist() == [[0.5], [1.0]]

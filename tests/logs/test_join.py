@@ -204,6 +204,16 @@ def test_words_are_left_out_without_a_note(tmp_path: Path, values: list[str]) ->
     assert report.columns == ("click",)
 
 
+def test_a_parquet_column_of_text_without_a_value_is_left_out_without_a_note(
+    tmp_path: Path,
+) -> None:
+    given = feedback([(1, 10, 7, 1)]).assign(word=pd.array([None], dtype="string"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        report, _ = joined_files(tmp_path, given)
+    assert report.columns == ("click",)
+
+
 def test_a_column_with_numbers_in_one_file_and_words_in_another_is_refused(tmp_path: Path) -> None:
     wanted = r"1\.csv: column CLICK has numbers in .*0\.csv, but here 1 of 2 are not numbers"
     with pytest.raises(InputError, match=wanted):
@@ -346,6 +356,28 @@ def test_the_options_of_a_log_hold_for_the_feedback(tmp_path: Path) -> None:
     assert clicks(LogMapping(where="source = 'app' AND click = 1")) == [0, 0, 1, 0]
     assert clicks(LogMapping(where="day = '02'", partitions=True)) == [0, 0, 0, 1]
     assert clicks(LogMapping(earliest="2023-11-14T22:20:20")) == [0, 0, 1, 0]
+
+
+def test_exposures_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
+    """Of an empty arm in Parquet and no arm in CSV, there is one; 1e1 and 10 are two items."""
+    rows = [
+        ("7", item, START, request, 1, 0.5, run, "d", "")
+        for item, request, run in (("1e1", "5e1", "1e3"), ("10", "50", "1000"))
+    ]
+    names = ["user_id", "item_id", "timestamp", "request_id", "position", "propensity", "run"]
+    shown = pd.DataFrame(rows, columns=[*names, "rule", "arm"])
+    (tmp_path / "shown").mkdir()
+    shown.to_csv(tmp_path / "shown" / "one.csv", index=False)
+    shown[:1].to_parquet(tmp_path / "shown" / "two.parquet")
+    clicks = feedback([("7", "1e1", 0, 1)]).assign(request_id="5e1")
+    clicks.to_csv(tmp_path / "clicks.csv", index=False)
+    report = join_feedback(
+        [tmp_path / "shown"], [tmp_path / "clicks.csv"], tmp_path / "log.parquet", MINUTE
+    )
+    assert (report.exposures, report.repeated, report.matched) == (2, 1, 1)
+    log = pd.read_parquet(tmp_path / "log.parquet").set_index("item_id")
+    assert log.click.to_dict() == {"1e1": 1, "10": 0}
+    assert log.loc["1e1", ["request_id", "run"]].tolist() == ["5e1", "1e3"]
 
 
 @pytest.mark.parametrize("name", ["run", "rule", "arm"])

@@ -53,6 +53,15 @@ def test_a_reward_that_is_null_because_a_column_is_names_it(tmp_path: Path, name
     assert not notes_of(path)
 
 
+def test_parts_whose_rewards_are_all_defined_count_as_none(tmp_path: Path) -> None:
+    log = make_log()
+    write(log[:3000], tmp_path, "a.parquet")
+    write(log[3000:].fillna({"revenue": 0}), tmp_path, "b.csv")
+    missing = f"{log.revenue[:3000].isna().sum():,}"
+    (note,) = notes_of(tmp_path, reward="reward + revenue")
+    assert f"is null because revenue is, in {missing} rows" in note
+
+
 @pytest.mark.parametrize("share", [0.25, 0.15])
 @pytest.mark.parametrize("name", ["user_id", "item_id", "timestamp"])
 def test_many_rows_without_a_key_are_told_of_by_column(

@@ -92,6 +92,16 @@ def test_every_file_settles_its_own_order(tmp_path: Path) -> None:
         validate([tmp_path], LogMapping())
 
 
+@pytest.mark.parametrize("other", [None, "n/a"])
+def test_a_file_without_dates_needs_no_order(tmp_path: Path, other: str | None) -> None:
+    log = make_log(days("2024-03-01", 31).strftime("%m/%d/%Y"))
+    write(log, tmp_path / "a.parquet")
+    without = pd.array([other] * 10, dtype="string")
+    write(log[:10].assign(timestamp=without), tmp_path / "b.parquet")
+    report = validate([tmp_path], LogMapping())
+    assert (report["rows_read"], report["dropped"]["null_key"]) == (3010, 10)
+
+
 @pytest.mark.parametrize(
     ("written", "expected"),
     [

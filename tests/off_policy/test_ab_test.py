@@ -146,7 +146,8 @@ def test_infinite_values_are_refused_with_their_file(tmp_path: Path, value: floa
     frame.to_parquet(tmp_path / "a.parquet")
     frame.loc[[3, 9], "feedback"] = value
     frame.to_parquet(tmp_path / "b.parquet")
-    files = [tmp_path / "a.parquet", tmp_path / "b.parquet"]
+    frame.assign(feedback=np.nan).to_parquet(tmp_path / "without.parquet")
+    files = [tmp_path / name for name in ("a.parquet", "b.parquet", "without.parquet")]
     with pytest.raises(InputError, match=r"b\.parquet: feedback is infinite .* in 2 rows"):
         compare_arms(files)
 

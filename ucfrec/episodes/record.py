@@ -58,6 +58,10 @@ class Source(Entry):
     partitions: bool = False
     session_by: Text | None = None
     session_gap_ms: Count | None = None
+    min_steps: _Positive = 1
+    """Episodes with fewer steps were dropped."""
+    max_session: _Positive | None = None
+    """Episodes with more steps were dropped."""
     duplicates: Literal["highest", "lowest", "first", "last"] = "highest"
     """Which of several rows with the same user, item and time was kept."""
     rows_read: Count | None = None

@@ -108,6 +108,8 @@ def _prepare_options(old: StoreRecord, store: Path, options: AppendOptions) -> P
     prepared = PrepareOptions(
         Expression(old.reward, str(store / StoreRecord.FILE)),
         old.source.session_by,
+        min_steps=old.source.min_steps,
+        max_session=old.source.max_session,
         split=options.split,
         duplicates=old.source.duplicates,
         memory_limit=options.memory_limit,
@@ -153,7 +155,7 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
     for name, table, file in ID_TABLES:
         before = pq.read_metadata(store / file).num_rows
         ids, new = log.one(
-            f"SELECT count(*), count_if(number >= {before}) FROM kept_{table} "
+            f"SELECT count(*), count(*) FILTER (number >= {before}) FROM kept_{table} "
             f"JOIN {table} USING ({name})"
         )
         # New ids are usual here; only logs without any old one may be written in another way.
@@ -204,8 +206,7 @@ class _Grown:
         self._shards = [self._shard(number, cut_ms) for number in range(old.n_shards)]
         self._kept = [shard for shard in self._shards if shard.kept.any()]
         names = [*old.columns]
-        if schema.PROPENSITY in self._log.columns and schema.PROPENSITY not in names:
-            names.append(schema.PROPENSITY)
+        names += [n for n in _FILL if n in self._log.columns and n not in names]
         if schema.OBSERVATION in names and schema.OBSERVATION not in self._log.columns:
             raise InputError(
                 f"{self._log.name} has no observation, {store} has; name its column with --column"

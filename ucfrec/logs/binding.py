@@ -119,21 +119,15 @@ def explained(
             raise
         raise _disk_full(folder) from None
     except duckdb.Error as error:
-        message = str(error)
         if _is_disk_full(error):
             raise _disk_full(folder) from None
         if isinstance(error, duckdb.OutOfMemoryException):
             raise InputError(f"{first_line(error)}; raise memory_limit") from None
-        if fault := _CSV_FAULT.search(message):
-            column = _CSV_COLUMN.search(message)
-            detail = f"column {column[1]}: {column[2]}" if column else first_line(error)
-            raise InputError(
-                f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write "
-                "the log as Parquet, where a column states its type"
-            ) from None
-        for file, fault_line in _unreadable(connection, tables):
-            raise InputError(
-                f"{file} cannot be read, it may be damaged ({fault_line}); fetch it again"
+        if fault := _fault_of_line(error):
+            raise fault from None
+        for file, damage in _unreadable(connection, tables):
+            raise _fault_of_line(damage) or InputError(
+                f"{file} cannot be read, it may be damaged ({first_line(damage)}); fetch it again"
             ) from None
         if isinstance(error, duckdb.InternalError):
             raise
@@ -141,6 +135,19 @@ def explained(
         raise InputError(
             f"{files}: {first_line(error)}; correct the values, or try_cast them in the mapping"
         ) from None
+
+
+def _fault_of_line(error: duckdb.Error) -> InputError | None:
+    """Error that names the line of a CSV file which cannot be read; None for other errors."""
+    message = str(error)
+    fault, column = _CSV_FAULT.search(message), _CSV_COLUMN.search(message)
+    if fault is None:
+        return None
+    detail = f"column {column[1]}: {column[2]}" if column else first_line(error)
+    return InputError(
+        f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write the log "
+        "as Parquet, where a column states its type"
+    )
 
 
 def _is_disk_full(error: Exception) -> bool:
@@ -157,14 +164,14 @@ def _disk_full(folder: Path) -> InputError:
 
 def _unreadable(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]
-) -> Iterator[tuple[Path, str]]:
+) -> Iterator[tuple[Path, duckdb.Error]]:
     for table in tables:
         for file in table.files:
             single = replace(table, files=(file,))
             try:
                 connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
             except duckdb.Error as error:
-                yield file, first_line(error)
+                yield file, error
 
 
 def settled(

@@ -237,7 +237,9 @@ def _as_id(key: str, key_type: str, id_type: str) -> str:
         # Text is an integer only if it is written as the integer is: 007 is not 7.
         number = f"TRY_CAST({key} AS BIGINT)"
         return f"CASE WHEN CAST({number} AS VARCHAR) = CAST({key} AS VARCHAR) THEN {number} END"
-    return f"TRY_CAST({key} AS {id_type})"
+    as_id = f"TRY_CAST({key} AS {id_type})"
+    # Text without a character is missing, as in the log.
+    return as_id if id_type == "BIGINT" else f"nullif({as_id}, '')"
 
 
 def _comparable(sql: str, kind: str) -> tuple[str, str] | None:

@@ -106,7 +106,7 @@ class _Words:
             alike += f"OR lower(x{n}) IN {_TRUTH_LIKE})"
             least, most = (f"{each}(x{n}) FILTER (NOT {alike})" for each in ("min", "max"))
             asked.append(
-                f"[count(x{n}), count_if(x{n} IS NOT NULL AND NOT {number}), count_if({alike})], "
+                f"[count(x{n}), count(x{n}) FILTER (NOT {number}), count(*) FILTER ({alike})], "
                 f"coalesce({least}, min(x{n}) FILTER (NOT {number})), "
                 f"coalesce({least} = {most}, false)"
             )

@@ -4,6 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from tempfile import gettempdir
 from typing import TYPE_CHECKING, Any, Final
@@ -180,7 +181,8 @@ def _as_array(values: "pd.Series[Any]") -> pa.Array:
     """A column of a data frame.
 
     Raises:
-        _UnusableError: it has mixed Python objects, durations or periods.
+        _UnusableError: it has mixed Python objects, durations or periods, whole numbers that Arrow
+            does not hold, or a type that the engine or Parquet lacks.
     """
     import pandas as pd
 
@@ -188,12 +190,40 @@ def _as_array(values: "pd.Series[Any]") -> pa.Array:
         raise _UnusableError("holds periods; convert them with .dt.to_timestamp()")
     try:
         array = pa.Array.from_pandas(values)
-    except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError) as error:
+    except OverflowError:
+        raise _UnusableError(
+            "holds whole numbers of more than 64 bits; convert them with .astype(str)"
+        ) from None
+    except (TypeError, ValueError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise _UnusableError(f"holds values of several types ({reason}); make them one") from None
     if pa.types.is_duration(array.type):
         raise _UnusableError("holds durations; convert them with .dt.total_seconds()")
+    dates = values.dtype == object and pa.types.is_date(array.type)
+    if dates and any(isinstance(each, datetime) for each in values):
+        # Arrow would cut off the time of day.
+        raise _UnusableError("holds dates and times; convert them with pandas.to_datetime")
+    if pa.types.is_float16(array.type):
+        return array.cast(pa.float32())
+    for lacking in filter(_is_lacking, _types_in(array.type)):
+        raise _UnusableError(f"is of type {lacking}, which is not read; convert it")
     return array
+
+
+def _types_in(kind: pa.DataType) -> Iterator[pa.DataType]:
+    """A type, and those of its parts."""
+    yield kind
+    if pa.types.is_dictionary(kind):
+        yield kind.value_type
+    for number in range(kind.num_fields):
+        yield from _types_in(kind.field(number).type)
+
+
+def _is_lacking(kind: pa.DataType) -> bool:
+    """Whether the engine or Parquet lacks a type of Arrow."""
+    of = pa.types
+    lacking = (of.is_float16, of.is_decimal256, of.is_interval, of.is_run_end_encoded, of.is_union)
+    return any(each(kind) for each in lacking) or (of.is_struct(kind) and not kind.num_fields)
 
 
 def _require_items(log: TypedLog) -> None:

@@ -25,10 +25,8 @@ from ucfrec.logs.typed import WANTED, typed_columns
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
 _REQUEST: Final = schema.REQUEST_ID
-_EXPOSURE: Final = {
-    schema.USER_ID: None,
-    schema.ITEM_ID: None,
-    schema.TIMESTAMP: "BIGINT",
+_KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
+_OTHERS: Final = {
     _REQUEST: "VARCHAR",
     schema.POSITION: "INTEGER",
     schema.PROPENSITY: "DOUBLE",
@@ -36,7 +34,8 @@ _EXPOSURE: Final = {
     schema.RULE: "VARCHAR",
     schema.ARM: "VARCHAR",
 }
-"""Columns of exposures and their DuckDB types; those of ids are kept."""
+"""Columns of exposures besides the keys, and their DuckDB types."""
+_EXPOSURE: Final = (*_KEYS, *_OTHERS)
 _MEASURED: Final = (schema.TIMESTAMP, schema.PROPENSITY)
 """Columns that may differ where an exposure is written twice."""
 _ONLY_SHOWN: Final = (schema.POSITION, schema.PROPENSITY, schema.RUN, schema.RULE)
@@ -137,14 +136,16 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
+    typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
     rows = " UNION ALL BY NAME ".join(
-        f"SELECT {_selected(table)} FROM {table.sql}" for table in tables
+        f"SELECT {keys}, {_others(whole)} FROM {_with_others(whole, narrow).sql}"
+        for whole, narrow, keys in zip(tables, typed.tables, typed.selects, strict=True)
     )
     connection.execute(f"CREATE TABLE given_exposures AS {rows}")
     connection.execute(
-        "CREATE TABLE exposures AS SELECT *, row_number() OVER (ORDER BY timestamp, "
-        f"{_ONE_EXPOSURE}) AS row FROM given_exposures QUALIFY row_number() OVER "
-        f"(PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
+        f"CREATE TABLE exposures AS SELECT * EXCLUDE {schema.REWARD}, row_number() OVER "
+        f"(ORDER BY timestamp, {_ONE_EXPOSURE}) AS row FROM given_exposures "
+        f"QUALIFY row_number() OVER (PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
     )
 
 
@@ -160,14 +161,36 @@ def _require_feedback(tables: Sequence[Table]) -> None:
             )
 
 
-def _selected(table: Table) -> str:
-    """The columns of exposures, with their types; the arm is empty where there is none."""
-    columns = []
-    for name, kind in _EXPOSURE.items():
-        value = quoted(name) if name in names_of(table) else "''"
-        value = value if kind is None else f"CAST({value} AS {kind})"
-        columns.append(f"{value} AS {quoted(name)}")
-    return ", ".join(columns)
+def _others(table: Table) -> str:
+    """SQL of the columns of exposures besides the keys; the arm is empty where there is none."""
+    names = names_of(table)
+    found = {
+        name: _text(table, names[name]) if kind == "VARCHAR" else f"CAST({name} AS {kind})"
+        for name, kind in _OTHERS.items()
+        if name in names
+    }
+    found[schema.ARM] = f"coalesce({found.get(schema.ARM, 'NULL')}, '')"
+    return ", ".join(f"{value} AS {name}" for name, value in found.items())
+
+
+def _with_others(table: Table, narrow: Table) -> Table:
+    """A table of the keys, with the columns that `_others` reads."""
+    kinds = {name: _OTHERS[key] for key, name in names_of(table).items() if key in _OTHERS}
+    texts = [name for name, kind in kinds.items() if kind == "VARCHAR"]
+    return _with_texts(narrow, [name for name in kinds if name not in texts], texts)
+
+
+def _text(table: Table, name: str) -> str:
+    """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
+    return f"CAST({quoted(name if table.columnar else raw_name(name))} AS VARCHAR)"
+
+
+def _with_texts(narrow: Table, columns: Sequence[str], texts: Sequence[str]) -> Table:
+    """A table with more columns and the text of some, see `_text`."""
+    used = [*(narrow.used or ()), *columns]
+    if narrow.columnar:
+        return narrow.of([*used, *texts], narrow.raw)
+    return narrow.of(used, [*narrow.raw, *texts])
 
 
 def _make_feedback(
@@ -186,15 +209,10 @@ def _make_feedback(
         has = [
             (n, names[key]) for n, name in enumerate(columns) if (key := name.casefold()) in names
         ]
-        read, request = [name for _, name in has], "NULL"
-        raw = list(narrow.raw)
-        if (name := names.get(_REQUEST)) is not None:
-            # The text of a CSV file is what its identifiers are: 007 is not 7.
-            (read if whole.columnar else raw).append(name)
-            request = quoted(name if whole.columnar else raw_name(name))
         values = [f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in has]
-        values.append(f"CAST({request} AS VARCHAR) AS {_REQUEST}")
-        source = narrow.of([*(narrow.used or ()), *read], raw)
+        requests = [names[_REQUEST]] if _REQUEST in names else []
+        values.append(f"{_text(whole, requests[0]) if requests else 'NULL'} AS {_REQUEST}")
+        source = _with_texts(narrow, [name for _, name in has], requests)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
     conditions = ["true"] if mapping.where is None else [WANTED]
@@ -227,8 +245,7 @@ def _keys_read(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], mapping: LogMapping
 ) -> set[str]:
     """Columns, in lower case, that user, item and time are read from, and those of folders."""
-    keys = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
-    given = [(table, name, mapping.columns.get(name) or name) for table in tables for name in keys]
+    given = [(table, name, mapping.columns.get(name) or name) for table in tables for name in _KEYS]
     read = (bind(connection, table, f"for {name}", each) for table, name, each in given)
     folders = {name.casefold() for table in tables for name, _ in table.partitions}
     return folders | {column.casefold() for bound in read for column in bound.columns}
@@ -304,7 +321,8 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
 
     reasons = []
     requests, known, sample, wanted = one(
-        f"SELECT count({_REQUEST}), count_if({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
+        f"SELECT count({_REQUEST}), "
+        f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
         f"min({_REQUEST}), (SELECT min({_REQUEST}) FROM exposures) FROM feedback"
     )
     if requests and not known:

@@ -313,6 +313,7 @@ def prepared_log(
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
+                report |= {"min_steps": options.min_steps, "max_session": options.max_session}
                 report |= _remembered(mapping)
                 stage.update()
         yield PreparedLog(rows, spool, cut, measures, features, report, scratch)

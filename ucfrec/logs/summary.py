@@ -251,7 +251,7 @@ def _note(rows: SortedRows, message: str) -> None:
 def _missing_key(log: TypedLog) -> str:
     names = [schema.USER_ID, log.key, schema.TIMESTAMP]
     names += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
-    asked = ", ".join(f"count_if({name} IS NULL)" for name in names)
+    asked = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
     counts = log.one(f"SELECT {asked} FROM {ROWS}")
     found = [f"{name} in {n:,}" for name, n in zip(names, counts, strict=True) if n]
     return f" ({', '.join(found)})"
@@ -276,7 +276,7 @@ def _null_counts(
     if not columns:
         return {}
     undefined = f"TRY(CAST({sql} AS DOUBLE)) IS NULL"
-    asked = ", ".join(f"count_if({quoted(name)} IS NULL)" for name in columns)
+    asked = ", ".join(f"count(*) FILTER ({quoted(name)} IS NULL)" for name in columns)
     query = f"SELECT {asked} FROM {table.sql} WHERE {undefined} AND ({where}\n)"
     (row,) = log.connection.sql(query).fetchall()
     return dict(zip(columns, row, strict=True))

@@ -367,13 +367,14 @@ def _of_all_rows(
 ) -> tuple[tuple[str, str], ...]:
     """Types of the columns of a CSV file, given those that DuckDB inferred from its first rows.
 
-    In later rows it would round 0.25 to a whole number, and cut the hour off a date, without an
-    error. For values of another kind there is one, when they are read. Dates that do not begin with
-    the year stay text: DuckDB guesses their order. A column without any value has the type
-    `NOTHING`.
+    In later rows it would round 0.25 to a whole number, take 007 for 7, and cut the hour off a
+    date, without an error. For values of another kind there is one, when they are read. Dates that
+    do not begin with the year stay text: DuckDB guesses their order. A column without any value has
+    the type `NOTHING`.
     """
     exact = {name: _EXACT[kind] for name, kind in types if kind in _EXACT}
     dated = [name for name, kind in types if kind == "DATE" or kind.startswith("TIMESTAMP")]
+    whole = [name for name, kind in types if kind == "BIGINT"]
     words = _never_filled(connection, file, types)
     asked = dict.fromkeys([*exact, *dated])
     if not asked and not words:
@@ -386,6 +387,7 @@ def _of_all_rows(
         for n, wide in exact.items()
     ]
     conditions += [f"NOT regexp_full_match(trim({quoted(n)}), {text(ISO_TIME)})" for n in dated]
+    conditions += [f"regexp_full_match({quoted(n)}, '-?0\\d+')" for n in whole]
     conditions += [f"{quoted(n)} IS NOT NULL" for n in words]
     every = ", ".join(f"coalesce(bool_or({each}), false)" for each in conditions)
     try:
@@ -394,7 +396,7 @@ def _of_all_rows(
         return types  # reading the rows shows what is wrong with the file
     told = iter(row)
     changed = {name: exact[name] for name in exact if next(told)}
-    changed |= {name: "VARCHAR" for name in dated if next(told)}
+    changed |= {name: "VARCHAR" for name in (*dated, *whole) if next(told)}
     changed |= {name: NOTHING for name in words if not next(told)}
     return tuple((name, changed.get(name, kind)) for name, kind in types)
 

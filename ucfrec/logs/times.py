@@ -66,6 +66,7 @@ def text_time(
                     "--time-format, or map an expression"
                 )
             orders = {_order(connection, table, sql, number) for number in range(len(table.files))}
+            orders.discard("")
             if len(orders) > 1:
                 raise InputError(
                     f"{where} has the day first in some files and the month in others; prepare "
@@ -94,7 +95,8 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
         for n in (1, 2)
     )
     ((*counts,),) = connection.sql(
-        f"SELECT count(x), count_if({number}), count_if({iso}), count_if({other}), "
+        f"SELECT count(x), count(*) FILTER ({number}), count(*) FILTER ({iso}), "
+        f"count(*) FILTER ({other}), "
         f"max({first}), max({second}), min(CASE WHEN {other} THEN x END), "
         f"min(CASE WHEN NOT ({number} OR {iso} OR {other}) THEN x END) "
         f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"
@@ -103,9 +105,11 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
 
 
 def _order(connection: duckdb.DuckDBPyConnection, table: Table, sql: str, number: int) -> str:
-    """How day and month follow each other in a file: "%d/%m" or "%m/%d"."""
+    """How day and month follow each other in a file: "%d/%m" or "%m/%d"; "" without such times."""
     one = replace(table, files=(table.files[number],))
     found = _survey(connection, one, sql)
+    if not found.other:
+        return ""
     days = [(found.first or 0) > 12, (found.second or 0) > 12]
     if days == [True, False]:
         return "%d/%m"

@@ -222,7 +222,7 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
             connection.execute(
                 "CREATE TABLE of_users AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
-                f"count_if(abs(value) > {_LARGEST}) AS beyond, "
+                f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
                 "count(arm) OVER (PARTITION BY who) AS arms "
                 f"FROM ({_rows(tables, column)}) GROUP BY who, arm"
             )
@@ -267,7 +267,7 @@ def _beyond(
     """Error for infinite values: names the file with the most."""
     counts = {}
     for single in [replace(table, files=(file,)) for table in tables for file in table.files]:
-        query = f"SELECT count_if(abs(value) > {_LARGEST}) FROM ({_rows([single], column)})"
+        query = f"SELECT count(*) FILTER (abs(value) > {_LARGEST}) FROM ({_rows([single], column)})"
         ((counts[single.files[0]],),) = connection.sql(query).fetchall()
     file = max(counts, key=lambda each: counts[each])
     return InputError(

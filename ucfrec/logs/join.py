@@ -136,7 +136,7 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Tabl
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
-    typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
+    typed = typed_columns(connection, tuple(tables), _keys_of(LogMapping()), "0", "user")
     rows = " UNION ALL BY NAME ".join(
         f"SELECT {keys}, {_others(whole)} FROM {_with_others(whole, narrow).sql}"
         for whole, narrow, keys in zip(tables, typed.tables, typed.selects, strict=True)

@@ -150,6 +150,23 @@ def test_the_size_of_the_last_batch_changes_nothing(
         assert found.top.shape == (test.n_steps, 10)
 
 
+def test_steps_that_the_filter_leaves_without_a_hit_are_counted(store: EpisodeStore) -> None:
+    test = store.split("test")
+    later = replace(alone(test), filter_seen=True)
+    seen: set[tuple[int, int]] = set()
+    repeats = []
+    users = test.episode_values(schema.USER)[test.all_steps()[0]]
+    for pair in zip(users.tolist(), test.column(schema.ITEM).tolist(), strict=True):
+        repeats.append(pair in seen)
+        seen.add(pair)
+    assert 0 < np.mean(repeats) < 1
+    assert later.share_out_of_reach() == pytest.approx(np.mean(repeats))
+    assert alone(test).share_out_of_reach() == 0
+    period = Period.of(test, users[np.cumsum(test.lengths) - test.lengths])
+    hits = value(measure(period, rank_steps(Oracle(), later, 39)), "hit_rate_shown")
+    assert hits <= 1 - np.mean(repeats) + 1e-9
+
+
 def test_one_step_is_ranked(store: EpisodeStore) -> None:
     train, names = store.split("train"), (schema.ITEM, schema.REWARD, schema.TIMESTAMP)
     one = EpisodeStore.from_arrays(
@@ -240,7 +257,7 @@ def test_rewards_within_the_period_do_not_rank_the_items_shown_in_it(store: Epis
     """Of two steps of which one is liked, the earlier one's score is higher where it was liked."""
     test = store.split("test")
     period = Period.of(test, test.episode_values(schema.USER))
-    found = measure(period, rank_steps(Sated(), alone(test), 10), 10)
+    found = measure(period, rank_steps(Sated(), alone(test), 10))
     assert value(found, "gauc") == pytest.approx(0.5, abs=0.12)
 
 

@@ -56,6 +56,15 @@ def found(store: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, 
     return searched, tune(searched, 6)
 
 
+def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
+    searched = Search(("dt",), FIXED, False, 0, SPACE)
+    rule = searched.config("dt", {"rule.reward_weights": 2.0}).rule
+    assert (rule.reward_weights, rule.lookaheads) == ((2.0,), (0.0,))
+    assert searched.config("dt", {"train.steps": 3}).rule.lookaheads != (0.0,)
+    given = Search(("dt",), {**FIXED, "rule.lookaheads": [4.0]}, False, 0, SPACE)
+    assert given.config("dt", {"rule.reward_weights": 2.0}).rule.lookaheads == (4.0,)
+
+
 def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]) -> None:
     searched, study = found
     assert len(finished(study)) == 6

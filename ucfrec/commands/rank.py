@@ -41,7 +41,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--liked",
         metavar="SQL",
         help="what counts as liked, a truth value over the column reward, e.g. 'reward >= 4' "
-        "(default: at least 60%% of the way from the lowest training reward to the highest)",
+        "(default: at least 60%% of the way from the lowest training reward to the highest, or to "
+        "two standard deviations above the mean, if that is less)",
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the rows, with intervals, as JSON"
@@ -95,6 +96,11 @@ def run(options: argparse.Namespace) -> None:
     about = rows[0].conditions
     print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
+    if (lost := about["out_of_reach"]) > 0:
+        print(
+            f"{lost:.1%} of the steps show an item that the user has seen, which is left out: "
+            f"hit_rate_shown is at most {1 - lost:.3g}; --keep-seen ranks these items too"
+        )
     on = ", ".join(map(without_folders, options.logs)) or "the test split"
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:

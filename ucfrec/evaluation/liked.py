@@ -40,8 +40,9 @@ class LikedByRange:
     def __str__(self) -> str:
         least = least_liked(self._low, self._high)
         return (
-            f"reward >= {least:.4g} ({LIKED:.0%} of the way from the lowest training reward, "
-            f"{self._low:.4g}, to the highest, {self._high:.4g})"
+            f"reward >= {least:.4g} ({LIKED:.0%} of the way from {self._low:.4g}, the lowest "
+            f"training reward, to {self._high:.4g}, the highest or two standard deviations above "
+            "the mean, if that is less)"
         )
 
 

@@ -50,6 +50,17 @@ class Later:
         users = self._users[episodes]
         return Steps(self.store, self.rows, numbers, episodes, steps, users, left_out)
 
+    def share_out_of_reach(self) -> float:
+        """Share of the steps whose shown item is left out; 0 without `filter_seen`."""
+        if not self.filter_seen:
+            return 0.0
+        items, lost = self.store.column(schema.ITEM).astype(np.int64), 0
+        for begin in range(0, len(items), _STEPS_AT_ONCE):
+            numbers = np.arange(begin, min(begin + _STEPS_AT_ONCE, len(items)))
+            rows, seen = self.rows.seen(numbers)
+            lost += len(np.unique(rows[seen == items[numbers][rows]]))
+        return lost / len(items)
+
     @cached_property
     def _users(self) -> IntArray:
         return self.store.episode_values(schema.USER).astype(np.int64)

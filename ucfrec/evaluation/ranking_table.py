@@ -101,6 +101,7 @@ def ranking_rows(
             "users": len(np.unique(period.users)),
             "reference": reference,
             "filter_seen": later.filter_seen,
+            "out_of_reach": later.share_out_of_reach(),
             "liked": str(liked),
             "liked_share": float(period.liked.mean()),
         },

@@ -158,6 +158,9 @@ class Search:
             table, _, field = name.partition(".")
             of_list = isinstance(getattr(getattr(plain, table), field, None), tuple)
             settings[name] = (value,) if of_list else value
+        if "rule.reward_weights" in values:
+            # Rules with a lookahead have other weights, which would take the place of the trial's.
+            settings.setdefault("rule.lookaheads", (0.0,))
         config = resolve_config(policy, None, settings, self.seed)
         warmup = config.train.warmup_steps
         if "train.warmup_steps" not in settings and config.train.steps < 4 * warmup:

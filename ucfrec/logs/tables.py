@@ -76,6 +76,17 @@ class Table:
         """The same table with some of its columns, so that others cost nothing."""
         return replace(self, used=tuple(dict.fromkeys(used)), raw=tuple(dict.fromkeys(raw)))
 
+    def with_texts(self, used: Iterable[str], texts: Iterable[str]) -> "Table":
+        """The same table with more columns, and with those that `text_of` needs."""
+        used = [*(self.used or ()), *used]
+        if self.columnar:
+            return self.of([*used, *texts], self.raw)
+        return self.of(used, [*self.raw, *texts])
+
+    def text_of(self, name: str) -> str:
+        """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
+        return f"CAST({quoted(name if self.columnar else raw_name(name))} AS VARCHAR)"
+
     @property
     def sql(self) -> str:
         """SQL of the rows: NaN is missing, integers of fewer than 64 bits have 64."""

@@ -104,6 +104,14 @@ def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
     assert batch.column("user_id").to_pylist() == ["007", "7", "a b"]
 
 
+def test_numbers_in_folders_stay_numbers_beside_a_folder_without_a_value(tmp_path: Path) -> None:
+    for name in ("3", "__HIVE_DEFAULT_PARTITION__"):
+        write(make_log(), tmp_path / f"weight={name}" / "part.parquet")
+    given = LogMapping(partitions=True)
+    (batch,) = read_histories([tmp_path], given, "coalesce(weight, 7)", 1000)
+    assert {*batch.column("rewards").flatten().to_pylist()} == {7}
+
+
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 def test_a_folder_that_contradicts_its_file_is_refused(tmp_path: Path, suffix: str) -> None:
     log = make_log()
@@ -283,6 +291,8 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
     expected = [known.index(str(each)) if str(each) in known else -1 for each in users]
     assert [*numbers] == expected
     assert max(expected) > 0
+    given = pq.read_table(tmp_path / "found" / "users.parquet")["user_id"].to_pylist()
+    assert [*map(str, given)] == known
 
 
 @pytest.mark.parametrize("parts", [["7,8", "7.0"], ["7,7.0,8"]])

@@ -42,6 +42,8 @@ ISO_TIME: Final = (
 """Times that have one meaning: the year comes first."""
 PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
 """Column in which pandas keeps the numbers of the rows of a frame: no data."""
+_NO_VALUE: Final = "__HIVE_DEFAULT_PARTITION__"
+"""Value of a column in the name of a folder whose rows have none."""
 _FILE: Final = "ucfrec: file"
 _RAW: Final = "ucfrec: text of "
 
@@ -135,7 +137,7 @@ def _of_folder(name: str, kind: str = "VARCHAR") -> str:
     """SQL of the value of a column in the name of a folder."""
     pattern = f"(?:^|[/\\\\]){re.escape(name)}=([^/\\\\]*)[/\\\\]"
     value = f"url_decode(regexp_extract({quoted(_FILE)}, {text(pattern)}, 1))"
-    return f"CAST(nullif({value}, '__HIVE_DEFAULT_PARTITION__') AS {kind})"
+    return f"CAST(nullif({value}, {text(_NO_VALUE)}) AS {kind})"
 
 
 def _computed_as(kind: str) -> str:
@@ -271,7 +273,8 @@ def _with_whole_numbers(tables: list[Table]) -> list[Table]:
         for part in file.parts[:-1]
         if "=" in part.strip("=")
     ]
-    words = {name for name, value in folders if not re.fullmatch(r"0|-?[1-9]\d{0,17}", value)}
+    whole = rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}"
+    words = {name for name, value in folders if not re.fullmatch(whole, value)}
     return [
         replace(
             table,

@@ -467,6 +467,21 @@ def test_csv_lines_of_other_lengths_and_a_missing_header_are_refused(
         validate([tmp_path / "log.csv"], LogMapping())
 
 
+def test_lines_that_begin_with_a_hash_are_rows(tmp_path: Path) -> None:
+    """DuckDB would take these for comments, because all other lines have equal types."""
+    lines = [
+        "User_Id,Session_Id,Timestamp,Reward,Is_Random,Note,Item_Id",
+        'NaN,6,2023-11-15T11:43:20.005+11:00,2.0,1,"x,y",1e3',
+        '#1,8,2023-11-15T02:13:20.000Z,inf,0,"x,y",12:00',
+        'NaN,0,2023-11-14 23:43:20.000,0.0,,"x,y",1e3',
+        '#1,6,2023-11-15T10:43:20.000+11:00,3.0,,"x,y",12:00',
+        '#1,8,2023-11-14 22:13:21.998,1.0,1,"x,y",1e3',
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    report = validate([tmp_path / "log.csv"], LogMapping(), PrepareOptions("item_id = '1e3'"))
+    assert (report["rows_read"], report["users"]) == (5, 2)
+
+
 @pytest.mark.parametrize("title", ["# exported by the shop", ""])
 def test_a_title_above_the_header_is_skipped(tmp_path: Path, title: str) -> None:
     log = make_log()

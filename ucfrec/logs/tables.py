@@ -123,8 +123,9 @@ class Table:
         kinds = {name: "VARCHAR" if kind == NOTHING else kind for name, kind in kinds.items()}
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in kinds.items())
         given = f", types = {{{types}}}" if types else ""
-        # DuckDB would take quotes for text if the first rows have none.
-        options += ", quote = '\"', escape = '\"'"
+        # DuckDB would take quotes for text if the first rows have none, and sometimes leave out
+        # lines that begin with #.
+        options += ", quote = '\"', escape = '\"', comment = ''"
         return f"read_csv([{files}], header = true, {options}{given})"
 
 

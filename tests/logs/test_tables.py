@@ -104,6 +104,14 @@ def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
     assert batch.column("user_id").to_pylist() == ["007", "7", "a b"]
 
 
+def test_numbers_in_folders_stay_numbers_beside_a_folder_without_a_value(tmp_path: Path) -> None:
+    for name in ("3", "__HIVE_DEFAULT_PARTITION__"):
+        write(make_log(), tmp_path / f"weight={name}" / "part.parquet")
+    given = LogMapping(partitions=True)
+    (batch,) = read_histories([tmp_path], given, "coalesce(weight, 7)", 1000)
+    assert {*batch.column("rewards").flatten().to_pylist()} == {7}
+
+
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 def test_a_folder_that_contradicts_its_file_is_refused(tmp_path: Path, suffix: str) -> None:
     log = make_log()
@@ -283,6 +291,8 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
     expected = [known.index(str(each)) if str(each) in known else -1 for each in users]
     assert [*numbers] == expected
     assert max(expected) > 0
+    given = pq.read_table(tmp_path / "found" / "users.parquet")["user_id"].to_pylist()
+    assert [*map(str, given)] == known
 
 
 @pytest.mark.parametrize("parts", [["7,8", "7.0"], ["7,7.0,8"]])
@@ -455,6 +465,21 @@ def test_csv_lines_of_other_lengths_and_a_missing_header_are_refused(
     (tmp_path / "log.csv").write_text("\n".join(change(lines.splitlines()[:40])) + "\n")
     with pytest.raises(InputError, match=rf"log\.csv, {message}"):
         validate([tmp_path / "log.csv"], LogMapping())
+
+
+def test_lines_that_begin_with_a_hash_are_rows(tmp_path: Path) -> None:
+    """DuckDB would take these for comments, because all other lines have equal types."""
+    lines = [
+        "User_Id,Session_Id,Timestamp,Reward,Is_Random,Note,Item_Id",
+        'NaN,6,2023-11-15T11:43:20.005+11:00,2.0,1,"x,y",1e3',
+        '#1,8,2023-11-15T02:13:20.000Z,inf,0,"x,y",12:00',
+        'NaN,0,2023-11-14 23:43:20.000,0.0,,"x,y",1e3',
+        '#1,6,2023-11-15T10:43:20.000+11:00,3.0,,"x,y",12:00',
+        '#1,8,2023-11-14 22:13:21.998,1.0,1,"x,y",1e3',
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    report = validate([tmp_path / "log.csv"], LogMapping(), PrepareOptions("item_id = '1e3'"))
+    assert (report["rows_read"], report["users"]) == (5, 2)
 
 
 @pytest.mark.parametrize("title", ["# exported by the shop", ""])

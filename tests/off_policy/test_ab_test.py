@@ -140,6 +140,14 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     assert same == compare_arms([tmp_path / "kept.parquet"])
 
 
+def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:
+    users = ["1e1", "10", "2e1", "20", "30", "40"]
+    frame = pd.DataFrame({"user_id": users, "arm": ["1", "1.0"] * 3, "feedback": range(6)})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    found = compare_arms([tmp_path / "log.csv"])
+    assert (found.arms, found.users, found.in_both) == (("1", "1.0"), (3, 3), 0)
+
+
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])
 def test_infinite_values_are_refused_with_their_file(tmp_path: Path, value: float) -> None:
     frame = log(50, 0.0).assign(feedback=lambda rows: rows.feedback.astype(float))

@@ -89,6 +89,7 @@ def text_ids(store: Path | None) -> tuple[str, ...]:
     return tuple(
         name
         for name, _, file in ID_TABLES
+        if (store / file).is_file()
         if not pa.types.is_integer(pq.read_schema(store / file).field(name).type)
     )
 

@@ -19,7 +19,7 @@ from ucfrec.logs.engine import BATCH_ROWS, engine
 from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
+from ucfrec.logs.tables import Table, open_tables, quoted
 from ucfrec.logs.typed import WANTED, typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -127,7 +127,7 @@ def join_feedback(
             return joined
 
 
-def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
+def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]) -> None:
     """Create the table `exposures`, each once, with its `row`."""
     for table in tables:
         missing = [name for name in _EXPOSURE if name not in {*names_of(table), schema.ARM}]
@@ -165,7 +165,7 @@ def _others(table: Table) -> str:
     """SQL of the columns of exposures besides the keys; the arm is empty where there is none."""
     names = names_of(table)
     found = {
-        name: _text(table, names[name]) if kind == "VARCHAR" else f"CAST({name} AS {kind})"
+        name: table.text_of(names[name]) if kind == "VARCHAR" else f"CAST({name} AS {kind})"
         for name, kind in _OTHERS.items()
         if name in names
     }
@@ -177,20 +177,7 @@ def _with_others(table: Table, narrow: Table) -> Table:
     """A table of the keys, with the columns that `_others` reads."""
     kinds = {name: _OTHERS[key] for key, name in names_of(table).items() if key in _OTHERS}
     texts = [name for name, kind in kinds.items() if kind == "VARCHAR"]
-    return _with_texts(narrow, [name for name in kinds if name not in texts], texts)
-
-
-def _text(table: Table, name: str) -> str:
-    """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
-    return f"CAST({quoted(name if table.columnar else raw_name(name))} AS VARCHAR)"
-
-
-def _with_texts(narrow: Table, columns: Sequence[str], texts: Sequence[str]) -> Table:
-    """A table with more columns and the text of some, see `_text`."""
-    used = [*(narrow.used or ()), *columns]
-    if narrow.columnar:
-        return narrow.of([*used, *texts], narrow.raw)
-    return narrow.of(used, [*narrow.raw, *texts])
+    return narrow.with_texts([name for name in kinds if name not in texts], texts)
 
 
 def _make_feedback(
@@ -211,8 +198,8 @@ def _make_feedback(
         ]
         values = [f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in has]
         requests = [names[_REQUEST]] if _REQUEST in names else []
-        values.append(f"{_text(whole, requests[0]) if requests else 'NULL'} AS {_REQUEST}")
-        source = _with_texts(narrow, [name for _, name in has], requests)
+        values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
+        source = narrow.with_texts([name for _, name in has], requests)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
     conditions = ["true"] if mapping.where is None else [WANTED]

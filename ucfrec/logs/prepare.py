@@ -289,7 +289,7 @@ def prepared_log(
 
                 log, batches = sorted_with_spark(*typed, known, scratch, options.spark_master)
             else:
-                log = typed_log(*typed, spill, text_ids(onto))
+                log = typed_log(*typed, spill, text_ids(onto or like))
                 with explained(connection, log.tables, spill):
                     batches = sorted_batches(log, known, scratch)
             with explained(connection, log.tables, spill):

@@ -42,6 +42,8 @@ ISO_TIME: Final = (
 """Times that have one meaning: the year comes first."""
 PANDAS_INDEX: Final = re.compile(r"__index_level_\d+__")
 """Column in which pandas keeps the numbers of the rows of a frame: no data."""
+_NO_VALUE: Final = "__HIVE_DEFAULT_PARTITION__"
+"""Value of a column in the name of a folder whose rows have none."""
 _FILE: Final = "ucfrec: file"
 _RAW: Final = "ucfrec: text of "
 
@@ -75,6 +77,17 @@ class Table:
     def of(self, used: Iterable[str], raw: Iterable[str] = ()) -> "Table":
         """The same table with some of its columns, so that others cost nothing."""
         return replace(self, used=tuple(dict.fromkeys(used)), raw=tuple(dict.fromkeys(raw)))
+
+    def with_texts(self, used: Iterable[str], texts: Iterable[str]) -> "Table":
+        """The same table with more columns, and with those that `text_of` needs."""
+        used = [*(self.used or ()), *used]
+        if self.columnar:
+            return self.of([*used, *texts], self.raw)
+        return self.of(used, [*self.raw, *texts])
+
+    def text_of(self, name: str) -> str:
+        """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
+        return f"CAST({quoted(name if self.columnar else raw_name(name))} AS VARCHAR)"
 
     @property
     def sql(self) -> str:
@@ -110,8 +123,9 @@ class Table:
         kinds = {name: "VARCHAR" if kind == NOTHING else kind for name, kind in kinds.items()}
         types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in kinds.items())
         given = f", types = {{{types}}}" if types else ""
-        # DuckDB would take quotes for text if the first rows have none.
-        options += ", quote = '\"', escape = '\"'"
+        # DuckDB would take quotes for text if the first rows have none, and sometimes leave out
+        # lines that begin with #.
+        options += ", quote = '\"', escape = '\"', comment = ''"
         return f"read_csv([{files}], header = true, {options}{given})"
 
 
@@ -124,7 +138,7 @@ def _of_folder(name: str, kind: str = "VARCHAR") -> str:
     """SQL of the value of a column in the name of a folder."""
     pattern = f"(?:^|[/\\\\]){re.escape(name)}=([^/\\\\]*)[/\\\\]"
     value = f"url_decode(regexp_extract({quoted(_FILE)}, {text(pattern)}, 1))"
-    return f"CAST(nullif({value}, '__HIVE_DEFAULT_PARTITION__') AS {kind})"
+    return f"CAST(nullif({value}, {text(_NO_VALUE)}) AS {kind})"
 
 
 def _computed_as(kind: str) -> str:
@@ -260,7 +274,8 @@ def _with_whole_numbers(tables: list[Table]) -> list[Table]:
         for part in file.parts[:-1]
         if "=" in part.strip("=")
     ]
-    words = {name for name, value in folders if not re.fullmatch(r"0|-?[1-9]\d{0,17}", value)}
+    whole = rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}"
+    words = {name for name, value in folders if not re.fullmatch(whole, value)}
     return [
         replace(
             table,

@@ -79,7 +79,9 @@ def text_time(
             "written with --time-format, e.g. '%d %b %Y %H:%M'"
         )
     number = f"TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT)"
-    plain = f"replace(replace(trim({sql}), '/', '-'), ',', '.')"
+    plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
+    # DuckDB reads no zone after a blank.
+    plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
     time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
     if not found.iso:
         return number

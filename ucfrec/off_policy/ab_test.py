@@ -254,10 +254,11 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
 def _rows(tables: Sequence[Table], column: str) -> str:
     """SQL of the rows: `who`, `arm` and `value`, NULL where there is none."""
     return " UNION ALL BY NAME ".join(
-        f"SELECT nullif(CAST({schema.USER_ID} AS VARCHAR), '') AS who, "
-        f"nullif(CAST({schema.ARM} AS VARCHAR), '') AS arm, "
-        f"CAST({quoted(column)} AS DOUBLE) AS value FROM {table.sql}"
+        f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
+        f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
+        f"CAST({quoted(column)} AS DOUBLE) AS value FROM {read.sql}"
         for table in tables
+        for read in [table.with_texts([column], (schema.USER_ID, schema.ARM))]
     )
 
 

@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> None:
     about = rows[0].conditions
     print(f"{'liked':<16}{about['liked']}: {about['liked_share']:.1%} of the steps")
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
-    if (lost := about["out_of_reach"]) > 0:
+    if lost := float(about["out_of_reach"] or 0):
         print(
             f"{lost:.1%} of the steps show an item that the user has seen, which is left out: "
             f"hit_rate_shown is at most {1 - lost:.3g}; --keep-seen ranks these items too"

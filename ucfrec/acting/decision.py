@@ -94,12 +94,15 @@ class DecisionRule:
 
     def __str__(self) -> str:
         target = "the largest return expected" if self.target is None else f"{self.target:g}"
-        parts = [f"target {target}"]
-        if self.minimum_target is not None:
+        parts = [f"target {target}"] if self.policy_weight else []
+        if self.minimum_target is not None and self.policy_weight:
             parts.append(f"at least {self.minimum_target:g} at every step")
         parts += [f"reward weight {self.reward_weight:g}"] if self.reward_weight else []
         parts += [f"lookahead {self.lookahead:g}"] if self.lookahead else []
-        parts += [f"policy weight {self.policy_weight:g}"] if self.policy_weight != 1 else []
+        if not self.policy_weight:
+            parts.append("policy weight 0 (the policy has no effect)")
+        elif self.policy_weight != 1:
+            parts.append(f"policy weight {self.policy_weight:g}")
         parts += [f"the {self.top_k} best"] if self.top_k else []
         parts += ["unseen items"] if self.exclude_seen else []
         parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []

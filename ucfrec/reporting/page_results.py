@@ -180,7 +180,7 @@ def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
     chosen = [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]
     if chosen:
         curves.append(("chosen rule", 1, dict(chosen[:1])))
-    title = "Estimated value against evidence"
+    title = "Value in the search for a rule, against evidence"
     chart = line_chart(title, "effective users of the log", curves)
-    head = ["estimated value", "effective users", "off-policy interval"]
+    head = ["value in the search", "effective users", "off-policy interval"]
     return chart, Table(title, "rule", head, body)

@@ -185,7 +185,27 @@ def test_logs_of_only_new_ids_are_noted(grown: Path, tmp_path: Path, name: str) 
         append_logs(grown / "store", [tmp_path / "strange.parquet"], tmp_path / "grown")
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
-        append_logs(grown / "store", [grown / "later.parquet"], tmp_path / "usual")
+        mapping = later_mapping(grown)
+        append_logs(grown / "store", [grown / "later.parquet"], tmp_path / "usual", mapping)
+
+
+def test_new_ids_without_features_are_noted(grown: Path, tmp_path: Path) -> None:
+    logs, old = [grown / "later.parquet"], tagged_mapping(tmp_path)
+    items = rf"items\.parquet: {NEW} of {NEW} new items have no row.*embeddings say nothing"
+    users = rf"users\.parquet: {NEW} of {NEW} new users have no row"
+    with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match=users):
+        append_logs(grown / "store", logs, tmp_path / "old", old)
+    items = rf"store was prepared with item features and none .* all {NEW} new items .* --mapping"
+    with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match="all 6 new users"):
+        append_logs(grown / "store", logs, tmp_path / "none")
+
+
+def test_a_store_without_features_needs_none_for_new_ids(tmp_path: Path) -> None:
+    store_of(tagged_log(), tmp_path)
+    later_log().to_parquet(tmp_path / "later.parquet")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])

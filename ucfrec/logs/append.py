@@ -16,18 +16,21 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from safetensors import safe_open
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
+from ucfrec.logs.feature_tables import note_lacking
 from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.prepare import PreparedLog, PrepareOptions, prepared_log
+from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, prepared_log
 from ucfrec.progress import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
@@ -100,6 +103,7 @@ def append_logs(
     ):
         _require_held_out(found.rows.log.name, found.report)
         _note_new_ids(found, store)
+        _note_lacking(found, mapping, store, old)
         return _Grown(store, old, found, options.window_ms).write(folder, made_of)
 
 
@@ -161,6 +165,27 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
         # New ids are usual here; only logs without any old one may be written in another way.
         if new == ids:
             note_unknown(log.name, name, new, ids, f"of {store}")
+
+
+def _note_lacking(found: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord) -> None:
+    """Note the new users and items of which no feature table says anything."""
+    log, had = found.rows.log, _features_of(store, old)
+    for name, table, file in ID_TABLES:
+        before = pq.read_metadata(store / file).num_rows
+        new = (
+            f"SELECT {name} FROM kept_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
+        )
+        given = feature_tables(mapping)[name], found.features[name]
+        note_lacking(log.connection, *given, name, new, str(store) if name in had else "")
+
+
+def _features_of(store: Path, old: StoreRecord) -> set[str]:
+    """Id columns with feature tables; stores of earlier releases show only some in their states."""
+    with safe_open(store / ITEM_STATES, framework="numpy") as states:
+        shapes = {name: states.get_slice(name).get_shape() for name in states.keys()}  # noqa: SIM118
+    found = {schema.ITEM_ID} if "tags" in shapes else set()
+    found |= {schema.USER_ID} if shapes["user_features"][1] else set()
+    return found | {*old.source.features}
 
 
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:

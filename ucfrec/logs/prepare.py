@@ -309,12 +309,13 @@ def prepared_log(
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like, onto)
-                _require_known_ids(log, mapping, features)
+                _require_known_ids(log, mapping, features, noted=onto is None)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
                 report |= {"min_steps": options.min_steps, "max_session": options.max_session}
                 report |= _remembered(mapping)
+                report["features"] = [name for name, names in features.items() if names]
                 stage.update()
         yield PreparedLog(rows, spool, cut, measures, features, report, scratch)
 
@@ -357,7 +358,7 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
         return {}
     return {
         name: load_features(log.connection, tables, name, log.id_type(name))
-        for name, tables in _feature_tables(mapping).items()
+        for name, tables in feature_tables(mapping).items()
         if name in log.columns
     }
 
@@ -371,7 +372,8 @@ def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
     }
 
 
-def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+    """Id column to the feature tables of a mapping."""
     return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
 
 
@@ -393,12 +395,12 @@ def _require_probabilities(log: TypedLog, measures: Measures) -> None:
         )
 
 
-def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:
+def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features, noted: bool) -> None:
     """Check that feature tables are about users and items of the log; after `number_ids`."""
     kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
     for name, names in features.items():
-        tables = _feature_tables(mapping)[name]
-        require_known_ids(log.connection, tables, names, name, kept[name])
+        tables = feature_tables(mapping)[name]
+        require_known_ids(log.connection, tables, names, name, kept[name], noted)
 
 
 def _other_inputs(

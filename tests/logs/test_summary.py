@@ -179,3 +179,15 @@ def test_a_condition_comes_from_the_command_or_the_mapping(
     left_out = validate([path], mapping)["dropped"]["left_out"]
     assert 1500 < left_out < 2500
     assert f"dropped: left_out  {left_out:,}  does not fulfil --where" in shown
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path, name: str) -> None:
+    log = make_log(200).assign(member=[None, "M1", "M9", "M2"] * 50)
+    path, where = write(log, tmp_path, name), "member <> 'M9'"
+    (note,) = notes_of(path, LogMapping(where=where))
+    assert f"{name}: the condition {where} is neither true nor false in 50 of 200 rows" in note
+    assert "IS DISTINCT FROM" in note
+    for defined in ("member IS DISTINCT FROM 'M9'", f"coalesce({where}, true)"):
+        assert not notes_of(path, LogMapping(where=defined))
+        assert validate([path], LogMapping(where=defined))["dropped"]["left_out"] == 50

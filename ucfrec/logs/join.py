@@ -19,6 +19,7 @@ from ucfrec.logs.engine import BATCH_ROWS, engine
 from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.summary import note_undefined
 from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
 from ucfrec.logs.typed import WANTED, typed_columns
 
@@ -253,6 +254,8 @@ def _make_feedback(
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
     conditions = ["true"] if mapping.where is None else [WANTED]
+    if mapping.where is not None:
+        note_undefined(connection, tables, mapping.where)
     if mapping.earliest is not None:
         conditions.append(f"timestamp >= {int(mapping.earliest_ms)}")
     connection.execute(

@@ -58,8 +58,10 @@ from ucfrec.logs.spool import Spool
 from ucfrec.logs.summary import (
     build_report,
     note_bots,
+    note_empty_splits,
     note_equal_times,
     note_losses,
+    note_one_item,
     require_variety,
 )
 from ucfrec.logs.tables import open_tables
@@ -299,12 +301,16 @@ def prepared_log(
                 if like is None and onto is None:
                     require_variety(rows)
                     note_unread_features(files, mapping)
-                note_equal_times(rows)
+                note_equal_times(rows, mapping.columns.get(schema.TIMESTAMP, schema.TIMESTAMP))
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
                 _require_probabilities(log, measures)
+                if like is None and onto is None:
+                    note_one_item(rows, measures)
+                    if len(options.split) == 2:
+                        note_empty_splits(rows, cut, measures)
                 note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)

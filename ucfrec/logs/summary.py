@@ -228,14 +228,43 @@ def note_undefined(
         )
 
 
-def note_equal_times(rows: SortedRows) -> None:
-    """Warn of a log in which many rows share their user and time."""
+def note_equal_times(rows: SortedRows, time: str) -> None:
+    """Warn of a log in which many rows share their user and time.
+
+    Args:
+        time: expression over the columns of the files that gives the times.
+    """
     if rows.tied > MANY * len(rows.clean):
         _note(
             rows,
             f"{rows.tied / len(rows.clean):.0%} of the rows share their time with another row of "
-            "the user, so their order is unknown and is not learned; log finer times if there are "
-            "any",
+            "the user, so their order is unknown and is not learned; log finer times, or add the "
+            f'place on a page: --column "timestamp={time} + position" for milliseconds, --column '
+            f'"timestamp={time} + to_milliseconds(position)" for dates',
+        )
+
+
+def note_one_item(rows: SortedRows, measures: Measures) -> None:
+    """Warn of a log that shows the same item everywhere."""
+    if rows.log.key == schema.ITEM_ID and np.count_nonzero(measures.item_steps) == 1:
+        _note(
+            rows,
+            f"all {measures.steps:,} rows show the same item, so there is nothing to choose "
+            "between; check --column item_id and --where",
+        )
+
+
+def note_empty_splits(rows: SortedRows, cut: Cut, measures: Measures) -> None:
+    """Warn of times of a split that leave a part of the log without rows."""
+    names = [name for name, (_, steps) in zip(schema.SPLITS, measures.splits, strict=True)
+             if not steps]  # fmt: skip
+    if names:
+        begin, end = (_clock(time) for time in (measures.first_ms, measures.last_ms))
+        _note(
+            rows,
+            f"--split {','.join(_clock(time) for time in cut.bounds)} leaves no rows for "
+            f"{' and '.join(names)}: the rows are from {begin} to {end} UTC; give times between "
+            "these, or three shares",
         )
 
 

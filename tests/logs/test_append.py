@@ -1,6 +1,7 @@
 """A grown store has all rows of its logs once, with the old numbers, and reads no old log."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,14 @@ def test_the_same_logs_count_once(grown: Path, tmp_path: Path) -> None:
     assert rows_of(tmp_path / "third") == rows_in(tagged_log(), later_log(), later_log(seed=2))
     with pytest.raises(InputError, match="store of other logs"):
         append_logs(grown / "store", both, grown / "grown", mapping)
+    other = "grown is a store of other feature tables in the mapping and of another window; give"
+    with pytest.raises(InputError, match=other):
+        append_logs(grown / "store", logs, grown / "grown", None, AppendOptions(window_ms=9))
+    other = replace(mapping, where="reward > 0")
+    with pytest.raises(InputError, match="store of other columns or conditions in the mapping"):
+        append_logs(grown / "store", logs, grown / "grown", other)
+    with pytest.raises(InputError, match="is a store that no update made"):
+        append_logs(grown / "store", logs, grown / "store", mapping)
 
 
 @settings(max_examples=8)

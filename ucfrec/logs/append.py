@@ -38,6 +38,16 @@ SPLIT: Final = (0.6, 0.2, 0.2)
 _FILL: Final = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
 
+_PARTS: Final = {
+    "onto": "another run's store",
+    "logs": "other logs",
+    "mapping": "other columns or conditions in the mapping",
+    "features": "other feature tables in the mapping",
+    "window_ms": "another window",
+    "split": "another split",
+}
+"""What a grown store depends on, and how a message names it where it differs."""
+
 
 @dataclass(frozen=True)
 class AppendOptions:
@@ -126,9 +136,11 @@ def _made_of(
 ) -> dict[str, Any]:
     """What the grown store depends on, to know it again."""
     tables = (*mapping.item_features, *mapping.user_features)
+    given = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
     return {
         "onto": old.fingerprint,
         "logs": [file_checksum(file) for file in files],
+        "mapping": {name: str(text) for name, text in given.items() if text is not None},
         "features": [file_checksum(file) for table in tables for file in log_files(table.files)],
         "window_ms": options.window_ms,
         "split": list(options.split),
@@ -191,9 +203,15 @@ def _features_of(store: Path, old: StoreRecord) -> set[str]:
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     """The report on a store that is there already."""
     others = StoreRecord.read(out).source.others
-    if others.get("made_of") != made_of:
+    if "made_of" not in others:
+        raise InputError(f"{out} is a store that no update made; name another folder")
+    # Stores of earlier releases do not say which columns the mapping had.
+    made = {**made_of, **others["made_of"]}
+    other = [name for key, name in _PARTS.items() if made[key] != made_of[key]]
+    if other:
         raise InputError(
-            f"{out} is a store of other logs, or of another window; name another folder"
+            f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "
+            "another folder"
         )
     report = dict(others["appended"])
     _require_held_out(str(out), report)

@@ -6,7 +6,11 @@ cd /srv/ucfrec
 day=$(date -u -d yesterday +%F)
 new="runs/$day"
 shown="shown/exposures-${day//-/}T*.parquet"
-ucfrec join "$shown" "clicks/$day.parquet" --within 30m --out "logs/$day.parquet"
+clicks=("clicks/$day.parquet")
+# What was shown before midnight is clicked after it, too.
+next="clicks/$(date -u -d "$day + 1 day" +%F).parquet"
+[ -e "$next" ] && clicks+=("$next")
+ucfrec join "$shown" "${clicks[@]}" --within 30m --out "logs/$day.parquet"
 # The server excludes items that users have seen.
 ucfrec update runs "logs/$day.parquet" --mapping shop.toml --window 60d --filter-seen --out "$new"
 ucfrec report "$new" --out "$new.html"

@@ -238,7 +238,7 @@ def test_the_systemd_units_are_sound() -> None:
 def test_the_retraining_script_calls_commands_that_exist() -> None:
     script = ROOT / "deploy" / "retrain.sh"
     assert subprocess.run(["bash", "-n", str(script)], check=False).returncode == 0
-    text = script.read_text(encoding="utf-8").replace('"${training[@]}"', "a.parquet b.parquet")
+    text = script.read_text(encoding="utf-8").replace('"${clicks[@]}"', "a.parquet b.parquet")
     commands = [line for line in text.splitlines() if line.startswith("ucfrec ")]
     assert len(commands) == 4
     for command in commands:

@@ -367,6 +367,11 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     while len({*moves}) == len(moves):
         moves.append(choose_by_simulation(replace(given, start=moves[-1])).rule)
     assert moves[-1] == moves[-2]
+    # Where the log supports none, it stays: nothing says that a neighbour is better.
+    unsupported = replace(config, least_impressions=10_000)
+    stays = choose_by_simulation(replace(given, start=bad, config=unsupported))
+    assert stays.rule == bad
+    assert "supports no candidate, so the rule of the earlier run stays" in stays.warning
     ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
     rules = [*near(ahead, given)]
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}

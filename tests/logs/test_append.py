@@ -1,6 +1,7 @@
 """A grown store has all rows of its logs once, with the old numbers, and reads no old log."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,14 @@ def test_the_same_logs_count_once(grown: Path, tmp_path: Path) -> None:
     assert rows_of(tmp_path / "third") == rows_in(tagged_log(), later_log(), later_log(seed=2))
     with pytest.raises(InputError, match="store of other logs"):
         append_logs(grown / "store", both, grown / "grown", mapping)
+    other = "grown is a store of other feature tables in the mapping and of another window; give"
+    with pytest.raises(InputError, match=other):
+        append_logs(grown / "store", logs, grown / "grown", None, AppendOptions(window_ms=9))
+    other = replace(mapping, where="reward > 0")
+    with pytest.raises(InputError, match="store of other columns or conditions in the mapping"):
+        append_logs(grown / "store", logs, grown / "grown", other)
+    with pytest.raises(InputError, match="is a store that no update made"):
+        append_logs(grown / "store", logs, grown / "store", mapping)
 
 
 @settings(max_examples=8)
@@ -185,7 +194,27 @@ def test_logs_of_only_new_ids_are_noted(grown: Path, tmp_path: Path, name: str) 
         append_logs(grown / "store", [tmp_path / "strange.parquet"], tmp_path / "grown")
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
-        append_logs(grown / "store", [grown / "later.parquet"], tmp_path / "usual")
+        mapping = later_mapping(grown)
+        append_logs(grown / "store", [grown / "later.parquet"], tmp_path / "usual", mapping)
+
+
+def test_new_ids_without_features_are_noted(grown: Path, tmp_path: Path) -> None:
+    logs, old = [grown / "later.parquet"], tagged_mapping(tmp_path)
+    items = rf"items\.parquet: {NEW} of {NEW} new items have no row.*embeddings say nothing"
+    users = rf"users\.parquet: {NEW} of {NEW} new users have no row"
+    with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match=users):
+        append_logs(grown / "store", logs, tmp_path / "old", old)
+    items = rf"store was prepared with item features and none .* all {NEW} new items .* --mapping"
+    with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match="all 6 new users"):
+        append_logs(grown / "store", logs, tmp_path / "none")
+
+
+def test_a_store_without_features_needs_none_for_new_ids(tmp_path: Path) -> None:
+    store_of(tagged_log(), tmp_path)
+    later_log().to_parquet(tmp_path / "later.parquet")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)
+        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])

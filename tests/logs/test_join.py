@@ -196,12 +196,44 @@ def test_numbers_in_a_parquet_column_of_text_are_not_left_out_without_a_word(
         joined_files(tmp_path, given)
 
 
-@pytest.mark.parametrize("values", [["DE", "FR"], ["a7", "b", "12"], ["view", "view"], ["", ""]])
-def test_words_are_left_out_without_a_note(tmp_path: Path, values: list[str]) -> None:
+@pytest.mark.parametrize("values", [["DE", "FR"], ["a7", "b", "12"], ["view", "view"]])
+def test_words_are_left_out_with_one_note(tmp_path: Path, values: list[str]) -> None:
+    rows = csv("word,position,click", *(f"{word},9,1" for word in values))
+    with pytest.warns(InputNote) as notes:
+        report, log = joined_files(tmp_path, rows)
+    (note,) = (str(each.message) for each in notes)
+    assert "0.csv: columns are left out: position (of the exposures, too), word (text); " in note
+    assert report.columns == ("click",)
+    assert log.position.tolist() == [1, 2, 1, 1]
+
+
+def test_a_csv_column_of_text_without_a_value_is_left_out_without_a_note(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
-        report, _ = joined_files(tmp_path, csv("word,click", *(f"{word},1" for word in values)))
+        report, _ = joined_files(tmp_path, csv("word,click", ",1", ",1"))
     assert report.columns == ("click",)
+
+
+def test_a_log_of_a_join_is_joined_with_more_feedback(tmp_path: Path) -> None:
+    clicks = feedback([(1, 10, 7, 1, 3), (1, 10, 8, 1, 1), (2, 10, 6, 1, 4)], "seconds")
+    _, first = joined(tmp_path, clicks.rename(columns={"click": "row"}))
+    first = first.assign(page="home", Free=[True, False, True, False])
+    first.to_parquet(tmp_path / "first.parquet")
+    bought = feedback([(1, 10, 7, 1, 2), (1, 11, 7, 1, 9)], "Seconds")
+    bought.rename(columns={"click": "bought"}).to_parquet(tmp_path / "bought.parquet")
+    files = [tmp_path / "first.parquet"], [tmp_path / "bought.parquet"]
+    report = join_feedback(*files, tmp_path / "both.parquet", 30 * MINUTE)
+    both = pd.read_parquet(tmp_path / "both.parquet")
+    assert (report.matched, report.with_feedback) == (2, 2)
+    assert both.feedback.tolist() == [0, 1, 3, 1]
+    assert both.Seconds.tolist() == [0, 9, 3, 4]
+    assert both.bought.tolist() == [0, 1, 1, 0]
+    assert both.row.tolist() == [0, 0, 1, 1]
+    assert both.page.tolist() == ["home"] * 4
+    assert both.Free.tolist() == [True, False, True, False]
+    assert [*both] == [
+        *[*first][:-5], "row", "page", "Free", "feedback", "bought", "Seconds"
+    ]  # fmt: skip
 
 
 def test_a_parquet_column_of_text_without_a_value_is_left_out_without_a_note(

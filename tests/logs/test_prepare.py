@@ -609,6 +609,27 @@ def test_a_mapping_is_read_from_toml(tmp_path: Path) -> None:
         read_mapping(tmp_path / "bad.toml")
 
 
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ("[[items_features]]\nkey = 'x'", "there is no key 'items_features'; did you mean 'item_"),
+        ("zzz = 1", "there is no key 'zzz'; the keys are columns, reward, session_by, item_feat"),
+        ("remembered = 1", "there is no key 'remembered'; the keys are"),
+        (
+            "[[item_features]]\nfile = ['x']\nkey = 'x'",
+            r"\[\[item_features\]\]: there is no key 'file'; did you mean 'files'\? The keys are "
+            "files, key, columns, first_by",
+        ),
+        ("[[user_features]]\nfiles = ['x']", "it has no key 'key'; add it"),
+        ("[item_features]\nfiles = ['x']", r"write \[\[item_features\]\] in double brackets"),
+    ],
+)
+def test_a_key_that_a_mapping_does_not_have_is_named(tmp_path: Path, lines: str, told: str) -> None:
+    (tmp_path / "bad.toml").write_text(f"{lines}\n")
+    with pytest.raises(InputError, match=rf"bad\.toml.*{told}"):
+        read_mapping(tmp_path / "bad.toml")
+
+
 @pytest.mark.parametrize("given", ["gpa", "Gap", "", "visit", 3, ["gap"]])
 def test_sessions_of_a_mapping_are_formed_in_a_known_way(tmp_path: Path, given: Any) -> None:
     """An unknown one had made one session of each user."""

@@ -11,7 +11,7 @@ import pytest
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.mapping import LogMapping, read_mapping
-from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 
 START = 1_700_000_000_000
 
@@ -179,3 +179,52 @@ def test_a_condition_comes_from_the_command_or_the_mapping(
     left_out = validate([path], mapping)["dropped"]["left_out"]
     assert 1500 < left_out < 2500
     assert f"dropped: left_out  {left_out:,}  does not fulfil --where" in shown
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_rows_in_which_the_condition_is_undefined_are_told_of(tmp_path: Path, name: str) -> None:
+    log = make_log(200).assign(member=[None, "M1", "M9", "M2"] * 50)
+    path, where = write(log, tmp_path, name), "member <> 'M9'"
+    (note,) = notes_of(path, LogMapping(where=where))
+    assert f"{name}: the condition {where} is neither true nor false in 50 of 200 rows" in note
+    assert "IS DISTINCT FROM" in note
+    for defined in ("member IS DISTINCT FROM 'M9'", f"coalesce({where}, true)"):
+        assert not notes_of(path, LogMapping(where=defined))
+        assert validate([path], LogMapping(where=defined))["dropped"]["left_out"] == 50
+
+
+def test_a_log_of_a_single_item_is_told_of(tmp_path: Path) -> None:
+    (note,) = notes_of(write(make_log(200).assign(item_id=7), tmp_path))
+    assert "all 200 rows show the same item, so there is nothing to choose between" in note
+
+
+@pytest.mark.parametrize(
+    ("split", "empty"),
+    [("2030-01-01,2030-01-02", "validation and test"), ("2023-11-16,2023-11-16", "validation")],
+)
+def test_a_split_that_leaves_a_part_without_rows_is_told_of(
+    tmp_path: Path, split: str, empty: str
+) -> None:
+    path = write(make_log(), tmp_path)
+    (note,) = notes_of(path, split=parse_split(split))
+    assert f"--split {split[:10]} 00:00:00," in note
+    assert f"leaves no rows for {empty}: the rows are from 2023-11-14 22:13:20 to" in note
+    assert not notes_of(path, split=parse_split("2023-11-16,2023-11-17"))
+    assert not notes_of(path, split=(0.8, 0.2, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    [("int", "position"), ("date", "to_milliseconds(position)"), ("zone", "to_milliseconds(pos")],
+)
+def test_the_remedy_for_rows_of_one_page_works(tmp_path: Path, kind: str, place: str) -> None:
+    log = make_log().rename(columns={"timestamp": "shown_at"})
+    log["position"], log["user_id"] = np.arange(4000) % 4, np.arange(4000) // 4
+    log["shown_at"] = START + 200_000 * (np.arange(4000) // 4)
+    if kind != "int":
+        log["shown_at"] = pd.to_datetime(log.shown_at, unit="ms", utc=kind == "zone")
+    path = write(log, tmp_path)
+    (note,) = notes_of(path, LogMapping({"timestamp": "shown_at"}))
+    remedies = re.findall(r'--column "timestamp=(.*?)"', note)
+    (remedy,) = (each for each in remedies if f" + {place}" in each)
+    assert not notes_of(path, LogMapping({"timestamp": remedy}))

@@ -104,6 +104,11 @@ def test_the_command_says_what_was_read_and_what_is_better(
     assert record.update is not None
     assert record.update.verdict is not None
     assert record.update.verdict.steps == 75
+    old = TrainedPolicy.load(folder / "run").rule
+    assert record.rule is not None
+    changed = f"rule changed  {old} → {record.rule.rule}" if record.rule.rule != old else ""
+    assert changed in said
+    assert ("rule changed" in said) == bool(changed)
     assert main([*arguments[:5], "--window", "soon"]) == 2
     assert "--window soon is not a duration" in capsys.readouterr().err
 

@@ -108,3 +108,14 @@ def test_what_was_served_without_seen_items_is_compared_without_them(
     wrong, right = (compare_runs(uniform, uniform, rows, 0, each) for each in (None, seen))
     assert "update with --filter-seen" in describe(wrong)
     assert "mean weight" not in describe(right)
+
+
+def test_a_difference_among_few_users_is_doubted(trained: TrainedPolicy) -> None:
+    rule = DecisionRule(trained.rule.target, temperature=0.3)
+    good, bad = replace(trained, rule=rule), replace(reversed_of(trained), rule=rule)
+    rows = EpisodeStore.open(trained.folder.parent / "store").split("test")
+    users = rows.episode_values("user")
+    few = rows.select(np.flatnonzero(users < np.unique(users)[9]))
+    found = verdict(good, bad, few)
+    assert (found.result, found.users) == ("no significant difference", 9)
+    assert all("fewer than 10, have such rows" in each.doubt for each in found.differences)

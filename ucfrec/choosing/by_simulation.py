@@ -183,28 +183,36 @@ class RuleSearch:
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
-        """The best and those of the highest value among the allowed, in more sessions."""
+        """The best, the rule that the choice starts from, and those of the highest value among the
+        allowed, in more sessions."""
         allowed = [each for each in candidates if self.allowed(each)]
         highest = sorted(allowed, key=_value, reverse=True)
-        rules = dict.fromkeys(each.rule for each in (best, *highest))
+        first = (best, *self.started(candidates))
+        rules = dict.fromkeys(each.rule for each in (*first, *highest))
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The allowed candidates that cannot be told apart from the best: within the standard error
         of the difference over pairs of sessions, or the tolerance.
 
-        If the log can evaluate none, all that it supports are allowed; if it supports none, the one
-        with the most effective items.
+        If the log can evaluate none, all that it supports are allowed; if it supports none, the
+        rule that the choice starts from, or the one with the most effective items.
         """
         allowed = [each for each in candidates if self.allowed(each)]
         allowed = allowed or [each for each in candidates if self.supported(each)]
         if not allowed:
+            if start := self.started(candidates):
+                return start
             return [max(candidates, key=lambda each: each.items)]
         top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
         return [
             each for each in allowed if top.value - each.value <= max(least, self._error(top, each))
         ]
+
+    def started(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
+        """The rule that the choice starts from, if it is a candidate."""
+        return [each for each in candidates if each.rule == self.problem.start]
 
     def _error(self, one: SimulatedRule, other: SimulatedRule) -> float:
         """Standard error of the difference of their values; sessions draw the same numbers."""
@@ -221,7 +229,7 @@ class RuleSearch:
         or the one with the most support in the log: effective users, or without propensities the
         likelihood; then the most hits."""
         level = self.level(candidates)
-        level = [each for each in level if each.rule == self.problem.start] or level
+        level = self.started(level) or level
         known = [each for each in level if each.evidence is not None]
         lacking = [each for each in level if each.evidence is None]
         known += [replace(one, evidence=each) for one, each in self._with_evidence(lacking)]
@@ -350,7 +358,10 @@ def _all(search: RuleSearch) -> list[SimulatedRule]:
 def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -> str:
     said, logged = [], float(search.problem.train.returns.mean())
     if not search.supported(best):
-        said.append("the log supports no candidate, this one shows the most different items")
+        why = "this one shows the most different items"
+        if best.rule == search.problem.start:
+            why = "so the rule of the earlier run stays"
+        said.append(f"the log supports no candidate, {why}")
     elif not search.allowed(best):
         said.append(
             f"no candidate leaves {search.least_users:g} effective users of the log with weights "

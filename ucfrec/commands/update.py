@@ -74,7 +74,8 @@ def run(options: argparse.Namespace) -> None:
     run = options.run
     if not (run / RUN).is_file() and (current := promoted(run)) is not None:
         run = current.run(run)
-    files, mapping = logs_given(options, TrainedPolicy.load(run))
+    old = TrainedPolicy.load(run)
+    files, mapping = logs_given(options, old)
     append = AppendOptions(
         window_ms=None if options.window is None else duration_ms("--window", options.window),
         split=SPLIT if options.split is None else parse_split(options.split),
@@ -105,6 +106,8 @@ def run(options: argparse.Namespace) -> None:
         f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows excluded"
     )
     print(record.describe())
+    if record.rule is not None and record.rule.rule != old.rule:
+        print(f"rule changed  {old.rule} → {record.rule.rule}")
     print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")
     print(f"\nrun: {options.out}")
     if update.verdict.result == "worse":

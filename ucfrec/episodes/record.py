@@ -77,6 +77,8 @@ class Source(Entry):
     sessions_cut: Count | None = None
     unknown_propensities: Count | None = None
     """Steps without a propensity; None if the logs have none at all."""
+    features: tuple[Text, ...] = ()
+    """Id columns whose users or items had feature tables."""
     time_range_ms: tuple[Milliseconds, Milliseconds] | None = None
     """First and last time."""
     split_times_ms: tuple[Milliseconds, Milliseconds] | None = None

@@ -16,24 +16,37 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from safetensors import safe_open
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
+from ucfrec.logs.feature_tables import note_lacking
 from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.prepare import PreparedLog, PrepareOptions, prepared_log
+from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, prepared_log
 from ucfrec.progress import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
 _FILL: Final = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
+
+_PARTS: Final = {
+    "onto": "another run's store",
+    "logs": "other logs",
+    "mapping": "other columns or conditions in the mapping",
+    "features": "other feature tables in the mapping",
+    "window_ms": "another window",
+    "split": "another split",
+}
+"""What a grown store depends on, and how a message names it where it differs."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +113,7 @@ def append_logs(
     ):
         _require_held_out(found.rows.log.name, found.report)
         _note_new_ids(found, store)
+        _note_lacking(found, mapping, store, old)
         return _Grown(store, old, found, options.window_ms).write(folder, made_of)
 
 
@@ -122,9 +136,11 @@ def _made_of(
 ) -> dict[str, Any]:
     """What the grown store depends on, to know it again."""
     tables = (*mapping.item_features, *mapping.user_features)
+    given = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
     return {
         "onto": old.fingerprint,
         "logs": [file_checksum(file) for file in files],
+        "mapping": {name: str(text) for name, text in given.items() if text is not None},
         "features": [file_checksum(file) for table in tables for file in log_files(table.files)],
         "window_ms": options.window_ms,
         "split": list(options.split),
@@ -163,12 +179,39 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
             note_unknown(log.name, name, new, ids, f"of {store}")
 
 
+def _note_lacking(found: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord) -> None:
+    """Note the new users and items of which no feature table says anything."""
+    log, had = found.rows.log, _features_of(store, old)
+    for name, table, file in ID_TABLES:
+        before = pq.read_metadata(store / file).num_rows
+        new = (
+            f"SELECT {name} FROM kept_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
+        )
+        given = feature_tables(mapping)[name], found.features[name]
+        note_lacking(log.connection, *given, name, new, str(store) if name in had else "")
+
+
+def _features_of(store: Path, old: StoreRecord) -> set[str]:
+    """Id columns with feature tables; stores of earlier releases show only some in their states."""
+    with safe_open(store / ITEM_STATES, framework="numpy") as states:
+        shapes = {name: states.get_slice(name).get_shape() for name in states.keys()}  # noqa: SIM118
+    found = {schema.ITEM_ID} if "tags" in shapes else set()
+    found |= {schema.USER_ID} if shapes["user_features"][1] else set()
+    return found | {*old.source.features}
+
+
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     """The report on a store that is there already."""
     others = StoreRecord.read(out).source.others
-    if others.get("made_of") != made_of:
+    if "made_of" not in others:
+        raise InputError(f"{out} is a store that no update made; name another folder")
+    # Stores of earlier releases do not say which columns the mapping had.
+    made = {**made_of, **others["made_of"]}
+    other = [name for key, name in _PARTS.items() if made[key] != made_of[key]]
+    if other:
         raise InputError(
-            f"{out} is a store of other logs, or of another window; name another folder"
+            f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "
+            "another folder"
         )
     report = dict(others["appended"])
     _require_held_out(str(out), report)

@@ -188,6 +188,7 @@ def require_known_ids(
     names: Sequence[str],
     kind: str,
     kept: str,
+    noted: bool = True,
 ) -> None:
     """Check that each feature table has a row of an id of the log; note if many ids have none.
 
@@ -195,6 +196,7 @@ def require_known_ids(
         names: of `load_features`, for each of them.
         kind: "item_id" or "user_id".
         kept: table of the log's ids, in the column `kind`.
+        noted: whether there is a note; see `note_lacking` for a store that grows.
 
     Raises:
         InputError: none of the ids of a table occurs in the log.
@@ -204,7 +206,7 @@ def require_known_ids(
             f"SELECT count(*), count(id) FROM {kept} LEFT JOIN {name} ON id = {kind}"
         ).fetchall()
         files = ", ".join(map(str, table.files))
-        if 0 < having < (1 - _MANY_LACKING) * every:
+        if noted and 0 < having < (1 - _MANY_LACKING) * every:
             warnings.warn(
                 f"{files}: {every - having:,} of {every:,} {kind}s of the log have no row; their "
                 "features count as missing",
@@ -220,6 +222,49 @@ def require_known_ids(
                 f"are {_listed(known)}, and {table.key} {theirs}; let the key be an expression "
                 "that gives the same ids, or leave the file out"
             )
+
+
+def note_lacking(
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[FeatureTable],
+    names: Sequence[str],
+    kind: str,
+    new: str,
+    lost: str,
+) -> None:
+    """Note the new ids of a store that grows which feature tables say nothing of.
+
+    Args:
+        tables: feature tables; none where none is given now.
+        names: of `load_features`, for each of them.
+        kind: "item_id" or "user_id".
+        new: SQL of the new ids of the log, in the column `kind`.
+        lost: the store, if it was made with such tables; empty otherwise.
+    """
+    every, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
+    what = "embeddings" if ids == "item" else "features"
+    remedy = "give a current table with --mapping"
+    if lost and every and not tables:
+        warnings.warn(
+            f"{lost} was prepared with {ids} features and none are given now: the {what} of all "
+            f"{every:,} new {ids}s begin at the mean; {remedy}",
+            InputNote,
+            stacklevel=3,
+        )
+    for table, name in zip(tables, names, strict=True):
+        lacking = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
+        if lacking:
+            warnings.warn(
+                f"{', '.join(map(str, table.files))}: {lacking:,} of {every:,} new {ids}s have no "
+                f"row in the {ids} features; their {what} say nothing of them; {remedy}",
+                InputNote,
+                stacklevel=3,
+            )
+
+
+def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
+    ((count,),) = connection.sql(f"SELECT count(*) FROM {rows}").fetchall()
+    return int(count)
 
 
 def _listed(rows: Sequence[tuple[object, ...]]) -> str:

@@ -34,17 +34,20 @@ def feedback_columns(
     tables: Sequence[Table],
     used: Collection[str],
     own: str,
+    shown: Collection[str],
 ) -> tuple[str, ...]:
     """Columns of numbers and truth values, each once, with a note on others that may be meant.
 
     Args:
         used: names in lower case that are none of feedback.
         own: the one that the log has itself, too.
+        shown: those of `used` that the log has of the exposures.
 
     Raises:
         InputError: a column has numbers in one file, and something else in another.
     """
     columns: dict[str, tuple[str, Table]] = {}
+    left_out: dict[str, str] = {}
     for table in tables:
         for key, name in names_of(table).items():
             if key not in used and holds_feedback(table.columns[name]):
@@ -53,7 +56,9 @@ def feedback_columns(
         others = []
         for key, name in names_of(table).items():
             kind = table.columns[name]
-            if key == own and holds_feedback(kind):
+            if key in shown:
+                left_out[name] = "of the exposures, too"
+            elif key == own and holds_feedback(kind):
                 _note_left_out(table, name, "the log has its own, the number of rows; rename it")
             elif (
                 not holds_feedback(kind)
@@ -66,6 +71,17 @@ def feedback_columns(
                 _require_numbers(words, columns[words.name.casefold()][1])
             elif words.mean_numbers:
                 _note_left_out(table, words.name, f"it is text, {words}; {_WRITE_NUMBERS}")
+            elif words.values:
+                left_out[words.name] = "text"
+    if left_out:
+        named = ", ".join(f"{name} ({why})" for name, why in left_out.items())
+        files = first_and_more([file for table in tables for file in table.files])
+        warnings.warn(
+            f"{files}: columns are left out: {named}; where one is feedback, write it as numbers "
+            "or truth values, in a column of its own name",
+            InputNote,
+            stacklevel=4,
+        )
     return tuple(name for name, _ in columns.values())
 
 

@@ -1,7 +1,7 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
@@ -19,7 +19,8 @@ from ucfrec.logs.engine import BATCH_ROWS, engine
 from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.tables import Table, open_tables, quoted
+from ucfrec.logs.summary import note_undefined
+from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
 from ucfrec.logs.typed import WANTED, typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -92,13 +93,15 @@ def join_feedback(
     the log has the largest value of every column that is a number or a truth value; where there is
     none, 0.
 
-    An `InputNote` says which columns of feedback are left out although their text seems to mean
-    numbers, and what may be wrong where no row of feedback matches.
+    An `InputNote` says which columns of feedback are left out, as they are text or have the name of
+    a column of exposures, and what may be wrong where no row of feedback matches.
 
     Args:
         exposures: files, folders and globs of `serve` and `recommend`.
         feedback: log files with `user_id`, `item_id`, `timestamp` and perhaps `request_id`.
-        out: Parquet file: the columns of the exposures, `feedback` and those of the feedback.
+        out: Parquet file: the columns of the exposures, `feedback` and those of the feedback. Where
+            the exposures are a log of this function, `feedback` counts both, and of a number that
+            both have it is the larger value.
         mapping: log columns to the columns of the feedback, and which of its rows count.
         memory_limit: of the engine; rows spill to disk.
 
@@ -116,19 +119,48 @@ def join_feedback(
         shown = tuple(open_tables(connection, files[0]))
         given = tuple(open_tables(connection, files[1], mapping.partitions))
         with explained(connection, (*shown, *given), folder):
-            _make_exposures(connection, shown)
+            kept = _make_exposures(connection, shown)
             _require_feedback(given)
             columns = _make_feedback(connection, given, mapping)
             _match(connection, within_ms)
-            _write(connection, columns, out)
+            _write(connection, columns, kept, out)
             joined = _counts(connection, columns)
             if not joined.matched:
                 warnings.warn(_why_unmatched(connection, joined), InputNote, stacklevel=2)
             return joined
 
 
-def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]) -> None:
-    """Create the table `exposures`, each once, with its `row`."""
+@dataclass(frozen=True)
+class _More:
+    """A further column of the exposures, as those of a log that was joined before."""
+
+    name: str
+    value: str
+    """Its name in the table `exposures`, so that any name is possible."""
+    is_number: bool
+    """Or a truth value, in all files that have it."""
+
+
+def _further(tables: Sequence[Table], taken: Collection[str]) -> dict[str, _More]:
+    """Further columns of the exposures, by their names in lower case.
+
+    Args:
+        taken: names in lower case of the columns that exposures have.
+    """
+    found: dict[str, _More] = {}
+    for table in tables:
+        for key, name in names_of(table).items():
+            if key not in taken:
+                one = found.get(key) or _More(name, f"more_{len(found)}", is_number=True)
+                number = one.is_number and holds_feedback(table.columns[name])
+                found[key] = replace(one, is_number=number)
+    return found
+
+
+def _make_exposures(
+    connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]
+) -> dict[str, _More]:
+    """Create the table `exposures`, each once, with its `row`; returns its further columns."""
     for table in tables:
         missing = [name for name in _EXPOSURE if name not in {*names_of(table), schema.ARM}]
         if missing:
@@ -136,9 +168,10 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
-    typed = typed_columns(connection, tuple(tables), _keys_of(LogMapping()), "0", "user")
+    typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
+    more = _further(tables, {*typed.names, *_EXPOSURE})
     rows = " UNION ALL BY NAME ".join(
-        f"SELECT {keys}, {_others(whole)} FROM {_with_others(whole, narrow).sql}"
+        f"SELECT {keys}, {_others(whole, more)} FROM {_with_others(whole, narrow, more).sql}"
         for whole, narrow, keys in zip(tables, typed.tables, typed.selects, strict=True)
     )
     connection.execute(f"CREATE TABLE given_exposures AS {rows}")
@@ -147,6 +180,7 @@ def _make_exposures(connection: duckdb.DuckDBPyConnection, tables: tuple[Table, 
         f"(ORDER BY timestamp, {_ONE_EXPOSURE}) AS row FROM given_exposures "
         f"QUALIFY row_number() OVER (PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
     )
+    return more
 
 
 def _require_feedback(tables: Sequence[Table]) -> None:
@@ -161,7 +195,7 @@ def _require_feedback(tables: Sequence[Table]) -> None:
             )
 
 
-def _others(table: Table) -> str:
+def _others(table: Table, more: Mapping[str, _More]) -> str:
     """SQL of the columns of exposures besides the keys; the arm is empty where there is none."""
     names = names_of(table)
     found = {
@@ -169,15 +203,31 @@ def _others(table: Table) -> str:
         for name, kind in _OTHERS.items()
         if name in names
     }
+    found |= {more[key].value: quoted(name) for key, name in names.items() if key in more}
     found[schema.ARM] = f"coalesce({found.get(schema.ARM, 'NULL')}, '')"
     return ", ".join(f"{value} AS {name}" for name, value in found.items())
 
 
-def _with_others(table: Table, narrow: Table) -> Table:
+def _with_others(table: Table, narrow: Table, more: Mapping[str, _More]) -> Table:
     """A table of the keys, with the columns that `_others` reads."""
     kinds = {name: _OTHERS[key] for key, name in names_of(table).items() if key in _OTHERS}
     texts = [name for name, kind in kinds.items() if kind == "VARCHAR"]
-    return narrow.with_texts([name for name in kinds if name not in texts], texts)
+    columns = [name for name in kinds if name not in texts]
+    columns += [name for key, name in names_of(table).items() if key in more]
+    return _with_texts(narrow, columns, texts)
+
+
+def _text(table: Table, name: str) -> str:
+    """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
+    return f"CAST({quoted(name if table.columnar else raw_name(name))} AS VARCHAR)"
+
+
+def _with_texts(narrow: Table, columns: Sequence[str], texts: Sequence[str]) -> Table:
+    """A table with more columns and the text of some, see `_text`."""
+    used = [*(narrow.used or ()), *columns]
+    if narrow.columnar:
+        return narrow.of([*used, *texts], narrow.raw)
+    return narrow.of(used, [*narrow.raw, *texts])
 
 
 def _make_feedback(
@@ -188,8 +238,9 @@ def _make_feedback(
     Their values are its columns `_value(0)`, …, so that any name is possible.
     """
     typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
-    used = {*_EXPOSURE, FEEDBACK, *_keys_read(connection, tables, mapping)}
-    columns = feedback_columns(connection, tables, used, FEEDBACK)
+    read = _keys_read(connection, tables, mapping)
+    used = {*_EXPOSURE, FEEDBACK, *read}
+    columns = feedback_columns(connection, tables, used, FEEDBACK, {*_OTHERS} - {_REQUEST} - read)
     selects = []
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
         names = names_of(whole)
@@ -203,6 +254,8 @@ def _make_feedback(
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
     rows = " UNION ALL BY NAME ".join(selects)
     conditions = ["true"] if mapping.where is None else [WANTED]
+    if mapping.where is not None:
+        note_undefined(connection, tables, mapping.where)
     if mapping.earliest is not None:
         conditions.append(f"timestamp >= {int(mapping.earliest_ms)}")
     connection.execute(
@@ -249,17 +302,27 @@ def _match(connection: duckdb.DuckDBPyConnection, within_ms: int) -> None:
     )
 
 
-def _write(connection: duckdb.DuckDBPyConnection, columns: Sequence[str], out: Path) -> None:
+def _write(
+    connection: duckdb.DuckDBPyConnection,
+    columns: Sequence[str],
+    more: Mapping[str, _More],
+    out: Path,
+) -> None:
     """Write the log, users as numbers if the feedback has numbers."""
     values = [_value(n) for n in range(len(columns))]
     found = ", ".join(
         ["m.row AS row", f"count(*) AS {FEEDBACK}", *(f"max({each}) AS {each}" for each in values)]
     )
-    named = zip((FEEDBACK, *values), (FEEDBACK, *columns), strict=True)
-    filled = ", ".join(f"coalesce({each}, 0) AS {quoted(name)}" for each, name in named)
+    named = dict(zip((FEEDBACK, *columns), (FEEDBACK, *values), strict=True))
+    again = {name.casefold() for name in named}
+    filled = [f"{one.value} AS {quoted(one.name)}" for k, one in more.items() if k not in again]
+    for name, each in named.items():
+        before = more.get(name.casefold())
+        filled.append(f"{_filled(each, before)} AS {quoted(name)}")
+    internal = "row", FEEDBACK, *values, *(each.value for each in more.values())
     user = "CAST(user_id AS BIGINT) AS user_id" if _whole_users(connection) else "user_id"
     query = (
-        f"SELECT {user}, * EXCLUDE (user_id, row, {', '.join((FEEDBACK, *values))}), {filled} "
+        f"SELECT {user}, * EXCLUDE (user_id, {', '.join(internal)}), {', '.join(filled)} "
         f"FROM exposures LEFT JOIN (SELECT {found} FROM matches m JOIN feedback f "
         "ON f.row = m.feedback_row GROUP BY m.row) USING (row) ORDER BY exposures.row"
     )
@@ -268,6 +331,16 @@ def _write(connection: duckdb.DuckDBPyConnection, columns: Sequence[str], out: P
         with pq.ParquetWriter(scratch, batches.schema) as writer:
             for batch in batches:
                 writer.write_batch(batch)
+
+
+def _filled(value: str, before: _More | None) -> str:
+    """SQL of a column of feedback, with what an earlier join found of it."""
+    value = f"coalesce({value}, 0)"
+    if before is None or not before.is_number:
+        return value
+    if value == f"coalesce({FEEDBACK}, 0)":
+        return f"{value} + CAST(coalesce({before.value}, 0) AS BIGINT)"
+    return f"greatest({value}, CAST(coalesce({before.value}, 0) AS DOUBLE))"
 
 
 def _whole_users(connection: duckdb.DuckDBPyConnection) -> bool:

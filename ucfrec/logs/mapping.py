@@ -1,9 +1,10 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
+import difflib
 import glob
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -237,6 +238,7 @@ def read_mapping(path: Path) -> LogMapping:
         InputError: the file is missing, is not TOML, or has an unknown field.
     """
     given = read_toml(path)
+    _require_keys(path, "", given, LogMapping)
     try:
         for name, value in given.get("columns", {}).items():
             given["columns"][name] = Expression(value, str(path))
@@ -244,6 +246,8 @@ def read_mapping(path: Path) -> LogMapping:
             if name in given:
                 given[name] = Expression(given[name], str(path))
         for kind in ("item_features", "user_features"):
+            for table in given.get(kind, []):
+                _require_keys(path, f"[[{kind}]]", table, FeatureTable)
             tables = (FeatureTable(**table) for table in given.get(kind, []))
             given[kind] = tuple(
                 replace(
@@ -258,6 +262,31 @@ def read_mapping(path: Path) -> LogMapping:
         return LogMapping(**given)
     except (AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _require_keys(path: Path, place: str, given: object, known: type) -> None:
+    """Check that a table of a mapping file has the keys of a class.
+
+    Args:
+        place: the name of the table, as it is written; empty for the file.
+
+    Raises:
+        InputError: it is no table, or has an unknown key, or lacks one.
+    """
+    if not isinstance(given, dict):
+        raise InputError(f"{path}: write {place} in double brackets, with its keys in lines below")
+    parts = [each for each in fields(known) if each.name != "remembered"]
+    names, where = [each.name for each in parts], f"{path}{place and f', {place}'}"
+    for key in given:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1)
+            meant = f"did you mean {near[0]!r}? The" if near else "the"
+            raise InputError(
+                f"{where}: there is no key {key!r}; {meant} keys are {', '.join(names)}"
+            )
+    for part in parts:
+        if part.name not in given and part.default is part.default_factory is MISSING:
+            raise InputError(f"{where}: it has no key {part.name!r}; add it")
 
 
 def _beside(mapping: Path, file: str | Path) -> Path:

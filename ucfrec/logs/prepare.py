@@ -58,8 +58,10 @@ from ucfrec.logs.spool import Spool
 from ucfrec.logs.summary import (
     build_report,
     note_bots,
+    note_empty_splits,
     note_equal_times,
     note_losses,
+    note_one_item,
     require_variety,
 )
 from ucfrec.logs.tables import open_tables
@@ -299,22 +301,27 @@ def prepared_log(
                 if like is None and onto is None:
                     require_variety(rows)
                     note_unread_features(files, mapping)
-                note_equal_times(rows)
+                note_equal_times(rows, mapping.columns.get(schema.TIMESTAMP, schema.TIMESTAMP))
                 stage.update()
                 spool, cut = _cut(rows, options, like, scratch)
                 stage.update()
                 measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
                 _require_probabilities(log, measures)
+                if like is None and onto is None:
+                    note_one_item(rows, measures)
+                    if len(options.split) == 2:
+                        note_empty_splits(rows, cut, measures)
                 note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
                 stage.update()
                 features = _features(log, mapping, like)
                 number_ids(log, measures, features, like, onto)
-                _require_known_ids(log, mapping, features)
+                _require_known_ids(log, mapping, features, noted=onto is None)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
                 report["dataset"] = options.dataset
                 report |= {"min_steps": options.min_steps, "max_session": options.max_session}
                 report |= _remembered(mapping)
+                report["features"] = [name for name, names in features.items() if names]
                 stage.update()
         yield PreparedLog(rows, spool, cut, measures, features, report, scratch)
 
@@ -357,7 +364,7 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
         return {}
     return {
         name: load_features(log.connection, tables, name, log.id_type(name))
-        for name, tables in _feature_tables(mapping).items()
+        for name, tables in feature_tables(mapping).items()
         if name in log.columns
     }
 
@@ -371,7 +378,8 @@ def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
     }
 
 
-def _feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
+    """Id column to the feature tables of a mapping."""
     return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
 
 
@@ -393,12 +401,12 @@ def _require_probabilities(log: TypedLog, measures: Measures) -> None:
         )
 
 
-def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features) -> None:
+def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features, noted: bool) -> None:
     """Check that feature tables are about users and items of the log; after `number_ids`."""
     kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
     for name, names in features.items():
-        tables = _feature_tables(mapping)[name]
-        require_known_ids(log.connection, tables, names, name, kept[name])
+        tables = feature_tables(mapping)[name]
+        require_known_ids(log.connection, tables, names, name, kept[name], noted)
 
 
 def _other_inputs(

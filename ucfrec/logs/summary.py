@@ -3,10 +3,11 @@
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
+import duckdb
 import numpy as np
 
 from ucfrec import schema
@@ -18,7 +19,7 @@ from ucfrec.logs.kept import CLOCK_HINT, DUPLICATES, REASONS
 from ucfrec.logs.measures import Distribution, Measures
 from ucfrec.logs.sessions import Cut
 from ucfrec.logs.sorted_rows import CODES, SortedRows, has_codes
-from ucfrec.logs.tables import Table, quoted, text
+from ucfrec.logs.tables import Table, first_and_more, quoted, text
 from ucfrec.logs.typed import ROWS, TypedLog
 
 CONFLICT: Final = "duplicates with a different reward from the kept row"
@@ -184,12 +185,14 @@ _REMEDIES: Final = {
 
 
 def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None:
-    """Warn of more than a fifth of the rows dropped for one reason.
+    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions.
 
     Args:
         rows: of the log; its connection is free.
         where: condition of the rows that are wanted at all.
     """
+    if where is not None and rows.dropped["left_out"]:
+        note_undefined(rows.log.connection, rows.log.tables, where)
     wanted = rows.read - rows.dropped["left_out"]
     for reason, n in rows.dropped.items():
         if n <= MANY * wanted or reason == "left_out":
@@ -203,14 +206,65 @@ def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None
         _note(rows, f"{share}: {REASONS[reason]}{which}; {_REMEDIES[reason]}")
 
 
-def note_equal_times(rows: SortedRows) -> None:
-    """Warn of a log in which many rows share their user and time."""
+def note_undefined(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], where: str
+) -> None:
+    """Warn of rows in which a condition is neither true nor false, which are excluded, too."""
+    undefined = rows = 0
+    for table in tables:
+        bound = bind(connection, table, "for --where", where)
+        asked = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
+        source = table.of(bound.columns).sql
+        ((some, every),) = connection.sql(f"SELECT {asked} FROM {source}").fetchall()
+        undefined, rows = undefined + some, rows + every
+    if undefined:
+        warnings.warn(
+            f"{first_and_more([file for table in tables for file in table.files])}: the condition "
+            f"{where} is neither true nor false in {undefined:,} of {rows:,} rows, as a column is "
+            "missing there, and these are excluded; to keep them, write IS DISTINCT FROM for <>, "
+            "or coalesce(…, true) around the condition",
+            InputNote,
+            stacklevel=3,
+        )
+
+
+def note_equal_times(rows: SortedRows, time: str) -> None:
+    """Warn of a log in which many rows share their user and time.
+
+    Args:
+        time: expression over the columns of the files that gives the times.
+    """
     if rows.tied > MANY * len(rows.clean):
         _note(
             rows,
             f"{rows.tied / len(rows.clean):.0%} of the rows share their time with another row of "
-            "the user, so their order is unknown and is not learned; log finer times if there are "
-            "any",
+            "the user, so their order is unknown and is not learned; log finer times, or add the "
+            f'place on a page: --column "timestamp={time} + position" for milliseconds, --column '
+            f'"timestamp={time} + to_milliseconds(position)" for dates',
+        )
+
+
+def note_one_item(rows: SortedRows, measures: Measures) -> None:
+    """Warn of a log that shows the same item everywhere."""
+    if rows.log.key == schema.ITEM_ID and np.count_nonzero(measures.item_steps) == 1:
+        _note(
+            rows,
+            f"all {measures.steps:,} rows show the same item, so there is nothing to choose "
+            "between; check --column item_id and --where",
+        )
+
+
+def note_empty_splits(rows: SortedRows, cut: Cut, measures: Measures) -> None:
+    """Warn of times of a split that leave a part of the log without rows."""
+    names = [name for name, (_, steps) in zip(schema.SPLITS, measures.splits, strict=True)
+             if not steps]  # fmt: skip
+    if names:
+        begin, end = (_clock(time) for time in (measures.first_ms, measures.last_ms))
+        _note(
+            rows,
+            f"--split {','.join(_clock(time) for time in cut.bounds)} leaves no rows for "
+            f"{' and '.join(names)}: the rows are from {begin} to {end} UTC; give times between "
+            "these, or three shares",
         )
 
 

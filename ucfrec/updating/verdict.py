@@ -26,6 +26,9 @@ _ERRORS: Final = 3.0
 _LEAST_STEPS: Final = 30
 """Effective steps below which weights say nothing."""
 
+_LEAST_USERS: Final = 10
+"""Users with rows below which an interval over users says nothing."""
+
 
 def compare_runs(
     new: TrainedPolicy,
@@ -143,6 +146,9 @@ def _difference(
 ) -> Difference:
     """The ratio of sums over steps (N, 1), with its interval over users."""
     low = high = value = float(above.sum() / below.sum())
+    users = len(np.unique(user[below[:, 0] > 0]))
+    if users < _LEAST_USERS:
+        doubt = f"{users} user{'s' * (users != 1)}, fewer than {_LEAST_USERS}, have such rows"
     (interval,) = cluster_intervals(above, below, user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high

@@ -6,7 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder
+from tests.support.served import (
+    FULL,
+    OBSERVED,
+    as_frame,
+    histories,
+    observed_log,
+    requests_of,
+    responder,
+)
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
@@ -30,7 +38,8 @@ def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:
 
 
 def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: object) -> pd.DataFrame:
-    batches = histories_of_frame(trained, log, LogMapping())
+    mapping = OBSERVED if "observation" in log else LogMapping()
+    batches = histories_of_frame(trained, log, mapping)
     return pd.concat(recommend(trained, batches, k, **named), ignore_index=True)  # type: ignore[arg-type]
 
 
@@ -58,6 +67,13 @@ def test_answers_are_those_of_recommend(
     pd.testing.assert_frame_equal(
         pd.concat(alone, ignore_index=True), expected, check_dtype=False, rtol=1e-5, atol=1e-6
     )
+
+
+def test_requests_give_the_observations_that_logs_have(screened: TrainedPolicy) -> None:
+    log = observed_log(histories())
+    found = answered(responder(screened, k=24), requests_of(log))
+    expected = recommended(screened, log, 24)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
 def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> None:

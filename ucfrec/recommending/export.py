@@ -124,6 +124,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "reward": record.reward,
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
+        **({"dropped_observations": [*trained.dropped]} if trained.dropped else {}),
         "fingerprint": record.fingerprint,
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),

@@ -240,7 +240,7 @@ class Responder:
         """The latest sessions of the requests, with the policy's numbers of items."""
         histories, rows = [one.history for one in prepared], np.arange(len(prepared))
         observations = None
-        if self.trained.record.observation_size:
+        if self.trained.logged_observation_size:
             observations = np.asarray([each.observation for each in histories], dtype=np.float32)
         sessions = None
         if histories[0].session_ids is not None:

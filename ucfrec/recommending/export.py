@@ -19,6 +19,7 @@ from ucfrec.recommending.export_graph import (
     OUTPUTS,
     RuleGraph,
     inputs_of,
+    magnitude,
     random_sessions,
     require_close,
     require_installed,
@@ -101,7 +102,8 @@ def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
     scores, _, top_scores = run_graph(runner, arguments)
     with torch.no_grad():
         expected, _, top_expected = graph(*arguments.values())
-    return require_close((scores, top_scores), (expected, top_expected), _REMEDY)
+    size = magnitude(graph.scorer)
+    return require_close((scores, top_scores), (expected, top_expected), _REMEDY, size)
 
 
 def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:

@@ -178,6 +178,17 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
     assert isinstance(skipping[0], Answer)
 
 
+def test_unknown_candidates_are_skipped_where_others_are_left(trained: TrainedPolicy) -> None:
+    by = responder(trained, k=9, skip_unknown=True)
+    some, none = by.answers(
+        [Request(user_id=1, candidates=[5, 999]), Request(user_id=1, candidates=[999, "x"])]
+    )
+    assert isinstance(some, Answer)
+    assert some.items == [5]
+    assert isinstance(none, InputError)
+    assert "2 of 2 candidates are items that the policy does not know" in str(none)
+
+
 @pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), float("nan"), 2e12, "1"])
 @pytest.mark.parametrize("reward", ["is_click", "1 * is_click"])
 def test_feedback_that_is_no_reward_is_refused(reward: str, value: object) -> None:

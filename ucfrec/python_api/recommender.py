@@ -308,7 +308,8 @@ class Recommender:
             users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
-            skip_unknown: ignore rows of items that are not in the training data.
+            skip_unknown: ignore rows of items that are not in the training data, and such
+                candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on

@@ -14,7 +14,7 @@ from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.verdict import compare_runs, describe
+from ucfrec.updating.verdict import _doubt, compare_runs, describe
 
 ITEMS = 12
 
@@ -108,3 +108,8 @@ def test_what_was_served_without_seen_items_is_compared_without_them(
     wrong, right = (compare_runs(uniform, uniform, rows, 0, each) for each in (None, seen))
     assert "update with --filter-seen" in describe(wrong)
     assert "mean weight" not in describe(right)
+    weights, user = np.full((100, 2), 0.5), np.arange(100)
+    assert "update with --filter-seen" in _doubt(weights, user, filter_seen=False)
+    filtered = _doubt(weights, user, filter_seen=True)
+    assert "update with" not in filtered
+    assert "items that requests excluded by candidates" in filtered

@@ -145,7 +145,7 @@ def _candidates_given(options: argparse.Namespace, trained: "TrainedPolicy") -> 
     from ucfrec.reporting.samples import read_features
 
     table = read_features(options.candidates, text_ids=True)
-    ids = table.column(schema.ITEM_ID).drop_null().unique().to_numpy(zero_copy_only=False)
+    ids: Array = table.column(schema.ITEM_ID).drop_null().unique().to_numpy(zero_copy_only=False)
     known = trained.items.numbers(ids) >= 0
     if known.all() or not known.any():
         return ids

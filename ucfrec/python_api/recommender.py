@@ -205,7 +205,7 @@ class Recommender:
             split: logs only: shares of training, validation and test (0.8, 0.1, 0.1), or the two
                 times at which validation and test begin: ISO text, dates or milliseconds (UTC).
             mapping: logs only: names of the columns, and feature tables; a dictionary of names is
-                enough.
+                enough. Or a TOML file, as for `ucfrec prepare --mapping`.
             dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
             screen: "drop" or "copies", as for `ucfrec train --screen`.
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;

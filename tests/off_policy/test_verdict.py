@@ -121,6 +121,10 @@ def test_unsupported_choices_over_ten_steps_are_refused_with_bounds() -> None:
     assert not verdict.reliable
     assert "the logs lack choices that the policy makes" in str(verdict)
     assert f"the value lies between {diagnosis.bounds[0]:.4g}" in str(verdict)
+    assert "evaluate with --filter-seen" in str(verdict)
+    filtered = str(conclude(steps, seed=0, diagnosis=diagnosis, filter_seen=True))
+    assert "evaluate with --filter-seen" not in filtered
+    assert "items that requests excluded by candidates" in filtered
 
 
 def test_a_mean_weight_that_is_off_by_chance_is_not_blamed_on_the_logs_alone() -> None:

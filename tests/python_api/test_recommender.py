@@ -494,7 +494,15 @@ WRONG: dict[str, tuple[Callable[[Recommender, pd.DataFrame], object], str]] = {
     "no path": (lambda p, log: p.fit(log, 3), "out is 3; give a path"),
     "mapped to a number": (
         lambda p, log: p.fit(log, mapping={"user_id": 3}),
-        "mapping is {'user_id': 3}; give a LogMapping, or a dictionary",
+        "mapping is {'user_id': 3}; give a LogMapping, a TOML file, or a dic",
+    ),
+    "features in a frame": (
+        lambda _, log: LogMapping(item_features=[log]),
+        "item_features takes a list of FeatureTable",
+    ),
+    "a frame to prepare": (
+        lambda _, log: prepare(log, LogMapping(), "store"),
+        "paths is a frame; give log files, folders or globs here, and frames to Recommender.fit",
     ),
     "no run": (lambda *_: Recommender.load(None), "run is None; give a path"),
     "no environment": (lambda p, _: p.evaluate(None), "environment is None; give the name of a"),
@@ -557,10 +565,13 @@ def test_numpys_integers_and_any_list_of_ids_are_taken(
 
 
 def test_names_of_columns_one_recommender_and_one_behavior_are_enough(
-    rated: Recommender, shown: pd.DataFrame
+    rated: Recommender, shown: pd.DataFrame, tmp_path: Path
 ) -> None:
     renamed, names = shown.rename(columns={"user_id": "uid"}), {"user_id": "uid"}
     again = Recommender("item-rate").fit(renamed, reward="reward", session_by="user", mapping=names)
+    (tmp_path / "log.toml").write_text('[columns]\nuser_id = "uid"\n')
+    for file in (tmp_path / "log.toml", str(tmp_path / "log.toml")):
+        assert len(rated.score(renamed, mapping=file)) == len(shown)
     assert again.trained.record.fingerprint == rated.trained.record.fingerprint
     pd.testing.assert_frame_equal(
         rated.recommend(renamed, mapping=names), rated.recommend(shown, k=10)

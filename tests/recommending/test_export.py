@@ -12,7 +12,16 @@ import pytest
 import torch
 
 from tests.support.logs import store_of
-from tests.support.served import FULL, SETTINGS, boredom, histories, learn_tastes, trained_run
+from tests.support.served import (
+    FULL,
+    OBSERVED,
+    SETTINGS,
+    boredom,
+    histories,
+    learn_tastes,
+    observed_log,
+    trained_run,
+)
 from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
@@ -32,7 +41,7 @@ pytest.importorskip("onnxscript")
 MAPPING = {
     "tags": LogMapping(),
     "no tags": LogMapping(),
-    "observations": LogMapping({"observation": "observation"}),
+    "observations": OBSERVED,
 }
 
 
@@ -45,9 +54,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
 @pytest.fixture(scope="module")
 def observed(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     """A run with logged observations."""
-    log = tagged_log()
-    log["observation"] = [[user % 3 / 2, user % 2] for user in log.user_id]
-    return fitted(tmp_path_factory.mktemp("observed"), log, MAPPING["observations"])
+    return fitted(tmp_path_factory.mktemp("observed"), observed_log(), MAPPING["observations"])
 
 
 def fitted(folder: Path, log: pd.DataFrame, mapping: LogMapping) -> TrainedPolicy:
@@ -85,7 +92,9 @@ def ranked(
             rows["excluded"].append(seen + [-1] * (60 - len(seen)))
             if "observations" in rows:
                 assert batch.observations is not None
-                rows["observations"].append([batch.observations[number]] * context)
+                dropped = description.get("dropped_observations", [])
+                seen_by_policy = np.delete(batch.observations[number], dropped)
+                rows["observations"].append([seen_by_policy] * context)
             users.append(user)
     dtypes = {entry["name"]: entry["dtype"] for entry in description["inputs"]}
     given = {name: np.asarray(values, dtypes[name]) for name, values in rows.items()}
@@ -140,13 +149,25 @@ def test_the_graph_recommends_what_the_policy_does(
     assert export(given, tmp_path / "out", rule=RULES[rule], k=20).difference <= 1e-5
     log = histories()
     if run == "observations":
-        log["observation"] = [[user % 3 / 2, user % 2] for user in log.user_id]
+        log = observed_log(log)
     for some in (log, log[log.user_id == log.user_id.min()]):
         batches = histories_of_frame(given, some, MAPPING[run])
         expected = pd.concat(recommend(given, batches, 20, rule=RULES[rule]), ignore_index=True)
         found = ranked(tmp_path / "out", given, some, MAPPING[run])
         expected = expected[[*found.columns]]  # a graph says nothing of draws
         pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
+
+
+def test_a_graph_has_the_observations_that_screening_kept(
+    screened: TrainedPolicy, tmp_path: Path
+) -> None:
+    export(screened, tmp_path / "out", rule=RULES["target"], k=20)
+    log = observed_log(histories())
+    batches = histories_of_frame(screened, log, OBSERVED)
+    expected = pd.concat(recommend(screened, batches, 20, rule=RULES["target"]))
+    found = ranked(tmp_path / "out", screened, log, OBSERVED)
+    expected = expected[[*found.columns]].reset_index(drop=True)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-4, atol=1e-4)
 
 
 @pytest.fixture

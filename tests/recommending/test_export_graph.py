@@ -4,8 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
+import torch
 from torch import Tensor
 
 from tests.recommending.test_responder import answered
@@ -20,6 +22,7 @@ from tests.support.served import (
 )
 from ucfrec.acting.sessions import Sessions
 from ucfrec.errors import InputError
+from ucfrec.recommending.export_graph import magnitude, require_close
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -64,6 +67,17 @@ def test_answers_are_those_of_torch(
 @pytest.mark.slow
 def test_the_run_s_own_scorer_stays_as_it_is(trained: TrainedPolicy, fast: Responder) -> None:
     assert trained.scorer(fast.rule)._engine is None
+
+
+def test_graphs_differ_by_the_rounding_of_what_is_added(trained: TrainedPolicy) -> None:
+    rule = replace(trained.rule, reward_weight=32.0, lookahead=4.8)
+    assert magnitude(trained.scorer(rule)) == pytest.approx(32 * 5.8)
+    assert magnitude(trained.scorer(replace(rule, lookahead=0.0))) == 32.0
+    assert magnitude(trained.scorer(replace(rule, reward_weight=0.0, lookahead=0.0))) == 1.0
+    ours, theirs = torch.tensor([0.0]), np.float32([1.5e-5])
+    assert require_close([theirs], [ours], "", 185.6) < 1e-6
+    with pytest.raises(InputError, match="differs from torch's"):
+        require_close([theirs], [ours], "", 1.0)
 
 
 def test_policies_that_score_in_their_own_way_are_refused(tmp_path: Path) -> None:

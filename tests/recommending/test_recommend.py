@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from tests.support.logs import store_of
+from tests.support.logs import store_of, write
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
@@ -205,6 +205,32 @@ def test_only_candidates_are_recommended(
     ):
         with pytest.raises(InputError, match=message):
             policy.recommend(log, candidates=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["items.csv", "items.parquet"])
+def test_the_command_recommends_candidates_only(
+    fitted: tuple[Recommender, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    policy, folder = fitted
+    write(pd.DataFrame({"item_id": [4, 8, 999]}), tmp_path / name)
+    command = ["recommend", str(folder / "run"), str(folder / "log.parquet"), "--keep-seen"]
+    command += ["--out", str(tmp_path / "out.parquet"), "--candidates", str(tmp_path / name)]
+    assert main(command) == 0
+    assert "does not know 1 of 3 items" in capsys.readouterr().err
+    found = pd.read_parquet(tmp_path / "out.parquet")
+    log = pd.read_parquet(folder / "log.parquet")
+    expected = policy.recommend(log, k=10, candidates=[4, 8], filter_seen=False)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False)
+    write(pd.DataFrame({"item_id": [998, 999]}), tmp_path / name)
+    assert main(command) == 2
+    assert "2 of 2 candidates are items that the policy does not know" in capsys.readouterr().err
+    assert main([*command, "--engine", "spark"]) == 2
+    assert "leave --candidates out" in capsys.readouterr().err
+    assert main([*command[:2], "--stream", *command[-2:]]) == 2
+    assert "leave --candidates out" in capsys.readouterr().err
 
 
 def test_unknown_items_are_refused_or_skipped(

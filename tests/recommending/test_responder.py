@@ -6,7 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.served import FULL, as_frame, histories, requests_of, responder
+from tests.support.served import (
+    FULL,
+    OBSERVED,
+    as_frame,
+    histories,
+    observed_log,
+    requests_of,
+    responder,
+)
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
@@ -30,7 +38,8 @@ def answered(by: Responder, requests: list[dict[str, object]]) -> pd.DataFrame:
 
 
 def recommended(trained: TrainedPolicy, log: pd.DataFrame, k: int, **named: object) -> pd.DataFrame:
-    batches = histories_of_frame(trained, log, LogMapping())
+    mapping = OBSERVED if "observation" in log else LogMapping()
+    batches = histories_of_frame(trained, log, mapping)
     return pd.concat(recommend(trained, batches, k, **named), ignore_index=True)  # type: ignore[arg-type]
 
 
@@ -58,6 +67,13 @@ def test_answers_are_those_of_recommend(
     pd.testing.assert_frame_equal(
         pd.concat(alone, ignore_index=True), expected, check_dtype=False, rtol=1e-5, atol=1e-6
     )
+
+
+def test_requests_give_the_observations_that_logs_have(screened: TrainedPolicy) -> None:
+    log = observed_log(histories())
+    found = answered(responder(screened, k=24), requests_of(log))
+    expected = recommended(screened, log, 24)
+    pd.testing.assert_frame_equal(found, expected, check_dtype=False, rtol=1e-5, atol=1e-6)
 
 
 def test_each_request_has_its_own_k_and_candidates(trained: TrainedPolicy) -> None:
@@ -160,6 +176,17 @@ def test_a_wrong_request_does_not_disturb_the_others(trained: TrainedPolicy) -> 
             raise error
     skipping = responder(trained, skip_unknown=True).answers([Request.model_validate(wrong[1][0])])
     assert isinstance(skipping[0], Answer)
+
+
+def test_unknown_candidates_are_skipped_where_others_are_left(trained: TrainedPolicy) -> None:
+    by = responder(trained, k=9, skip_unknown=True)
+    some, none = by.answers(
+        [Request(user_id=1, candidates=[5, 999]), Request(user_id=1, candidates=[999, "x"])]
+    )
+    assert isinstance(some, Answer)
+    assert some.items == [5]
+    assert isinstance(none, InputError)
+    assert "2 of 2 candidates are items that the policy does not know" in str(none)
 
 
 @pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), float("nan"), 2e12, "1"])

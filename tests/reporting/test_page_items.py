@@ -209,6 +209,26 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
     assert not {tag for tag, _ in page.elements} & {"script", "img"}
 
 
+def test_estimates_per_step_have_a_table_of_their_own(folder: Path, tmp_path: Path) -> None:
+    rows = [estimate("logged", 2.0, "behavior"), estimate("DM", 3.0, interval=None)]
+    rows += [
+        estimate(name, value, policy, table="per step", metric="R_step", interval=ends,
+                 metrics={"effective_steps": 9.5, "largest_weight": 0.5})
+        for name, policy, value, ends in (
+            ("logged", "behavior", 0.25, (0.125, 0.5)), ("DR", "ucf", 0.5, None)
+        )
+    ]  # fmt: skip
+    write_results(tmp_path / "ope.json", rows)
+    page = page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
+    assert list(page.tables["Estimates for ucf"]) == ["logged sessions", "DM"]
+    table = page.tables["Estimates per step for ucf"]
+    assert table["logged steps"]["mean reward of a step"] == "0.25 [0.125, 0.5]"
+    assert table["DR"] == {
+        "mean reward of a step": "0.5 [–]", "effective sample": "9.5",
+        "share of the largest weight": "0.5",
+    }  # fmt: skip
+
+
 def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
     folder: Path, tmp_path: Path
 ) -> None:

@@ -16,6 +16,7 @@ from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -33,6 +34,14 @@ SETTINGS = [
 ]
 FULL = DecisionRule(None, minimum_target=0.1, reward_weight=0.7, exclude_seen=True, tag_window=2)
 """A rule that uses every part of a policy."""
+OBSERVED = LogMapping({"observation": "observation"})
+"""Mapping of logs with observations."""
+
+
+def observed_log(log: pd.DataFrame | None = None) -> pd.DataFrame:
+    """A log with observations of two numbers; `tagged_log` without one."""
+    log = tagged_log() if log is None else log
+    return log.assign(observation=[[user % 3 / 2, user % 2] for user in log.user_id])
 
 
 def trained_run(folder: Path, policy: str = "ucf") -> TrainedPolicy:

@@ -17,6 +17,7 @@ from ucfrec.errors import InputError
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.tuning.report import _value
 from ucfrec.tuning.space import Dimension, Search
 from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measured, tune
 
@@ -121,6 +122,11 @@ def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
     assert ended
     assert all(max(trial.intermediate_values) <= 12 for trial in ended)
     assert study.trials.index(ended[0]) >= 4
+
+
+@pytest.mark.parametrize("text", ["it's", '"it\'s"\\n', "a\nb\t\x7f\x01é", ""])
+def test_texts_are_written_as_they_are(text: str) -> None:
+    assert tomllib.loads(f"x = [{_value(text)}]") == {"x": [text]}
 
 
 def test_the_command_writes_settings_that_train_takes(

@@ -245,7 +245,8 @@ def item_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--skip-unknown",
         action="store_true",
-        help="ignore rows with items outside the catalogue of the run (default: an error)",
+        help="ignore rows with items outside the catalogue of the run, and such candidates "
+        "(default: an error)",
     )
 
 

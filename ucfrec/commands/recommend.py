@@ -2,10 +2,13 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ucfrec import schema
 from ucfrec.commands.options import (
     draw_options,
     engine_option,
@@ -21,11 +24,12 @@ from ucfrec.commands.options import (
     spark_given,
     spark_option,
 )
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import Output, origin, uri_or_path
 from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
+    from ucfrec.arrays import Array
     from ucfrec.recommending.histories import Histories
     from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -34,9 +38,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec recommend`."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     logs = log_options(parser)
+    logs.nargs, logs.required = "*", False
     memory_option(parser)
     parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
     item_options(parser)
+    parser.add_argument(
+        "--candidates",
+        type=Path,
+        metavar="FILE",
+        help="the only items to recommend: Parquet or CSV with a column item_id (default: all)",
+    )
     parser.add_argument(
         "--new-session",
         action="store_true",
@@ -51,16 +62,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule "
         "without a temperature; says the recall (default: exactly)",
     )
-    out = parser.add_argument(
+    parser.add_argument(
         "--out",
         type=uri_or_path(Output, Path),
-        required=True,
         help="Parquet file (with --engine spark: folder) to write",
     )
     parser.add_argument(
         "--stream",
-        action=_Stream,
-        instead_of=(logs, out),
+        action="store_true",
         help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
         "answers to stdout (docs/serving.md)",
     )
@@ -74,25 +83,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     limit_options(parser)
 
 
-class _Stream(argparse.Action):
-    """A flag that makes other arguments optional."""
-
-    def __init__(self, instead_of: tuple[argparse.Action, ...], **named: Any) -> None:
-        super().__init__(nargs=0, default=False, **named)
-        self._instead_of = instead_of
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        setattr(namespace, self.dest, True)
-        for action in self._instead_of:
-            action.required = False
-
-
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec recommend`: write the recommendations as Parquet, or answer a stream.
 
@@ -102,6 +92,10 @@ def run(options: argparse.Namespace) -> None:
     if options.stream:
         _answer_stream(options)
         return
+    if not options.logs or options.out is None:
+        raise InputError(
+            "name LOGS after the run and the file to write with --out; or give --stream"
+        )
     from ucfrec.files.parquet import write_frames
     from ucfrec.recommending.exposures import exposures_written
     from ucfrec.recommending.histories import histories_of_files
@@ -125,6 +119,7 @@ def run(options: argparse.Namespace) -> None:
             options.k,
             rule=rule,
             filter_seen=not options.keep_seen,
+            candidates=_candidates_given(options, trained),
             skip_unknown=options.skip_unknown,
             new_session=options.new_session,
             seed=options.seed,
@@ -143,6 +138,26 @@ def run(options: argparse.Namespace) -> None:
         )
 
 
+def _candidates_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Array | None":
+    """The ids in the file of candidates that the run knows; all ids if it knows none."""
+    if options.candidates is None:
+        return None
+    from ucfrec.reporting.samples import read_features
+
+    table = read_features(options.candidates, text_ids=True)
+    ids: Array = table.column(schema.ITEM_ID).drop_null().unique().to_numpy(zero_copy_only=False)
+    known = trained.items.numbers(ids) >= 0
+    if known.all() or not known.any():
+        return ids
+    warnings.warn(
+        f"{options.candidates}: the run does not know {int((~known).sum()):,} of {len(ids):,} "
+        "items, which are not recommended; prepare and train on logs with them",
+        InputNote,
+        stacklevel=2,
+    )
+    return ids[known]
+
+
 def _recommend_with_spark(
     options: argparse.Namespace, trained: "TrainedPolicy", master: str
 ) -> None:
@@ -150,6 +165,8 @@ def _recommend_with_spark(
 
     if options.approximate:
         raise InputError("--engine spark finds items exactly; leave --approximate out")
+    if options.candidates is not None:
+        raise InputError("--engine spark recommends all items; leave --candidates out")
     rows = recommend_with_spark(
         trained,
         *logs_given(options, trained),
@@ -180,15 +197,16 @@ def _answer_stream(options: argparse.Namespace) -> None:
         raise InputError("--stream finds items exactly; leave --approximate out")
     if options.new_session:
         raise InputError("with --stream, each line says new_session; leave --new-session out")
+    if options.candidates is not None:
+        raise InputError("with --stream, each line has its candidates; leave --candidates out")
     trained = TrainedPolicy.load(options.run, options.checkpoint)
-    responder = responder_given(options, trained)
     # Unbuffered, so that a request is answered without waiting for the next ones.
     with (
+        closing(responder_given(options, trained)) as responder,
         exposures_given(options, trained) as exposures,
         open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as source,
     ):
         counts = answer_stream(responder, source, sys.stdout.buffer, exposures=exposures)
-    responder.close()
     print(
         f"ucfrec recommend: {counts.answers:,} answers, {counts.errors:,} errors", file=sys.stderr
     )

@@ -73,7 +73,8 @@ class LogMapping:
     Example: `LogMapping({"item_id": "video_id", "timestamp": "time_s * 1000"}, reward="is_click")`.
 
     Raises:
-        InputError: `columns` names no log column, or `session_by` is none of `SESSIONS`.
+        InputError: `columns` names no log column, `session_by` is none of `SESSIONS`, or features
+            are no `FeatureTable`.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -111,6 +112,15 @@ class LogMapping:
                 f"of sessions as {schema.SESSION_ID}"
             )
 
+        for name in ("item_features", "user_features"):
+            given = getattr(self, name)
+            if not isinstance(given, (tuple, list)) or not all(
+                isinstance(each, FeatureTable) for each in given
+            ):
+                raise InputError(
+                    f"{name} takes a list of FeatureTable, such as FeatureTable(['items.parquet'], "
+                    "key='item_id'); write a frame to a file first"
+                )
         self.earliest_ms  # noqa: B018
 
     @property

@@ -193,6 +193,10 @@ def prepare(
         InputError: the input cannot be used, `out` exists, or the disk is full.
     """
     options, out = options or PrepareOptions(), Path(out)
+    if hasattr(paths, "columns"):
+        raise InputError(
+            "paths is a frame; give log files, folders or globs here, and frames to Recommender.fit"
+        )
     files = log_files(paths)
     if like is not None and not (like / USERS_FILE).is_file():
         raise InputError(f"{like} is neither an episode store nor a run: it has no {USERS_FILE}")

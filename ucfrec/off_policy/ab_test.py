@@ -210,14 +210,7 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
     ):
         tables = tuple(open_tables(connection, files))
         for table in tables:
-            for name in (schema.USER_ID, schema.ARM, column):
-                if name not in table.columns:
-                    raise InputError(
-                        f"{table.files[0]} has no column {name}; give the log of ucfrec join"
-                    )
-            kind = table.columns[column]
-            if not is_number(kind) and kind != "BOOLEAN":
-                raise InputError(f"{table.files[0]}: {column} is not a number; name another column")
+            _require_columns(table, column)
         with explained(connection, tables, folder):
             connection.execute(
                 "CREATE TABLE of_users AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
@@ -249,6 +242,18 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
         int(no_arm),
         int(in_several),
     )
+
+
+def _require_columns(table: Table, column: str) -> None:
+    file, kinds = table.files[0], table.columns
+    for name in (schema.USER_ID, schema.ARM):
+        if name not in kinds:
+            raise InputError(f"{file} has no column {name}; give the log of ucfrec join")
+    numbers = [name for name, kind in kinds.items() if is_number(kind) or kind == "BOOLEAN"]
+    if column not in numbers:
+        lacks = f": {column} is not a number" if column in kinds else f" has no column {column}"
+        remedy = f"its columns of numbers are {', '.join(numbers)}"
+        raise InputError(f"{file}{lacks}; {remedy if numbers else 'give the log of ucfrec join'}")
 
 
 def _rows(tables: Sequence[Table], column: str) -> str:

@@ -162,7 +162,10 @@ def evaluate_off_policy(
     seen = share_seen(trained, logged.store)
     lacking, notes = _of_dropped_rows(logged, options.pages)
     forbidden = [*seen_too_often(seen), *_too_many_items(trained, evaluated), *lacking]
-    verdict = conclude(steps, seed, diagnosis, options.wanted_lift, forbidden, _declared(evaluated))
+    verdict = conclude(
+        *(steps, seed, diagnosis, options.wanted_lift, forbidden, _declared(evaluated)),
+        filter_seen=options.filter_seen,
+    )
     warnings = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
     warnings += [*notes, *of_groups, *_of_the_models(evaluated)]
     warnings += [value.doubt] if value is not None and value.doubt else []

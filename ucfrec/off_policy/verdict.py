@@ -22,6 +22,14 @@ FAR_OFF: Final = 0.1
 though their number may be too small for a test to show it."""
 ENOUGH_REWARDED: Final = 30
 MOST_LEFT_OUT: Final = 0.05
+_SEEN_REMOVED: Final = (
+    "such as seen items, which serve excludes without --keep-seen: evaluate with --filter-seen"
+)
+OTHERS_REMOVED: Final = (
+    "such as items that requests excluded by candidates, or that another system removed: with "
+    "--filter-seen, seen items are left out already"
+)
+"""Why logs may lack choices of a policy that is evaluated without seen items."""
 _DETECTED: Final = 1.96 + 0.84
 """Standard errors in a lift that 80% of samples would find at 95% confidence."""
 
@@ -81,6 +89,7 @@ def conclude(
     wanted_lift: float | None = None,
     forbidden: Sequence[str] = (),
     declared: str = "",
+    filter_seen: bool = False,
 ) -> Verdict:
     """Compare the evaluated policy with the behavior policy, if the logs allow it.
 
@@ -91,9 +100,10 @@ def conclude(
             return.
         forbidden: what else the caller knows to forbid a conclusion.
         declared: what the estimate rests on beside the logs, said with the verdict.
+        filter_seen: whether the policy was evaluated without items that users had seen.
     """
     diagnosis = diagnosis or diagnose(steps)
-    reasons = [*forbidden, *_reasons(diagnosis)]
+    reasons = [*forbidden, *_reasons(diagnosis, filter_seen)]
     if wanted_lift is None:
         wanted_lift = 0.05 * abs(float(steps.returns.mean()))
     terms: Mapping[str, Terms] = {}
@@ -151,7 +161,7 @@ def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
     return said
 
 
-def _reasons(diagnosis: Diagnosis) -> list[str]:
+def _reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
     """What forbids a conclusion, the gravest first."""
     if diagnosis.overlap is None:
         return ["no session has all its propensities, so nothing can be weighed"]
@@ -161,7 +171,7 @@ def _reasons(diagnosis: Diagnosis) -> list[str]:
             f"{diagnosis.left_out / diagnosis.sessions:.0%} of the sessions have a step without "
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
         )
-    failed, mean = _failed_tests(diagnosis), diagnosis.mean_weight
+    failed, mean = _failed_tests(diagnosis, filter_seen), diagnosis.mean_weight
     said += failed
     if not failed and mean is not None and abs(mean - 1) > FAR_OFF:
         said.append(
@@ -189,7 +199,7 @@ def _reasons(diagnosis: Diagnosis) -> list[str]:
     return said
 
 
-def _failed_tests(diagnosis: Diagnosis) -> list[str]:
+def _failed_tests(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
     failed = [test for test in diagnosis.tests if not test.passed]
     if not failed:
         return []
@@ -204,9 +214,9 @@ def _failed_tests(diagnosis: Diagnosis) -> list[str]:
             "logs; or the logs lack choices that the policy makes"
         )
     elif worst.mean < 1:
+        lacks = OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
         cause = (
-            "the logs lack choices that the policy makes (such as seen items, which serve excludes "
-            "without --keep-seen: evaluate with --filter-seen), or propensities are too large"
+            f"the logs lack choices that the policy makes ({lacks}), or propensities are too large"
         )
     else:
         cause = "propensities are too small"

@@ -22,7 +22,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.kept import note_dropped
-from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping
+from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
 from ucfrec.logs.summary import MANY
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
@@ -33,8 +33,8 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""
-Columns = LogMapping | Mapping[str, str]
-"""What the columns of logs mean, or only the names of some."""
+Columns = LogMapping | Mapping[str, str] | str | Path
+"""What the columns of logs mean, only the names of some, or a TOML file as of `--mapping`."""
 _FRAME: Final = "frame.parquet"
 _KEYS: Final = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP, schema.SESSION_ID)
 _OPTIONS: Final = (
@@ -87,10 +87,12 @@ def split_given(name: str, value: object) -> tuple[float, ...]:
 def _mapping(given: Columns | None) -> LogMapping:
     if given is None or isinstance(given, LogMapping):
         return given or LogMapping()
+    if isinstance(given, (str, Path)):
+        return read_mapping(Path(given))
     if not isinstance(given, Mapping) or not all(isinstance(each, str) for each in given.values()):
         raise InputError(
-            f"mapping is {shown(given)}; give a LogMapping, or a dictionary of log columns to "
-            "columns of the data"
+            f"mapping is {shown(given)}; give a LogMapping, a TOML file, or a dictionary of log "
+            "columns to columns of the data"
         )
     return LogMapping(given)
 

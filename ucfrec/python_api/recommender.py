@@ -205,7 +205,7 @@ class Recommender:
             split: logs only: shares of training, validation and test (0.8, 0.1, 0.1), or the two
                 times at which validation and test begin: ISO text, dates or milliseconds (UTC).
             mapping: logs only: names of the columns, and feature tables; a dictionary of names is
-                enough.
+                enough. Or a TOML file, as for `ucfrec prepare --mapping`.
             dataset: files only: the dataset adapter, as for `ucfrec prepare --dataset`.
             screen: "drop" or "copies", as for `ucfrec train --screen`.
             refit: go on learning from all rows once everything is chosen, as `ucfrec train` does;
@@ -308,7 +308,8 @@ class Recommender:
             users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
             candidates: the only item_ids to recommend; None for all.
-            skip_unknown: ignore rows of items that are not in the training data.
+            skip_unknown: ignore rows of items that are not in the training data, and such
+                candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
             rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on

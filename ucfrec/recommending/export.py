@@ -19,6 +19,7 @@ from ucfrec.recommending.export_graph import (
     OUTPUTS,
     RuleGraph,
     inputs_of,
+    magnitude,
     random_sessions,
     require_close,
     require_installed,
@@ -101,7 +102,8 @@ def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
     scores, _, top_scores = run_graph(runner, arguments)
     with torch.no_grad():
         expected, _, top_expected = graph(*arguments.values())
-    return require_close((scores, top_scores), (expected, top_expected), _REMEDY)
+    size = magnitude(graph.scorer)
+    return require_close((scores, top_scores), (expected, top_expected), _REMEDY, size)
 
 
 def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
@@ -124,6 +126,7 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "reward": record.reward,
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
+        **({"dropped_observations": [*trained.dropped]} if trained.dropped else {}),
         "fingerprint": record.fingerprint,
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),

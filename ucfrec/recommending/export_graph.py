@@ -25,7 +25,8 @@ INPUTS: Final = ("items", "rewards", "steps", "collected", "users", "observation
 EXCLUDED: Final = "excluded"
 OUTPUTS: Final = ("scores", "top_items", "top_scores")
 TOLERANCE: Final = 1e-5
-"""Largest difference of a score to torch's, relative to the larger of 1 and the score."""
+"""Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
+"""
 _OPSET: Final = 20
 _DEFAULT_K: Final = 100
 _CHUNK: Final = 2**16
@@ -160,8 +161,26 @@ def run_graph(session: Any, inputs: dict[str, Tensor]) -> list[Array]:
     return found
 
 
-def require_close(found: Iterable[Array], expected: Iterable[Tensor], remedy: str) -> float:
-    """The largest difference of a graph's numbers to torch's, relative to max(1, |number|).
+def magnitude(scorer: Scorer) -> float:
+    """Size of what is added up to a score under the scorer's rule, at least 1.
+
+    A sum is rounded relative to its terms, even if what is left of them is about 0.
+    """
+    rule, model = scorer.rule, scorer.reward_model
+    added = rule.reward_weight
+    if rule.looks_ahead and model is not None:
+        low, high = float(model.reward_low), float(model.reward_high)
+        added *= (max(abs(low), abs(high)) + rule.lookahead) / (high - low)
+    return max(1.0, rule.policy_weight, added)
+
+
+def require_close(
+    found: Iterable[Array], expected: Iterable[Tensor], remedy: str, size: float
+) -> float:
+    """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
+
+    Args:
+        size: see `magnitude`.
 
     Raises:
         InputError: it is beyond the tolerance.
@@ -171,7 +190,7 @@ def require_close(found: Iterable[Array], expected: Iterable[Tensor], remedy: st
         ours = tensor.numpy()
         same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
         finite = np.isfinite(ours) & np.isfinite(theirs)
-        apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(1.0, np.abs(ours[finite]))
+        apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(size, np.abs(ours[finite]))
         largest = max(largest, float(apart.max(initial=0.0)), 0.0 if same.all() else np.inf)
     if not largest <= TOLERANCE:
         raise InputError(
@@ -290,10 +309,11 @@ class ScoreGraph:
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
+        size = magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = _example(scorer, seed=number)
             expected = scorer.scores(session, excluded=excluded, empty=True)
-            require_close([self(session, excluded).numpy()], [expected], _REMEDY)
+            require_close([self(session, excluded).numpy()], [expected], _REMEDY, size)
 
     def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
         """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be

@@ -59,7 +59,8 @@ def recommend(
         rule: the decision rule; None for the run's own.
         filter_seen: exclude every item that the user has seen.
         candidates: the only item_ids to recommend, for all users; None for all items.
-        skip_unknown: ignore rows of items that are not in the training data.
+        skip_unknown: ignore rows of items that are not in the training data, and such candidates
+            where others are left.
         new_session: whether users begin a new session.
         seed: of the draws of a rule with a temperature, or that explores. They also depend on the
             user and the time of the user's last row: the same history gives the same items, and a
@@ -81,7 +82,7 @@ def recommend(
     scorer = trained.item_scorer(rule)
     k = require_whole("k", k)
     known_ids = trained.items
-    excluded = None if candidates is None else _all_but(known_ids, candidates)
+    excluded = None if candidates is None else _all_but(known_ids, candidates, skip_unknown)
 
     choice = _Choice(trained, scorer, k, excluded, new_session, seed, index)
     return map(choice.frame, _numbered(known_ids, batches, filter_seen, skip_unknown))
@@ -199,28 +200,33 @@ def best_of(
     return items, values.masked_fill(none, -torch.inf), propensities
 
 
-def _all_but(index: IdLookup, candidates: Iterable[Any]) -> Tensor:
+def _all_but(index: IdLookup, candidates: Iterable[Any], skip_unknown: bool) -> Tensor:
     """(n_items,) true for the items that are not among the candidates."""
     ids = require_ids("candidates", candidates, schema.ITEM_ID)
     excluded = torch.ones(len(index), dtype=torch.bool)
-    excluded[torch.from_numpy(candidate_numbers(index, ids))] = False
+    excluded[torch.from_numpy(candidate_numbers(index, ids, skip_unknown))] = False
     return excluded
 
 
-def candidate_numbers(index: IdLookup, ids: Array) -> IntArray:
+def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
     """Numbers (N,) of the items that may be recommended.
 
+    Args:
+        skip_unknown: leave out those that the policy does not know.
+
     Raises:
-        InputError: the policy does not know some of them.
+        InputError: the policy does not know some of them, or with `skip_unknown`, any.
     """
     numbers = index.numbers(ids)
-    if (numbers < 0).any():
-        unknown = ids[numbers < 0].tolist()
+    known = numbers >= 0
+    if not (known.any() if skip_unknown else known.all()):
+        unknown = ids[~known].tolist()
+        remedy = "name items of its catalogue" if skip_unknown else "leave them out"
         raise InputError(
             f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
-            f"({some_of(unknown)}); leave them out"
+            f"({some_of(unknown)}); {remedy}"
         )
-    return numbers
+    return numbers[known]
 
 
 def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:

@@ -270,6 +270,7 @@ class HistoryReader:
     """See `ucfrec.logs.prepare.PrepareOptions.duplicates`."""
     by_session_id: bool
     observation_size: int
+    """Of the logs: columns that the policy does not see are given too."""
     rewards: RowRewards
 
     @classmethod
@@ -278,7 +279,7 @@ class HistoryReader:
         return cls(
             trained.record.data.duplicates,
             trained.record.session_by == schema.SESSION_ID,
-            trained.record.observation_size,
+            trained.logged_observation_size,
             RowRewards(reward_of(trained)),
         )
 

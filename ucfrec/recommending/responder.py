@@ -117,7 +117,8 @@ class Responder:
             rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
             filter_seen: exclude every item that the user has seen.
-            skip_unknown: ignore rows of items that are not in the training data.
+            skip_unknown: ignore rows of items that are not in the training data, and such
+                candidates where others are left.
             seed: of the draws of a rule with a temperature, or that explores; they also depend on
                 user and request_id.
             engine: what computes the scores of a request that comes alone, one of `ENGINES`.
@@ -209,7 +210,7 @@ class Responder:
         allowed = (
             None
             if request.candidates is None
-            else candidate_numbers(self._items, id_array(request.candidates))
+            else candidate_numbers(self._items, id_array(request.candidates), self._skip_unknown)
         )
         k = self._k if request.k is None else request.k
         request_id = request.request_id or uuid4().hex
@@ -240,7 +241,7 @@ class Responder:
         """The latest sessions of the requests, with the policy's numbers of items."""
         histories, rows = [one.history for one in prepared], np.arange(len(prepared))
         observations = None
-        if self.trained.record.observation_size:
+        if self.trained.logged_observation_size:
             observations = np.asarray([each.observation for each in histories], dtype=np.float32)
         sessions = None
         if histories[0].session_ids is not None:

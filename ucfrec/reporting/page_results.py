@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from ucfrec.runs.record import RunRecord
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
 _WEIGHTS = ("effective_sessions", "largest_weight", "sessions", "overlap")
+_STEP = "R_step"
+"""Metric of rows per step, where only some steps of the logs have propensities."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Estimates:
     rows: Sequence[ResultRow]
     """One row per estimator, without `logged`."""
     warnings: tuple[str, ...]
+    steps: Sequence[ResultRow] = ()
+    """Rows per step, with that of the logged steps."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,9 @@ def results_of(paths: Sequence[Path]) -> Results:
     for path in paths:
         rows = read_results(path)
         for number, row in enumerate(rows, start=1):
-            if row.metric != "R_cum" or (row.interval is None and row.suite != SUITE):
+            of_steps = row.suite == SUITE and row.metric == _STEP
+            session = row.metric == "R_cum" and (row.interval is not None or row.suite == SUITE)
+            if not (session or of_steps):
                 raise InputError(
                     f"{path}, row {number}, has no R_cum with an interval; give rows that `ucfrec "
                     "evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
@@ -68,15 +74,17 @@ def _estimates(rows: Sequence[ResultRow]) -> list[Estimates]:
     """Group the rows of one file by `ucfrec ope` call; the rows of a call begin with `logged`."""
     groups: list[list[ResultRow]] = []
     for row in rows:
-        if row.method == LOGGED or not groups:
+        if (row.method == LOGGED and row.metric != _STEP) or not groups:
             groups.append([])
         groups[-1].append(row)
     return [_policy_estimates(group) for group in groups]
 
 
 def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
-    logged = next((row for row in group if row.method == LOGGED), None)
-    rows = [row for row in group if row is not logged]
+    steps = [row for row in group if row.metric == _STEP]
+    sessions = [row for row in group if row.metric != _STEP]
+    logged = next((row for row in sessions if row.method == LOGGED), None)
+    rows = [row for row in sessions if row is not logged]
     first = rows[0] if rows else group[0]
     run, choice = first.conditions.get("run"), first.conditions.get("choice")
     name = first.policy
@@ -86,7 +94,7 @@ def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
         name = f"{first.policy} ({first.details.get('candidate')})"
     warnings = (row.details.get("warnings") for row in group)
     said = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
-    return Estimates(name, logged, rows, tuple(dict.fromkeys(said)))
+    return Estimates(name, logged, rows, tuple(dict.fromkeys(said)), steps)
 
 
 def environments(results: Results) -> list[tuple[BarChart, Table]]:
@@ -106,7 +114,7 @@ def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[BarChart,
 
 
 def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
-    """Bar chart and table of each policy with estimates from logs."""
+    """Bar chart and table of each policy with estimates from logs, and of those per step."""
     drawn = []
     for one in results.estimates:
         rows = [*([one.logged] if one.logged else []), *one.rows]
@@ -118,8 +126,25 @@ def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
         columns = ["mean return of a session", "effective sample", "share of the largest weight"]
         table = Table(f"Estimates for {one.name}", "", [*columns, "sessions", "overlap"], body)
         chart = _bars(f"Mean return of a session: {one.name}, with 95% intervals", names, rows)
-        drawn.append((one, chart, table))
+        if one.steps:
+            # The warnings come once, below both.
+            drawn += [(replace(one, warnings=()), chart, table), (one, *_per_step(one))]
+        else:
+            drawn.append((one, chart, table))
     return drawn
+
+
+def _per_step(one: Estimates) -> tuple[BarChart, Table]:
+    names = ["logged steps" if row.method == LOGGED else row.method for row in one.steps]
+    weights = ("effective_steps", "largest_weight")
+    body = [
+        (name, [interval(row), *(shown(row.as_line().get(column)) for column in weights)])
+        for name, row in zip(names, one.steps, strict=True)
+    ]
+    columns = ["mean reward of a step", "effective sample", "share of the largest weight"]
+    table = Table(f"Estimates per step for {one.name}", "", columns, body)
+    title = f"Mean reward of a step with a propensity: {one.name}, with 95% intervals"
+    return _bars(title, names, one.steps), table
 
 
 def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> BarChart:
@@ -132,7 +157,7 @@ def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> BarCha
 
 
 def interval(row: ResultRow) -> str:
-    """R_cum with its 95% interval, if it has one."""
+    """The value with its 95% interval, if it has one."""
     if row.interval is None:
         return f"{shown(row.value)} [–]"
     low, high = row.interval

@@ -39,15 +39,20 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
         return str(samples["rule"]), tables
 
 
-def read_features(path: Path) -> pa.Table:
+def read_features(path: Path, text_ids: bool = False) -> pa.Table:
     """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
+
+    Args:
+        text_ids: whether the ids of a CSV are read as they are written, e.g. 007.
 
     Raises:
         InputError: the file cannot be read as that or lacks the column.
     """
     require_regular(path)
     try:
-        table = csv.read_csv(path) if path.suffix == ".csv" else pq.read_table(path)
+        types = csv.ConvertOptions(column_types={schema.ITEM_ID: pa.string()} if text_ids else None)
+        text = path.suffix == ".csv"
+        table = csv.read_csv(path, convert_options=types) if text else pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path} cannot be read as Parquet or CSV: {reason}") from None

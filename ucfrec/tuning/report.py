@@ -1,5 +1,6 @@
 """What a search found: the best settings as TOML, importances, and a page of all trials."""
 
+import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -112,5 +113,6 @@ def _value(value: Any) -> str:
     if isinstance(value, (tuple, list)):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, str):
-        return "'" + value.replace("'", "") + "'"
+        # A JSON string is a TOML string, but for a control character that JSON leaves as it is.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

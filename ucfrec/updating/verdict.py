@@ -13,6 +13,7 @@ from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.intervals import cluster_intervals, cluster_mean
 from ucfrec.off_policy.score import scored_steps
+from ucfrec.off_policy.verdict import OTHERS_REMOVED
 from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -25,6 +26,7 @@ _ERRORS: Final = 3.0
 """Standard errors by which a mean weight may differ from 1."""
 _LEAST_STEPS: Final = 30
 """Effective steps below which weights say nothing."""
+_SEEN_REMOVED: Final = "as where it was served without seen items: update with --filter-seen"
 
 _LEAST_USERS: Final = 10
 """Users with rows below which an interval over users says nothing."""
@@ -59,8 +61,9 @@ def compare_runs(
         if (weighed := propensity > 0).any():
             weights = np.stack([each.probability for each in found], axis=1)[weighed]
             weights /= propensity[weighed, None]
+            doubt = _doubt(weights, user[weighed], seen is not None)
             differences.append(
-                _valued(weights, reward[weighed].astype(np.float64), user[weighed], seed)
+                _valued(weights, reward[weighed].astype(np.float64), user[weighed], seed, doubt)
             )
     decisive = differences[-1]
     results: dict[int, Literal["better", "no significant difference", "worse"]] = {
@@ -120,7 +123,9 @@ def _ranked(new: _Logged, old: _Logged, liked: BoolArray, user: IntArray, seed: 
     return _difference(RANKING, gained, liked[:, None].astype(np.float64), user, seed, "")
 
 
-def _valued(weights: Float64Array, reward: Float64Array, user: IntArray, seed: int) -> Difference:
+def _valued(
+    weights: Float64Array, reward: Float64Array, user: IntArray, seed: int, doubt: str
+) -> Difference:
     """The difference in reward per step, by inverse propensities.
 
     The mean reward is a control variate: weights of both policies have mean 1.
@@ -131,7 +136,7 @@ def _valued(weights: Float64Array, reward: Float64Array, user: IntArray, seed: i
         user: (N,).
     """
     lift = ((weights[:, 0] - weights[:, 1]) * (reward - reward.mean()))[:, None]
-    return _difference(VALUE, lift, np.ones_like(lift), user, seed, _doubt(weights, user))
+    return _difference(VALUE, lift, np.ones_like(lift), user, seed, doubt)
 
 
 def _mean_ranks(scores: torch.Tensor, items: torch.Tensor) -> torch.Tensor:
@@ -157,15 +162,15 @@ def _difference(
     return Difference(measure=measure, value=value, low=low, high=high, doubt=doubt)
 
 
-def _doubt(weights: Float64Array, user: IntArray) -> str:
+def _doubt(weights: Float64Array, user: IntArray, filter_seen: bool) -> str:
     """Why not to rely on weights (N, 2) of the new and the old run; empty if nothing is found."""
     for name, column in zip(("new", "old"), weights.T, strict=True):
         mean, error = cluster_mean(column, user)
         if not abs(mean - 1) <= _ERRORS * error:
+            cause = OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
             return (
                 f"the mean weight of the {name} run is {mean:.3g} ± {error:.2g} where 1 is "
-                "expected: the log lacks its choices (as where it was served without seen items: "
-                "update with --filter-seen), or propensities are wrong"
+                f"expected: the log lacks its choices ({cause}), or propensities are wrong"
             )
     effective = min(effective_number(column) for column in weights.T)
     if effective < _LEAST_STEPS:

@@ -301,7 +301,7 @@ def test_ids_with_and_without_decimals_are_noted_and_can_be_made_one(
 ) -> None:
     times = itertools.count(START)
     for n, users in enumerate(parts):
-        lines = [f"{user},1,{next(times)},{user[0]}" for user in users.split(",")]
+        lines = [f"{user},{user[0]},{next(times)},{user[0]}" for user in users.split(",")]
         (tmp_path / f"{n}.csv").write_text("\n".join(["user_id,item_id,timestamp,reward", *lines]))
     with pytest.warns(InputNote, match=r"user_id is written .* 7 and 7\.0 are two ids; .*::BIGINT"):
         apart = validate(log_files([tmp_path]), LogMapping())["users"]

@@ -145,7 +145,7 @@ def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) ->
     frame = pd.DataFrame({"user_id": users, "arm": ["1", "1.0"] * 3, "feedback": range(6)})
     frame.to_csv(tmp_path / "log.csv", index=False)
     found = compare_arms([tmp_path / "log.csv"])
-    assert (found.arms, found.users, found.in_both) == (("1", "1.0"), (3, 3), 0)
+    assert (found.arms, found.users, found.in_several) == (("1", "1.0"), (3, 3), 0)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])

@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"k is {about['k']}; --json has 95% intervals and paired differences by user")
     if lost := float(about["out_of_reach"] or 0):
         print(
-            f"{lost:.1%} of the steps show an item that the user has seen, which is left out: "
+            f"{lost:.1%} of the steps show an item that the user has seen, which is excluded: "
             f"hit_rate_shown is at most {1 - lost:.3g}; --keep-seen ranks these items too"
         )
     on = ", ".join(map(without_folders, options.logs)) or "the test split"

@@ -16,11 +16,9 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from safetensors import safe_open
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
@@ -181,23 +179,16 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
 
 def _note_lacking(found: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord) -> None:
     """Note the new users and items of which no feature table says anything."""
-    log, had = found.rows.log, _features_of(store, old)
+    log = found.rows.log
     for name, table, file in ID_TABLES:
         before = pq.read_metadata(store / file).num_rows
         new = (
             f"SELECT {name} FROM kept_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
         )
         given = feature_tables(mapping)[name], found.features[name]
-        note_lacking(log.connection, *given, name, new, str(store) if name in had else "")
-
-
-def _features_of(store: Path, old: StoreRecord) -> set[str]:
-    """Id columns with feature tables; stores of earlier releases show only some in their states."""
-    with safe_open(store / ITEM_STATES, framework="numpy") as states:
-        shapes = {name: states.get_slice(name).get_shape() for name in states.keys()}  # noqa: SIM118
-    found = {schema.ITEM_ID} if "tags" in shapes else set()
-    found |= {schema.USER_ID} if shapes["user_features"][1] else set()
-    return found | {*old.source.features}
+        note_lacking(
+            log.connection, *given, name, new, str(store) if name in old.source.features else ""
+        )
 
 
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,9 +196,7 @@ def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     others = StoreRecord.read(out).source.others
     if "made_of" not in others:
         raise InputError(f"{out} is a store that no update made; name another folder")
-    # Stores of earlier releases do not say which columns the mapping had.
-    made = {**made_of, **others["made_of"]}
-    other = [name for key, name in _PARTS.items() if made[key] != made_of[key]]
+    other = [name for key, name in _PARTS.items() if others["made_of"].get(key) != made_of[key]]
     if other:
         raise InputError(
             f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "

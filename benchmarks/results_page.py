@@ -482,8 +482,9 @@ SECTIONS = (
         "log. Bold is the highest mean of a column among policies that "
         "do not know the simulator. The shared components decide, not the network: with them all "
         "methods are level in the catalogue and in KuaiRand, and behaviour cloning is ahead of UCF "
-        "by 2 in SARDINE. A lookahead was among the candidates in the catalogue, and for `ucf` and "
-        "`bc+shared` in SARDINE.",
+        "by 2 in SARDINE. Rows of the other `+shared` methods and of `ucf-wo-count` in SARDINE and "
+        "KuaiRand than `bc`, `dt`, `ucf` and, in KuaiRand, `cdt4rec` are of an earlier selection of "
+        "rules.",
         f"`{RUN} main`",
         of("recommendation", "main"),
         returns,

@@ -482,9 +482,9 @@ SECTIONS = (
         "log. Bold is the highest mean of a column among policies that "
         "do not know the simulator. The shared components decide, not the network: with them all "
         "methods are level in the catalogue and in KuaiRand, and behaviour cloning is ahead of UCF "
-        "by 2 in SARDINE. Rows of the other `+shared` methods and of `ucf-wo-count` in SARDINE and "
-        "KuaiRand than `bc`, `dt`, `ucf` and, in KuaiRand, `cdt4rec` are of an earlier selection of "
-        "rules.",
+        "by 2 in SARDINE. In SARDINE and KuaiRand the rows of `+shared` methods are of an earlier "
+        "selection of rules, but for `bc`, `dt`, `ucf` and, in KuaiRand, `cdt4rec`; so are those "
+        "of `ucf-wo-count` there.",
         f"`{RUN} main`",
         of("recommendation", "main"),
         returns,

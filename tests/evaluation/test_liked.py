@@ -81,7 +81,9 @@ def test_what_is_no_truth_value_over_the_reward_is_refused(expression: str, says
 
 def test_the_default_states_its_threshold(folder: Path) -> None:
     said = str(LikedByRange(EpisodeStore.open(folder / "store").item_states))
-    assert said.startswith("reward >= 3.2 (60% of the way from 0.5, the lowest training reward, to 5,")
+    assert said.startswith(
+        "reward >= 3.2 (60% of the way from 0.5, the lowest training reward, to 5,"
+    )
 
 
 def ranked(folder: Path, out: Path, *arguments: str) -> pd.DataFrame:

@@ -20,7 +20,7 @@ from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined
-from ucfrec.logs.tables import Table, open_tables, quoted, raw_name
+from ucfrec.logs.tables import Table, open_tables, quoted
 from ucfrec.logs.typed import WANTED, typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -214,20 +214,7 @@ def _with_others(table: Table, narrow: Table, more: Mapping[str, _More]) -> Tabl
     texts = [name for name, kind in kinds.items() if kind == "VARCHAR"]
     columns = [name for name in kinds if name not in texts]
     columns += [name for key, name in names_of(table).items() if key in more]
-    return _with_texts(narrow, columns, texts)
-
-
-def _text(table: Table, name: str) -> str:
-    """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
-    return f"CAST({quoted(name if table.columnar else raw_name(name))} AS VARCHAR)"
-
-
-def _with_texts(narrow: Table, columns: Sequence[str], texts: Sequence[str]) -> Table:
-    """A table with more columns and the text of some, see `_text`."""
-    used = [*(narrow.used or ()), *columns]
-    if narrow.columnar:
-        return narrow.of([*used, *texts], narrow.raw)
-    return narrow.of(used, [*narrow.raw, *texts])
+    return narrow.with_texts(columns, texts)
 
 
 def _make_feedback(
@@ -318,7 +305,7 @@ def _write(
     filled = [f"{one.value} AS {quoted(one.name)}" for k, one in more.items() if k not in again]
     for name, each in named.items():
         before = more.get(name.casefold())
-        filled.append(f"{_filled(each, before)} AS {quoted(name)}")
+        filled.append(f"{_filled(each, before, name == FEEDBACK)} AS {quoted(name)}")
     internal = "row", FEEDBACK, *values, *(each.value for each in more.values())
     user = "CAST(user_id AS BIGINT) AS user_id" if _whole_users(connection) else "user_id"
     query = (
@@ -333,12 +320,16 @@ def _write(
                 writer.write_batch(batch)
 
 
-def _filled(value: str, before: _More | None) -> str:
-    """SQL of a column of feedback, with what an earlier join found of it."""
+def _filled(value: str, before: _More | None, counts: bool) -> str:
+    """SQL of a column of feedback, with what an earlier join found of it.
+
+    Args:
+        counts: whether it counts rows, which are added; of other columns the larger value is kept.
+    """
     value = f"coalesce({value}, 0)"
     if before is None or not before.is_number:
         return value
-    if value == f"coalesce({FEEDBACK}, 0)":
+    if counts:
         return f"{value} + CAST(coalesce({before.value}, 0) AS BIGINT)"
     return f"greatest({value}, CAST(coalesce({before.value}, 0) AS DOUBLE))"
 

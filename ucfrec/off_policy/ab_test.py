@@ -20,12 +20,10 @@ from ucfrec.logs.engine import engine
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quoted
-from ucfrec.off_policy.intervals import cluster_mean
+from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
-FEWEST: Final = 10
-"""Users of an arm below which their spread says too little for an interval."""
 EXPECTED: Final = 0.05
 """Difference that the always-valid interval is tuned for, as a share of the first arm's value."""
 _LARGEST: Final = 1e100
@@ -56,7 +54,7 @@ class Comparison:
     """Its standard error, over users."""
     low: float | None
     """Ends of the 95% interval, for a test that ends when it was planned to; None, as the others,
-    where an arm has fewer than `FEWEST` users or no user differs from another of the arm."""
+    where an arm has fewer than `FEWEST_USERS` users or no user differs from another of the arm."""
     high: float | None
     always_low: float | None
     """Ends of the 95% interval that may be looked at as often as one likes, and acted upon."""
@@ -92,8 +90,8 @@ class Comparison:
         first, second = self.arms
         if self.always_low is None or self.always_high is None:
             return (
-                f"nothing can be said yet: an arm has fewer than {FEWEST} users with a value, or "
-                f"{self.column} is the same for all users of an arm"
+                f"nothing can be said yet: an arm has fewer than {FEWEST_USERS} users with a "
+                f"value, or {self.column} is the same for all users of an arm"
             )
         if self.always_low > 0:
             return f"{second} is better than {first}"
@@ -169,7 +167,7 @@ def compare_arms(
     difference, variance = values[1] - values[0], errors[0] ** 2 + errors[1] ** 2
     error = math.sqrt(variance)
     ends: tuple[float | None, ...] = (None,) * 4
-    if min(errors) > 0 and min(len(found[name]) for name in names) >= FEWEST:
+    if min(errors) > 0 and min(len(found[name]) for name in names) >= FEWEST_USERS:
         always = always_valid(difference, variance, expected or EXPECTED * abs(values[0]) or error)
         ends = difference - _NORMAL * error, difference + _NORMAL * error, *always
     return Comparison(

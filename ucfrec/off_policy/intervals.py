@@ -12,6 +12,8 @@ RESAMPLES = 2000
 MOST_CLUSTERS = 10_000
 """Of more, random groups are drawn, all of about one size: the error stays, and time and memory do
 not grow with the logs."""
+FEWEST_USERS = 10
+"""Users below which their spread says too little for a conclusion."""
 _COUNTS_AT_ONCE = 2**22
 _USABLE = 0.9
 """Share of resamples that must have a spread of their own."""

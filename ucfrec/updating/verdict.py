@@ -11,7 +11,7 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.intervals import cluster_intervals, cluster_mean
+from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_intervals, cluster_mean
 from ucfrec.off_policy.score import scored_steps
 from ucfrec.off_policy.verdict import OTHERS_REMOVED
 from ucfrec.results.statistics import effective_number
@@ -27,9 +27,6 @@ _ERRORS: Final = 3.0
 _LEAST_STEPS: Final = 30
 """Effective steps below which weights say nothing."""
 _SEEN_REMOVED: Final = "as where it was served without seen items: update with --filter-seen"
-
-_LEAST_USERS: Final = 10
-"""Users with rows below which an interval over users says nothing."""
 
 
 def compare_runs(
@@ -152,8 +149,8 @@ def _difference(
     """The ratio of sums over steps (N, 1), with its interval over users."""
     low = high = value = float(above.sum() / below.sum())
     users = len(np.unique(user[below[:, 0] > 0]))
-    if users < _LEAST_USERS:
-        doubt = f"{users} user{'s' * (users != 1)}, fewer than {_LEAST_USERS}, have such rows"
+    if users < FEWEST_USERS:
+        doubt = f"{users} user{'s' * (users != 1)}, fewer than {FEWEST_USERS}, have such rows"
     (interval,) = cluster_intervals(above, below, user, seed)
     if interval is not None and np.isfinite([interval.low, interval.high]).all():
         low, high = interval.low, interval.high

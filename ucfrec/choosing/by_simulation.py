@@ -25,6 +25,7 @@ from ucfrec.choosing.choice import (
     RuleChoice,
     SimulatedRule,
     ValueEstimate,
+    chosen_by,
     doubts_of,
 )
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
@@ -317,7 +318,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
-        chosen_by=_chosen_by(search.users) + where,
+        chosen_by=chosen_by(search.users) + where,
         candidates=[best if each.rule == best.rule else each for each in tried],
         warning=_warning(search, best, estimate),
         estimate=estimate,
@@ -443,21 +444,3 @@ def _least_evident(candidate: SimulatedRule) -> tuple[float, ...]:
     assert evidence is not None
     support = users if users >= _FEWEST else evidence.likelihood
     return (-support, -round(evidence.hits, 2), *_simplicity(candidate))
-
-
-def _chosen_by(users: UserModel) -> str:
-    if users.training_users is None:
-        return (
-            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
-            "propensities are used"
-        )
-    report = users.training_users.report
-    whose = "new users" if users.reward_report.new_users else "validation users"
-    weighted = "weighted by their propensities" if report.weighted else "without weights"
-    checked = users.calibration_report
-    if checked is not None and checked.weighted:
-        weighted += ", and calibrated by propensities"
-    return (
-        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
-        f"are fitted to {report.steps:,} training rows {weighted}"
-    )

@@ -152,6 +152,25 @@ def doubts_of(value: float, error: float, users: UserModel, some: bool) -> tuple
     return tuple(said)
 
 
+def chosen_by(users: UserModel) -> str:
+    """What chooses a rule in simulated sessions, in words."""
+    if users.training_users is None:
+        return (
+            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
+            "propensities are used"
+        )
+    report = users.training_users.report
+    whose = "new users" if users.reward_report.new_users else "validation users"
+    weighted = "weighted by their propensities" if report.weighted else "without weights"
+    checked = users.calibration_report
+    if checked is not None and checked.weighted:
+        weighted += ", and calibrated by propensities"
+    return (
+        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
+        f"are fitted to {report.steps:,} training rows {weighted}"
+    )
+
+
 @dataclass(frozen=True)
 class RankedRule:
     """A rule and how it ranks validation rows."""

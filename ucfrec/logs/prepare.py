@@ -322,9 +322,8 @@ def prepared_log(
                 _require_known_ids(log, mapping, features, noted=onto is None)
                 report = _report(rows, spool, cut, measures)
                 report = {"reward": reward, **report, "duplicates": options.duplicates}
-                report["dataset"] = options.dataset
+                report |= {"dataset": options.dataset, **_remembered(mapping)}
                 report |= {"min_steps": options.min_steps, "max_session": options.max_session}
-                report |= _remembered(mapping)
                 report["features"] = [name for name, names in features.items() if names]
                 stage.update()
         yield PreparedLog(rows, spool, cut, measures, features, report, scratch)

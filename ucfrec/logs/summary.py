@@ -256,9 +256,8 @@ def note_one_item(rows: SortedRows, measures: Measures) -> None:
 
 def note_empty_splits(rows: SortedRows, cut: Cut, measures: Measures) -> None:
     """Warn of times of a split that leave a part of the log without rows."""
-    names = [name for name, (_, steps) in zip(schema.SPLITS, measures.splits, strict=True)
-             if not steps]  # fmt: skip
-    if names:
+    of_splits = zip(schema.SPLITS, measures.splits, strict=True)
+    if names := [name for name, (_, steps) in of_splits if not steps]:
         begin, end = (_clock(time) for time in (measures.first_ms, measures.last_ms))
         _note(
             rows,

@@ -21,15 +21,16 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = ROOT / ".ci" / "sizes.toml"
 PACKAGES = ("ucfrec", "datasets", "simulators", "control")
-VAGUE = set(
+VAGUE = (
     "given found told said asked shown kept known own each many few others rest wanted lacking here"
     " there about like onto over before after begun listed read made used drawn tried named placed"
-    " settled explained checked all_ one other".split()
+    " settled explained checked all_ one other"
 )
-PREPOSITIONS = set("of in on with without by at near from as over to like onto under".split())
+PREPOSITIONS = "of in on with without by at near from as over to like onto under"
 VERBS_IN_ED = {"need", "seed", "feed", "embed", "speed"}
 NOUNS_ALLOWED = {"property", "cached_property", "classmethod", "fixture"}
 """Decorators of functions that may be called by a noun, or `from_…`."""
+VAGUE_NAMES, FIRST_WORDS = set(VAGUE.split()), set(PREPOSITIONS.split())
 
 
 def tracked_files() -> list[Path]:
@@ -52,16 +53,20 @@ def count_lines(files: list[Path], rooms: str) -> int:
 def scan_names(file: Path) -> Iterator[tuple[str, int, str]]:
     """(kind, line, name) of every function, vague name, verbless function and starred call."""
     for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in VAGUE:
+        if (
+            isinstance(node, ast.Name)
+            and isinstance(node.ctx, ast.Store)
+            and node.id in VAGUE_NAMES
+        ):
             yield "vague", node.lineno, node.id
-        elif isinstance(node, ast.arg) and node.arg in VAGUE:
+        elif isinstance(node, ast.arg) and node.arg in VAGUE_NAMES:
             yield "vague", node.lineno, node.arg
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield "function", node.lineno, node.name
             first = node.name.strip("_").split("_")[0]
             decorators = {getattr(d, "id", getattr(d, "attr", "")) for d in node.decorator_list}
             participle = first.endswith("ed") and first not in VERBS_IN_ED
-            if not decorators & NOUNS_ALLOWED and (first in PREPOSITIONS or participle):
+            if not decorators & NOUNS_ALLOWED and (first in FIRST_WORDS or participle):
                 yield "verbless", node.lineno, node.name
         elif isinstance(node, ast.Call) and any(isinstance(a, ast.Starred) for a in node.args):
             yield "starred", node.lineno, ast.unparse(node.func)

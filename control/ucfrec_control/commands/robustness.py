@@ -21,7 +21,7 @@ from ucfrec_control.benchmark.robustness import (
     screening_rows,
 )
 from ucfrec_control.commands.options import (
-    choices_options,
+    context_option,
     control_grid_options,
     data_option,
     rows_of_suite,
@@ -31,7 +31,7 @@ from ucfrec_control.commands.options import (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
     data_option(parser)
-    choices_options(parser)
+    context_option(parser)
     control_grid_options(parser)
 
 

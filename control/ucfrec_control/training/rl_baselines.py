@@ -174,17 +174,6 @@ def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RL
     return RLConfig(algorithm=algorithm, task=task.name if task else "", kind=kind, **settings)
 
 
-def action_loss(run: Path, store: EpisodeStore) -> float:
-    """Mean squared error of the actor's mean actions at all validation steps of `store`, whose
-    training `run` is."""
-    validation = store.split("validation")
-    steps = validation.all_steps()
-    policy = RLPolicy(run)
-    live = np.ones(len(steps[0]), dtype=bool)
-    taken, _ = policy.act(validation.step_values(schema.OBSERVATION, *steps), live)
-    return float(np.mean((taken - validation.step_values(schema.ACTION, *steps)) ** 2))
-
-
 def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
     """`config` and `seed` in the form of a run's record."""
     return {"policy_name": config.algorithm, "policy": asdict(config), "seed": seed}
@@ -261,28 +250,6 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
         record.written(out)
         (out / _CHECKPOINT).unlink()
     return record.sealed(out)
-
-
-@random_state_kept()
-def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
-    """Seconds of one update of a training on `store`, by the time of a few.
-
-    Raises:
-        InputError: d3rlpy is not installed.
-    """
-    d3rlpy, train = _d3rlpy(), store.split("train")
-    mean, std = _statistics(train, config)
-    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
-    algorithm, times = _algorithm(config), [0.0]
-    algorithm.fit(
-        dataset,
-        n_steps=updates + 2,
-        n_steps_per_epoch=updates + 2,
-        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-        show_progress=False,
-        callback=lambda *_: times.append(perf_counter()),
-    )
-    return (times[-1] - times[2]) / updates
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:

@@ -35,8 +35,8 @@ from ucfrec_control.benchmark.plan import (
     SEARCHED,
     presets_of,
     score_cells,
+    set_contexts,
     stores_of,
-    with_contexts,
 )
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
@@ -105,7 +105,7 @@ def context_cells(data: Path, out: Path, budget: Budget) -> Iterator[Cell]:
         budget, tasks=FILES, seeds=1, evaluation=replace(budget.evaluation, seed=SEARCH_SEED)
     )
     for context in CONTEXTS:
-        longer = with_contexts(budget, dict.fromkeys(WITH_HISTORY, context))
+        longer = set_contexts(budget, dict.fromkeys(WITH_HISTORY, context))
         for cell in score_cells(data, out, longer, MAIN, WITH_HISTORY):
             yield replace(cell, suite="contexts", table="contexts", conditions={"context": context})
 

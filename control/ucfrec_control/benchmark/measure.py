@@ -40,7 +40,7 @@ def config(cell: Cell) -> dict[str, Any] | None:
 
 def rl_config_of(cell: Cell) -> RLConfig:
     """The configuration of an IQL or CQL training, whose settings are `field=value` in JSON."""
-    parts = (each.partition("=") for each in cell.settings)
+    parts = (setting.partition("=") for setting in cell.settings)
     settings = {name: json.loads(value) for name, _, value in parts}
     return rl_config(dataset_of(opened(cell)), cell.policy, **settings)
 
@@ -55,8 +55,8 @@ def targets_of(cell: Cell) -> Sequence[float]:
     """The target returns of the preset, or the first; empty if the policy knows its own."""
     if cell.policy not in ALGORITHMS and cell.config.policy.max_return:
         return ()
-    found = preset_of(dataset_of(opened(cell)), cell.policy).targets
-    return found if cell.evaluation.all_targets else found[:1]
+    targets = preset_of(dataset_of(opened(cell)), cell.policy).targets
+    return targets if cell.evaluation.all_targets else targets[:1]
 
 
 def train(cell: Cell) -> RunRecord | RLRecord:

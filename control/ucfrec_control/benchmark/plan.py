@@ -46,7 +46,7 @@ def score_cells(
     Raises:
         InputError: a file is missing, or a method is not in the table.
     """
-    selected = _selected(TABLES[table], methods or budget.methods)
+    selected = _select(TABLES[table], methods or budget.methods)
     plan = _plan(SCORES, folder, budget)
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
@@ -54,7 +54,7 @@ def score_cells(
             yield from plan.trained(table, Task(file, store), selected)
 
 
-def with_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
+def set_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
     """`budget` with contexts of single methods."""
     settings = dict(budget.of_methods)
     for name, context in contexts.items():
@@ -71,7 +71,7 @@ def robustness_cells(
 ) -> Iterator[Cell]:
     """The cells of some methods of `ROBUST` and distractors (empty for all); arguments and errors
     as of `score_cells`."""
-    selected = _selected(ROBUST, methods)
+    selected = _select(ROBUST, methods)
     plan = _plan(ROBUSTNESS, folder, budget)
     for file in budget.tasks:
         for distractor in distractors or DISTRACTORS:
@@ -89,7 +89,7 @@ def presets_of(store: EpisodeStore, policy: str) -> Presets:
     return {} if policy in ALGORITHMS else preset_of(dataset_of(store), policy).tables
 
 
-def _selected(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
+def _select(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
     return {name: methods[name] for name in chosen(methods, names, "method")}
 
 
@@ -97,7 +97,7 @@ def _time_settings(settings: Sequence[str]) -> tuple[str, ...]:
     return tuple(setting for setting in settings if setting.startswith("policy.max_timestep"))
 
 
-def _tuned_methods() -> Methods:
+def _find_tuned() -> Methods:
     """The methods of the main table that can have a learning rate of their own: one for each policy
     with embeddings of time, and one without."""
     methods: dict[tuple[str, tuple[str, ...]], str] = {}
@@ -106,7 +106,7 @@ def _tuned_methods() -> Methods:
     return {name: METHODS[name] for name in methods.values()}
 
 
-_TUNED: Final = _tuned_methods()
+_TUNED: Final = _find_tuned()
 SEARCHED: Final = {
     name: method
     for name, method in _TUNED.items()

@@ -62,8 +62,8 @@ def largest_drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     """The largest of each method's drops, in percent, with the distractor fixed to 0 and to 1: over
     datasets and distractors, each in the mean over seeds."""
     lines = []
-    for method, own in grouped(drops(rows), lambda line: line["method"]).items():
-        cases = grouped(own, lambda line: (line["task"], line["distractor"])).values()
+    for method, lines_of_method in grouped(drops(rows), lambda line: line["method"]).items():
+        cases = grouped(lines_of_method, lambda line: (line["task"], line["distractor"])).values()
         largest = [
             max(summary(line[name] for line in case).mean for case in cases)
             for name in ("drop", "drop_at_one")
@@ -124,7 +124,7 @@ def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     began = time.perf_counter()
     report = screen(training_views(store)[0], ScreeningConfig(), SEED)
     dimensions = verdicts(report.dimensions, store)
-    wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
+    wrong = sum(dimension["flagged"] and not dimension["distractor"] for dimension in dimensions)
     row = ResultRow(
         **vars(row_key),
         metric="true_flagged",
@@ -145,11 +145,13 @@ SCREENING_MEASUREMENT: Final = measured_by(_measure, _config)
 
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
     """The verdict of a screening report on each state dimension of `store`."""
-    added = {each["dimension"] for each in store.record.source.others.get("distractors", [])}
+    distractors = {
+        distractor["dimension"] for distractor in store.record.source.others.get("distractors", [])
+    }
     return [
         {
             "dimension": d.dimension,
-            "distractor": d.dimension in added,
+            "distractor": d.dimension in distractors,
             "flagged": not d.causes,
             "effect": d.effect,
             "p_value": d.p_value,

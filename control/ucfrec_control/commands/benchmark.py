@@ -76,9 +76,9 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
             print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")
-    shown = (*values, "acceptance")
+    columns = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
-    print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
+    print(format_rows(over_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
     reference = UCF if table == MAIN or not last else last[0].method
     for name in values:
         if lines := difference_table(last, reference, name):

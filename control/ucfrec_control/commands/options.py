@@ -13,7 +13,7 @@ from ucfrec.errors import InputError, one_line
 from ucfrec.results.row import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
-from ucfrec_control.benchmark.plan import with_contexts
+from ucfrec_control.benchmark.plan import set_contexts
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
@@ -121,10 +121,10 @@ def rows_of_suite(
     """
     budget = narrow_budget(budget_of(suite, options.budget), options)
 
-    def listed() -> Iterable[Cell]:
+    def list_cells() -> Iterable[Cell]:
         return cells(data_given(options), options.out, budget, options.methods)
 
-    return rows_of(options, suite, (), listed, how)
+    return rows_of(options, suite, (), list_cells, how)
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:
@@ -163,4 +163,4 @@ def narrow_budget(budget: Budget, options: argparse.Namespace) -> Budget:
     budget = budget.narrowed(
         options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
     )
-    return with_contexts(budget, dict(options.contexts))
+    return set_contexts(budget, dict(options.contexts))

@@ -71,10 +71,10 @@ def run(options: argparse.Namespace) -> None:
         else:
             print_scores(rows, part.table)
         if part.of_runs:
-            made, _ = make_figures(
+            files, _ = make_figures(
                 [cell.run for cell in cells if cell.run is not None], [], pictures
             )
         else:
-            made = make_row_figures(rows, pictures)
-    print("\n".join(["", *map(str, made)]))
+            files = make_row_figures(rows, pictures)
+    print("\n".join(["", *map(str, files)]))
     print(f"\nrows: {results}")

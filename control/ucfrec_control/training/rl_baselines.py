@@ -154,7 +154,7 @@ class RLPolicy(Memoryless):
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """The policy's mean actions (N, A)."""
-        return self._algorithm.predict(_normalised(observations, self._mean, self._std)), None
+        return self._algorithm.predict(_normalise(observations, self._mean, self._std)), None
 
 
 def is_rl(record: RunRecord | RLRecord) -> bool:
@@ -202,8 +202,8 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
         existing = RLRecord.read(out)
-        wanted = (plain_config(config, seed), store.record.fingerprint)
-        if (existing.settings, existing.fingerprint) != wanted:
+        expected = (plain_config(config, seed), store.record.fingerprint)
+        if (existing.settings, existing.fingerprint) != expected:
             raise InputError(
                 f"{out} has a run with other settings or data; remove it or name another folder"
             )
@@ -304,7 +304,7 @@ def _dataset(d3rlpy: Any, train: EpisodeStore, mean: Array, std: Array) -> Any:
     terminated = train.episode_values(schema.TERMINATED).astype(bool)[episodes]
     observations = train.step_values(schema.OBSERVATION, episodes, steps)
     return d3rlpy.dataset.MDPDataset(
-        _normalised(observations, mean, std),
+        _normalise(observations, mean, std),
         train.step_values(schema.ACTION, episodes, steps),
         train.step_values(schema.REWARD, episodes, steps),
         terminals=(last & terminated).astype(np.float32),
@@ -395,7 +395,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     )
 
 
-def _normalised(states: Array, mean: Array, std: Array) -> Float32Array:
+def _normalise(states: Array, mean: Array, std: Array) -> Float32Array:
     normalised: Float32Array = ((states - mean) / std).astype(np.float32)
     return normalised
 

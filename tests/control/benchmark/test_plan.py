@@ -29,7 +29,7 @@ from ucfrec_control.benchmark.methods import (
     SCREENED,
     TABLES,
 )
-from ucfrec_control.benchmark.plan import SEARCHED, score_cells, settings_of, with_contexts
+from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
 from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
@@ -140,7 +140,7 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
 def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8))
     medium = replace(budget_of(MAIN, "medium"), tasks=("hopper_medium-made",), tasks_of={})
-    budget = with_contexts(medium, {"dc-wo-time": 20})
+    budget = set_contexts(medium, {"dc-wo-time": 20})
     contexts = {
         cell.method: cell.config.policy.context
         for cell in score_cells(tmp_path, tmp_path / "out", budget, MAIN)

@@ -15,7 +15,6 @@ CONTROL = Program(
         "convert": "convert D4RL HDF5 to Minari, or back",
         "distract": "add a distractor to the states of a store",
         "screen": "find state dimensions that have no effect",
-        "screen-all": "screen every zoo file and distractor; resumes",
         "train": "train a policy on a store; resumes",
         "evaluate": "measure normalised scores of trained policies",
         "benchmark": "measure every method on the zoo files; resumes",

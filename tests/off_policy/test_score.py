@@ -243,7 +243,7 @@ def test_rows_that_repeat_count_as_in_the_training_log(
     twice = pd.concat([log, log.assign(reward=kept(-1.0, 2.0)), log.assign(reward=0.5)])
     twice.to_parquet(tmp_path / "twice.parquet")
     data = trained.record.data.model_copy(update={"duplicates": duplicates})
-    alike = replace(trained, record=trained.record.with_entries(data=data))
+    alike = replace(trained, record=trained.record.copy_with(data=data))
     with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
 

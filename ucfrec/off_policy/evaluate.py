@@ -44,7 +44,7 @@ from ucfrec.off_policy.verdict import (
     conclude,
     influences,
 )
-from ucfrec.provenance import without_folders
+from ucfrec.provenance import shorten_paths
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -195,7 +195,7 @@ def evaluate_off_policy(
 def conditions(run: Path, sessions: int, steps: int, options: EstimateOptions) -> dict[str, Scalar]:
     """How the logs were read, and their size."""
     return {
-        "run": without_folders(str(run)),
+        "run": shorten_paths(str(run)),
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,

@@ -17,7 +17,7 @@ from ucfrec.acting.uniform import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
-from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.locks import lock_path, remove_leftovers_within
 from ucfrec.processes import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
@@ -85,7 +85,7 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             process, the environment cannot be created or has no step limit, its action space is not
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
-    with claimed(out, "filled"):
+    with lock_path(out, "filled"):
         _require_incomplete(out)
         return _collect(env_id, out, seed, config)
 
@@ -113,7 +113,7 @@ def collect_agent(
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
-    with claimed(out, "filled"):
+    with lock_path(out, "filled"):
         _require_incomplete(out)
         env = make_env(env_id, 1)
         shape, space = env.single_observation_space.shape or (), env.single_action_space

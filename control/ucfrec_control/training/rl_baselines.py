@@ -20,7 +20,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.locks import lock_path, remove_leftovers_within
 from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
@@ -192,7 +192,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLR
         InputError: d3rlpy is not installed, `out` is of another configuration or other data, or
             another process is training in it.
     """
-    with claimed(out, "trained"):
+    with lock_path(out, "trained"):
         remove_leftovers_within(out)
         return _train(store, out, config, seed)
 
@@ -243,13 +243,13 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     log.close()
     actor = algorithm.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
-    record = record.with_entries(
+    record = record.copy_with(
         policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
     )
     if (out / _CHECKPOINT).exists():
-        record.written(out)
+        record.write(out)
         (out / _CHECKPOINT).unlink()
-    return record.sealed(out)
+    return record.seal(out)
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
@@ -271,7 +271,7 @@ def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
         "wall_time_s": 0.0,
     }
     with atomic_folder(out) as scratch:
-        RLRecord.of(entries, out / RUN).sealed(scratch)
+        RLRecord.of(entries, out / RUN).seal(scratch)
 
 
 def _resume(path: Path, algorithm: Any, dataset: Any) -> tuple[int, float]:

@@ -35,13 +35,13 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 CHILDREN = """
 import os, sys, time
 from pathlib import Path
-from ucfrec.processes import pool_of_processes, without_ctrl_c
+from ucfrec.processes import pool_of_processes, block_ctrl_c
 def work(folder):
     (Path(folder) / str(os.getpid())).write_text("")
     time.sleep(60)
 if __name__ == "__main__":
     with pool_of_processes(2) as pool:
-        with without_ctrl_c():
+        with block_ctrl_c():
             waiting = [pool.submit(work, sys.argv[1]) for _ in range(2)]
         [each.result() for each in waiting]
 """

@@ -96,7 +96,7 @@ def _is_list(value: object) -> bool:
     return isinstance(value, Iterable) and not isinstance(value, (str, bytes))
 
 
-def of_kind(what: str, *kinds: Any) -> Check:
+def require_kind(what: str, *kinds: Any) -> Check:
     """A check that a value is of one of some types.
 
     Args:

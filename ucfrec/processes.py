@@ -126,7 +126,7 @@ def interruptions_raised() -> Iterator[None]:
 
 
 @contextmanager
-def without_ctrl_c() -> Iterator[None]:
+def block_ctrl_c() -> Iterator[None]:
     """Processes that are started in the block are not reached by Ctrl-C; their parent ends them."""
     if not hasattr(signal, "pthread_sigmask"):  # on Windows
         yield
@@ -163,7 +163,7 @@ def pool_of_processes(
 ) -> "Iterator[ProcessPoolExecutor]":
     """Yield a pool whose processes end when the block raises, and when this process is killed.
 
-    Work must be submitted within `without_ctrl_c`, because Ctrl-C on a terminal reaches every
+    Work must be submitted within `block_ctrl_c`, because Ctrl-C on a terminal reaches every
     process of a command, and this one ends the others.
 
     Args:

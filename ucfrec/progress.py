@@ -47,7 +47,7 @@ def progress(total: float | None, job: str, unit: str, done: float = 0) -> Itera
 
 
 @contextmanager
-def labelled(name: str) -> Iterator[None]:
+def label_progress(name: str) -> Iterator[None]:
     """Name this job in the progress of all that it does, as one of several at the same time."""
     before = _LABEL.set(name)
     try:

@@ -44,10 +44,10 @@ def command_line() -> str:
 
     Result rows are published and must not reveal the folders of a machine.
     """
-    return " ".join([Path(sys.argv[0]).name, *map(without_folders, sys.argv[1:])])
+    return " ".join([Path(sys.argv[0]).name, *map(shorten_paths, sys.argv[1:])])
 
 
-def without_folders(argument: str) -> str:
+def shorten_paths(argument: str) -> str:
     """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
     option, equals, value = "", "", argument
     if not _is_absolute(argument):

@@ -19,7 +19,7 @@ def sealed(tmp_path: Path) -> Path:
     """A folder with two files and their record."""
     for name in ("a", "b"):
         (tmp_path / name).write_text(name)
-    Example(files={}, version=1, numbers=(0.5,)).sealed(tmp_path)
+    Example(files={}, version=1, numbers=(0.5,)).seal(tmp_path)
     return tmp_path
 
 
@@ -34,12 +34,12 @@ def test_sealing_again_signs_off_no_damage(sealed: Path) -> None:
     record = Example.read(sealed)
     (sealed / "b").write_text("B")
     (sealed / "new").write_text("1")
-    assert "new" in record.sealed(sealed).files
+    assert "new" in record.seal(sealed).files
     assert [name for name, _ in Example.read(sealed).checksums(sealed).faults()] == ["b"]
 
 
 def test_reopening_leaves_only_what_stays(sealed: Path) -> None:
-    assert set(Example.read(sealed).reopened(sealed, ("b",)).files) == {"b"}
+    assert set(Example.read(sealed).reopen(sealed, ("b",)).files) == {"b"}
     assert set(Example.read(sealed).files) == {"b"}
 
 
@@ -80,7 +80,7 @@ def three_files(tmp_path: Path) -> Path:
     (folder / "inner").mkdir(parents=True)
     for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(3_000_000))):
         (folder / name).write_bytes(content)
-    Example(files={}, version=1, numbers=(0.1, float("nan"))).sealed(folder)
+    Example(files={}, version=1, numbers=(0.1, float("nan"))).seal(folder)
     return folder
 
 

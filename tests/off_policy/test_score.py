@@ -249,7 +249,7 @@ def test_rows_that_repeat_count_as_in_the_training_log(
     twice = pd.concat([log, log.assign(reward=kept(-1.0, 2.0)), log.assign(reward=0.5)])
     twice.to_parquet(tmp_path / "twice.parquet")
     data = trained.record.data.model_copy(update={"duplicates": duplicates})
-    alike = replace(trained, record=trained.record.with_entries(data=data))
+    alike = replace(trained, record=trained.record.copy_with(data=data))
     with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
 
@@ -336,7 +336,7 @@ def test_without_the_training_store_nothing_is_known(
     shutil.copytree(folder / "store", tmp_path / "store")
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
-        moved = replace(trained, record=trained.record.with_entries(**places))
+        moved = replace(trained, record=trained.record.copy_with(**places))
         with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
             assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
 
@@ -346,7 +346,7 @@ def test_a_run_that_was_moved_with_its_store_finds_it(
 ) -> None:
     for name in ("run", "store"):
         shutil.copytree(folder / name, tmp_path / name)
-    record = trained.record.with_entries(store=str(tmp_path / "gone"))
+    record = trained.record.copy_with(store=str(tmp_path / "gone"))
     found = store_of(tmp_path / "run", record)
     assert found is not None
     assert found.path == (tmp_path / "store").resolve()

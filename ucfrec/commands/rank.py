@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
         seen_too_often,
         share_seen,
     )
-    from ucfrec.provenance import without_folders
+    from ucfrec.provenance import shorten_paths
     from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
             f"{lost:.1%} of the steps show an item that the user has seen, which is excluded: "
             f"hit_rate_shown is at most {1 - lost:.3g}; --keep-seen ranks these items too"
         )
-    on = ", ".join(map(without_folders, options.logs)) or "the test split"
+    on = ", ".join(map(shorten_paths, options.logs)) or "the test split"
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")

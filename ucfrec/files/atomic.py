@@ -13,7 +13,7 @@ from typing import Any, Final
 import xxhash
 
 from ucfrec.errors import InputError, explain_os_error
-from ucfrec.files.locks import claim, claimed, remove, remove_leftovers, scratch_of
+from ucfrec.files.locks import claim, lock_path, remove, remove_leftovers, scratch_of
 
 CHECKSUM: Final = "checksum"
 """Entry of a JSON object with the checksum of its other entries; see `content_checksum`."""
@@ -32,7 +32,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         InputError: `path` exists already, or another process is writing it.
     """
     _require_absent(path)
-    with claimed(path):
+    with lock_path(path):
         _require_absent(path)
         remove_leftovers(path.parent)
         scratch = scratch_of(path)

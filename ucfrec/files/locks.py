@@ -83,7 +83,7 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
 
 
 @contextmanager
-def claimed(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
+def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
     """Hold the claim on `path`, or say who does.
 
     Args:
@@ -139,7 +139,7 @@ def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
     If this process is killed, the next one that calls this or `remove_leftovers` removes it.
     """
     path = parent / f"{name}-{secrets.token_hex(8)}"
-    with claimed(path):
+    with lock_path(path):
         remove_leftovers(parent)
         scratch = scratch_of(path)
         scratch.mkdir(mode=0o700)

@@ -238,18 +238,18 @@ class Record(Entry):
         except ValidationError as error:
             raise _first_fault(error, path, cls.REMEDY) from None
 
-    def with_entries(self, **entries: Any) -> Self:
+    def copy_with(self, **entries: Any) -> Self:
         """A copy with other entries."""
         return self.model_copy(update=entries)
 
-    def sealed(self, folder: Path) -> Self:
+    def seal(self, folder: Path) -> Self:
         """Write the record of a complete folder, with the checksums of the other files in it.
 
         A file that is listed already keeps its checksum, so that damage since is not signed off.
         """
-        return self.with_entries(files=files_of(folder, self.FILE, self.files)).written(folder)
+        return self.copy_with(files=files_of(folder, self.FILE, self.files)).write(folder)
 
-    def reopened(self, folder: Path, kept: Container[str]) -> Self:
+    def reopen(self, folder: Path, kept: Container[str]) -> Self:
         """Write the record before files of the folder change.
 
         Args:
@@ -257,9 +257,9 @@ class Record(Entry):
             kept: files that will not change; the others are no longer listed.
         """
         listed = {name: entry for name, entry in self.files.items() if name in kept}
-        return self if listed == self.files else self.with_entries(files=listed).written(folder)
+        return self if listed == self.files else self.copy_with(files=listed).write(folder)
 
-    def written(self, folder: Path) -> Self:
+    def write(self, folder: Path) -> Self:
         """Write the record as it is; returns it."""
         write_sealed_json(folder / self.FILE, self.model_dump())
         return self

@@ -29,7 +29,7 @@ from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, number_pages
 from ucfrec.off_policy.score import LoggedSessions, scored_steps, seen_too_often, share_seen
 from ucfrec.off_policy.verdict import Verdict, conclude, list_cautions
-from ucfrec.provenance import config_hash, provenance, without_folders
+from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -233,7 +233,7 @@ def make_report(
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *doubts.remarks]
     record, choice = trained.record, "softmax" if rule.draws else "greedy"
     conditions: dict[str, Scalar] = {
-        "run": without_folders(str(trained.folder)),
+        "run": shorten_paths(str(trained.folder)),
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,

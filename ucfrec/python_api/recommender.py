@@ -16,7 +16,7 @@ import pandas as pd
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arguments import (
     checked,
-    of_kind,
+    require_kind,
     require_number,
     require_seed,
     require_whole,
@@ -46,7 +46,7 @@ from ucfrec.off_policy.evaluate import (
 )
 from ucfrec.off_policy.score import score, seen_too_often, share_seen
 from ucfrec.policies.registry import policy_class
-from ucfrec.provenance import without_folders
+from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,
@@ -79,16 +79,16 @@ _checked: Final = checked(
         "seed": require_seed,
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
         **dict.fromkeys(
-            ("reward", "session_by", "dataset", "screen", "liked"), of_kind("text", str)
+            ("reward", "session_by", "dataset", "screen", "liked"), require_kind("text", str)
         ),
-        **dict.fromkeys(("out", "run", "folder", "file"), of_kind("a path", str, Path)),
-        **dict.fromkeys(("on_step", "on_validation"), of_kind("a function", Callable)),
+        **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
+        **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
         "split": split_given,
-        "histories": of_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
-        "rule": of_kind("a DecisionRule", DecisionRule),
-        "options": of_kind("EstimateOptions", EstimateOptions),
-        "environment": of_kind("the name of a simulator or an Environment", str, Environment),
+        "histories": require_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
+        "rule": require_kind("a DecisionRule", DecisionRule),
+        "options": require_kind("EstimateOptions", EstimateOptions),
+        "environment": require_kind("the name of a simulator or an Environment", str, Environment),
     }
 )
 """Decorator of methods: the check of each argument by its name."""
@@ -639,4 +639,4 @@ def _named(logs: Logs | None) -> str:
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
     listed = [files] if isinstance(files, (str, Path)) else files
-    return ", ".join(without_folders(str(file)) for file in listed)
+    return ", ".join(shorten_paths(str(file)) for file in listed)

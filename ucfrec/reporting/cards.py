@@ -6,7 +6,7 @@ from pathlib import Path
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.off_policy.evaluate import OffPolicyReport
-from ucfrec.provenance import without_folders
+from ucfrec.provenance import shorten_paths
 from ucfrec.reporting.model_card import add_measurement
 from ucfrec.results.row import ResultRow
 from ucfrec.results.table import Ranking
@@ -25,7 +25,7 @@ def card_of_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -
     rows = {row.method: row for row in report.rows}
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
-    files = ", ".join(map(without_folders, logs))
+    files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_rule(row)}"
     of += ", pages" if row.conditions["pages"] else ""
     discount = row.conditions["discount"]

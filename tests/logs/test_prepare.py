@@ -125,6 +125,11 @@ def test_splits_are_windows_of_time(tmp_path: Path) -> None:
     times = steps_of(tmp_path / "store").groupby("split")["timestamp"].agg(["min", "max", "size"])
     assert times["max"][0] < times["min"][1]
     assert times["max"][1] < times["min"][2]
+    steps = steps_of(tmp_path / "store")
+    for name in ("user", "item"):
+        counts = pq.read_table(tmp_path / "store" / f"{name}s.parquet")["train_count"].to_numpy()
+        trained = steps.loc[steps["split"] == 0, name]
+        np.testing.assert_array_equal(counts, np.bincount(trained, minlength=len(counts)))
     assert times["size"].sum() == report["steps"]
     assert abs(times["size"][0] / report["steps"] - 0.8) < 0.02
     at = (START + 100 * MINUTE, START + 1000 * MINUTE)

@@ -11,12 +11,11 @@ import pytest
 from ucfrec.logs.engine import engine
 from ucfrec.logs.kept import DUPLICATES
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import RowVectors, check_sorted, sorted_batches
+from ucfrec.logs.sorted_rows import sort_rows
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import typed_log
 
 START = 1_700_000_000_000
-PAYLOAD = ["propensity", "is_random", "session_id"]
 
 
 def make_log(seed: int, text: bool) -> pd.DataFrame:
@@ -45,8 +44,9 @@ def make_log(seed: int, text: bool) -> pd.DataFrame:
     return log
 
 
-def kept_by_pandas(log: pd.DataFrame, duplicates: str) -> tuple[pd.DataFrame, dict[str, int]]:
-    """The rows to keep, in order of user, time and item, and the number of the others by reason."""
+def kept_by_pandas(log: pd.DataFrame, duplicates: str) -> tuple[pd.DataFrame, dict[str, int], int]:
+    """The rows to keep, in order of user, time and item, the number of the others by reason, and
+    how many duplicates have another reward; rewards that are not finite are equal."""
     missing = log[["user_id", "item_id", "timestamp"]].isna().any(axis=1)
     late = ~missing & (log["timestamp"] < START)
     left = log[~missing & ~late].reset_index(names="row")
@@ -57,12 +57,15 @@ def kept_by_pandas(log: pd.DataFrame, duplicates: str) -> tuple[pd.DataFrame, di
     order = left.sort_values([*key, "bad", "rule", "propensity", "session_id", "is_random"])
     single = order.drop_duplicates(key)
     good = single[~single["bad"]]
-    return good, {
+    rewards = order["reward"].where(~order["bad"], np.inf)
+    first = rewards.groupby([order[name] for name in key]).transform("first")
+    dropped = {
         "null_key": int(missing.sum()),
         "clock_out_of_range": int(late.sum()),
         "duplicate": len(left) - len(single),
         "reward_not_finite": len(single) - len(good),
     }
+    return good, dropped, int((rewards != first).sum())
 
 
 @pytest.mark.parametrize("duplicates", DUPLICATES)
@@ -75,25 +78,27 @@ def test_the_rows_that_are_kept_are_those_of_pandas(
     path = tmp_path / "log.parquet"
     given = make_log(len(duplicates), text)
     given.to_parquet(path)
-    expected, dropped = kept_by_pandas(given, duplicates)
+    expected, dropped, conflicts = kept_by_pandas(given, duplicates)
     folder = None if in_memory else tmp_path
     with engine([path], tmp_path) as connection:
         tables = tuple(open_tables(connection, [path]))
         log = typed_log(connection, tables, LogMapping(), "reward", "gap", tmp_path)
-        rows = check_sorted(log, sorted_batches(log, None, folder), duplicates, folder)
-        found = {name: rows.clean.read(name, 0, len(rows.clean)) for name in rows.clean.names}
+        rows = sort_rows(log, None, duplicates, folder)
+        batches = list(rows.file.read())
+    assert len(batches) > 1
+    found = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     # Equal times have an order of their own: `tests/logs/test_kept.py`.
-    order = np.lexsort([found[name] for name in ("item", "timestamp", "user")])
+    order = np.lexsort([found[name] for name in ("item_code", "timestamp", "user_code")])
     found = {name: values[order] for name, values in found.items()}
     assert {name: n for name, n in rows.dropped.items() if n} == dropped
-    assert rows.read == 400
-    assert 0 < rows.conflicts <= dropped["duplicate"]
+    assert (rows.read, rows.count, rows.conflicts) == (400, len(expected), conflicts)
+    assert 0 < rows.conflicts < dropped["duplicate"]
     for name in ("timestamp", "reward", "propensity", "is_random"):
         np.testing.assert_array_equal(found[name], expected[name].astype(found[name].dtype))
     for name in ("user", "item"):
         # Codes are in the order of the ids.
         ranks = expected[f"{name}_id"].astype("category").cat.codes
-        assert [*np.unique(found[name], return_inverse=True)[1]] == [*ranks]
+        assert [*np.unique(found[f"{name}_code"], return_inverse=True)[1]] == [*ranks]
 
 
 def write_log(file: Path, rows: int, size: int) -> np.ndarray:
@@ -111,21 +116,6 @@ def write_log(file: Path, rows: int, size: int) -> np.ndarray:
     return numbers
 
 
-def test_rows_have_their_own_observations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", 64)
-    file, asked = tmp_path / "log.parquet", np.array([500, 1, 2, 2, 77])
-    numbers = write_log(file, 500, 3)
-    with engine([file], tmp_path) as connection:
-        tables = tuple(open_tables(connection, [file]))
-        log = typed_log(connection, tables, LogMapping(), "reward", "user", tmp_path)
-        vectors = RowVectors(log, tmp_path / "observations.bin")
-        np.testing.assert_array_equal(vectors.of(asked), numbers[asked - 1])
-        (batch,) = vectors.joined(iter([pa.record_batch({"row": asked})]))
-        found = np.asarray(batch.column("observation").flatten()).reshape(-1, 3)
-        np.testing.assert_array_equal(found, numbers[asked - 1])
-        assert not (tmp_path / "observations.bin").exists()
-
-
 def test_long_rows_are_sorted_in_less_memory_than_they_take(tmp_path: Path) -> None:
     file = tmp_path / "log.parquet"
     numbers = write_log(file, 20_000, 1024)
@@ -133,7 +123,10 @@ def test_long_rows_are_sorted_in_less_memory_than_they_take(tmp_path: Path) -> N
     with engine([file], tmp_path, "40MB", threads=1) as connection:
         tables = tuple(open_tables(connection, [file]))
         log = typed_log(connection, tables, LogMapping(), "reward", "user", tmp_path)
-        rows = check_sorted(log, sorted_batches(log, None, tmp_path), "highest", tmp_path)
-        order = np.lexsort((np.arange(20_000), np.arange(20_000) % 7))
-        found = rows.clean.read("observation", 9_000, 9_100)
-        np.testing.assert_array_equal(found, numbers[order[9_000:9_100]])
+        rows = sort_rows(log, None, "highest", tmp_path)
+        order = np.concatenate([batch["row"] for batch in rows.file.read()])
+        assert rows.observations is not None
+        found = rows.observations.of_rows(order[9_000:9_100])
+    by_user = np.lexsort((np.arange(20_000), np.arange(20_000) % 7))
+    np.testing.assert_array_equal(order, by_user + 1)
+    np.testing.assert_array_equal(found, numbers[by_user[9_000:9_100]])

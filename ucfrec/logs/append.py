@@ -25,7 +25,7 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.feature_tables import note_lacking
-from ucfrec.logs.ids import ID_TABLES, StepNumbers, write_ids, write_steps
+from ucfrec.logs.ids import ID_TABLES, write_ids, write_steps
 from ucfrec.logs.kept import note_unknown
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, prepared_log
@@ -169,7 +169,7 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
     for name, table, file in ID_TABLES:
         before = pq.read_metadata(store / file).num_rows
         ids, new = log.one(
-            f"SELECT count(*), count(*) FILTER (number >= {before}) FROM kept_{table} "
+            f"SELECT count(*), count(*) FILTER (number >= {before}) FROM used_{table} "
             f"JOIN {table} USING ({name})"
         )
         # New ids are usual here; only logs without any old one may be written in another way.
@@ -183,7 +183,7 @@ def _note_lacking(found: PreparedLog, mapping: LogMapping, store: Path, old: Sto
     for name, table, file in ID_TABLES:
         before = pq.read_metadata(store / file).num_rows
         new = (
-            f"SELECT {name} FROM kept_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
+            f"SELECT {name} FROM used_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
         )
         given = feature_tables(mapping)[name], found.features[name]
         note_lacking(
@@ -234,7 +234,7 @@ class _Grown:
         self, store: Path, old: StoreRecord, found: PreparedLog, window_ms: int | None
     ) -> None:
         self._store, self._old, self._found, self._log = store, old, found, found.rows.log
-        cut_ms = None if window_ms is None else found.measures.last_ms - window_ms
+        cut_ms = None if window_ms is None else found.report["time_range_ms"][1] - window_ms
         self._shards = [self._shard(number, cut_ms) for number in range(old.n_shards)]
         self._kept = [shard for shard in self._shards if shard.kept.any()]
         names = [*old.columns]
@@ -260,11 +260,9 @@ class _Grown:
 
         found, log = self._found, self._log
         self._count_moved_rows()
-        numbers = StepNumbers.of(log, found.measures, found.scratch)
         fill = {name: float(_FILL.get(name, np.nan)) for name in self._names}
         with progress(found.report["steps"], "write the new shards", "steps") as bar:
-            given = folder, found.episodes(), found.spool, numbers, bar
-            writer = write_steps(*given, first_shard=len(self._kept), fill=fill)
+            writer = write_steps(found.rows, found.cut, folder, bar, len(self._kept), fill)
         new = writer.finish(found.report["reward"], found.report, write_ids(log, folder))
         report = found.report | self._counts(folder, new)
         files = dict(new.files)

@@ -20,8 +20,13 @@ from ucfrec.logs.binding import explained, settled
 from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
 from ucfrec.logs.kept import note_dropped, require_rows
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.sessions import end_of_user
-from ucfrec.logs.sorted_rows import CODES, SortedRows, check_sorted, has_codes, sorted_batches
+from ucfrec.logs.sorted_rows import (
+    ITEM,
+    SESSION,
+    USER,
+    SortedRows,
+    sort_rows,
+)
 from ucfrec.logs.tables import Table, open_tables, quoted
 from ucfrec.logs.typed import TypedLog, typed_log
 
@@ -85,9 +90,8 @@ def read_histories(
         log = typed_log(connection, tables, mapping, reward, session_by, folder)
         _require_items(log)
         with explained(connection, tables, folder):
-            batches = sorted_batches(log, None, folder)
-            rows = check_sorted(log, batches, duplicates, folder)
-        require_rows(log, len(rows.clean), rows.dropped)
+            rows = sort_rows(log, None, duplicates, folder)
+        require_rows(log, rows.count, rows.dropped)
         note_dropped(log.name, rows.dropped, rows.read)
         with explained(connection, tables, folder):
             yield from _by_users(rows, last)
@@ -130,8 +134,8 @@ def frame_histories(
         log = typed_log(connection, (table,), mapping, reward, session_by, source)
         _require_items(log)
         with explained(connection, log.tables, source):
-            rows = check_sorted(log, sorted_batches(log, None, None), duplicates, None)
-            require_rows(log, len(rows.clean), rows.dropped)
+            rows = sort_rows(log, None, duplicates, None)
+            require_rows(log, rows.count, rows.dropped)
             note_dropped(HISTORIES, rows.dropped, rows.read)
             yield from _by_users(rows, last)
 
@@ -233,61 +237,50 @@ def _require_items(log: TypedLog) -> None:
 
 def _by_users(rows: SortedRows, last: int) -> Iterator[pa.RecordBatch]:
     """The users of sorted rows, some thousand rows at a time."""
-    clean, begin = rows.clean, 0
-    items = _ids(rows.log, schema.ITEM_ID, 0, rows.items)
-    while begin < len(clean):
-        end = end_of_user(clean, begin, clean.block_rows)
-        yield _histories(rows, begin, end, items, last)
-        begin = end
+    query = f"SELECT {schema.ITEM_ID} FROM item_codes ORDER BY code"
+    items = rows.log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+    for batch in rows.file.read():
+        yield _histories(rows, batch, items, last)
 
 
 def _histories(
-    rows: SortedRows, begin: int, end: int, items: pa.Array, last: int
+    sorted_rows: SortedRows, rows: dict[str, Array], items: pa.Array, last: int
 ) -> pa.RecordBatch:
-    """The users of the rows from `begin` to `end`, which are all theirs."""
-    log, clean = rows.log, rows.clean
-    codes = clean.read("user", begin, end)
+    """The users of rows, which are all theirs."""
+    log, codes = sorted_rows.log, rows[USER]
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
     ends = np.append(first[1:], len(codes))
     kept = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
     offsets = np.append(0, np.cumsum(kept)[ends - 1])
 
     def lists(name: str, of: Callable[[Array], pa.Array]) -> pa.ListArray:
-        return _lists(offsets, of(clean.read(name, begin, end)[kept]))
+        return _lists(offsets, of(rows[name][kept]))
 
-    columns: dict[str, pa.Array] = {schema.USER_ID: _users(log, codes[first])}
-    columns["item_ids"] = lists(schema.ITEM, lambda codes: items.take(as_arrow(codes)))
+    query = (
+        f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "
+        "ORDER BY code"
+    )
+    users = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+    columns: dict[str, pa.Array] = {
+        schema.USER_ID: users.take(as_arrow(codes[first].astype(np.int64) - codes[0]))
+    }
+    columns["item_ids"] = lists(ITEM, lambda codes: items.take(as_arrow(codes)))
     columns["rewards"] = lists(
         schema.REWARD, lambda values: _numbers(values.astype(np.float32), pa.float32())
     )
     columns["timestamps"] = lists(schema.TIMESTAMP, as_arrow)
     if log.session_by == schema.SESSION_ID:
-        columns["session_ids"] = lists("session", as_arrow)
+        columns["session_ids"] = lists(SESSION, as_arrow)
     # Codes of items are in the order of their ids.
     owner = np.repeat(np.arange(len(first)), ends - first)
-    seen = np.unique(owner * max(rows.items, 1) + clean.read(schema.ITEM, begin, end))
-    bounds = np.searchsorted(seen, np.arange(len(first) + 1) * max(rows.items, 1))
-    columns["seen"] = _lists(bounds, items.take(as_arrow(seen % max(rows.items, 1))))
-    if schema.OBSERVATION in log.columns:
-        latest = [clean.read(schema.OBSERVATION, begin + row, begin + row + 1) for row in ends - 1]
-        observations = np.concatenate(latest)
-        every = np.arange(len(first) + 1) * observations.shape[1]
-        columns[schema.OBSERVATION] = _lists(every, _numbers(observations.ravel(), pa.float32()))
+    seen = np.unique(owner * len(items) + rows[ITEM])
+    bounds = np.searchsorted(seen, np.arange(len(first) + 1) * len(items))
+    columns["seen"] = _lists(bounds, items.take(as_arrow(seen % len(items))))
+    if sorted_rows.observations is not None:
+        observations = sorted_rows.observations.of_rows(rows["row"][ends - 1])
+        bounds = np.arange(len(first) + 1) * observations.shape[1]
+        columns[schema.OBSERVATION] = _lists(bounds, _numbers(observations.ravel(), pa.float32()))
     return pa.record_batch(columns)
-
-
-def _users(log: TypedLog, codes: IntArray) -> pa.Array:
-    """Identifiers (U,) of ascending codes (U,) of users."""
-    if not has_codes(log, schema.USER_ID):
-        return as_arrow(codes)
-    low = int(codes[0])
-    return _ids(log, schema.USER_ID, low, int(codes[-1]) + 1).take(as_arrow(codes - low))
-
-
-def _ids(log: TypedLog, name: str, begin: int, end: int) -> pa.Array:
-    """Identifiers with the codes from `begin` to `end`."""
-    query = f"SELECT {name} FROM {CODES[name]} WHERE code >= {begin} AND code < {end} ORDER BY code"
-    return log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
 
 
 def _lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:

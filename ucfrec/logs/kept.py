@@ -7,20 +7,19 @@ that could be learned: theirs is that of a hash of user, time and item. Any othe
 that of the ids, is one that a policy predicts.
 """
 
+import hashlib
 import time
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import xxhash
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.mapping import EARLIEST_MS
 from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, text
@@ -35,18 +34,14 @@ DUPLICATES: Final = {
 }
 """Which of several rows with the same user, item or action, and time is kept: rule to its
 description."""
-_TIE_BREAKERS: Final = (
-    schema.OBSERVATION,
-    schema.PROPENSITY,
-    "no_session",
-    "session",
-    schema.IS_RANDOM,
-)
-"""Columns that decide between duplicates that are equal to the rule, the most important first, so
-that the order of rows and files does not matter."""
-
-
-Digests = npt.NDArray[np.uint64]
+PRIME: Final = 2**31 - 1
+USER_FACTOR: Final = 7919
+HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
+"""SQL of `hash_ids`, for Spark and, where `conv` is a macro, for DuckDB."""
+TIE: Final = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME})"
+"""SQL of the place of a row among those of one user and time, by the hash of the user, the time and
+the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
+two items are as often in one order as in the other."""
 DAY_MS: Final = 86_400_000
 """One day in ms."""
 REASONS: Final = {
@@ -73,169 +68,80 @@ CLOCK_HINT: Final = (
 )
 
 
-@dataclass(frozen=True)
-class Hashes:
-    """Hashes of the text of identifiers, so that 7 and '7' have one."""
-
-    of_users: Callable[[Array], Digests]
-    """Of the values (M,) of the column `user`."""
-    of_items: Callable[[Array], Digests]
-    """Of the values (M,) of the column `item`."""
-
-
-@dataclass(frozen=True)
-class Kept:
-    """The rows that are kept, and how many are not."""
-
-    rows: IntArray
-    """(K,) their positions, in order."""
-    duplicates: int
-    """Rows that repeat the user, time and choice of a row that counts in their place."""
-    conflicts: int
-    """Duplicates with another reward than that row."""
-    undefined: int
-    """Rows, not duplicates, whose reward is NaN or infinite."""
-
-
-def kept_rows(rows: Mapping[str, Array], duplicates: str) -> Kept:
-    """The rows of a log that are kept: one of each user, time and choice, with a finite reward.
-
-    Args:
-        rows: (N,) columns in order of user, time and choice: `user`, `timestamp`, `item` (or
-            `action`, (N, A)), `reward`, `row` (position in the log) and perhaps those that break
-            ties.
-        duplicates: key of `DUPLICATES`.
-    """
-    rewards = rows[schema.REWARD]
-    good = np.abs(rewards) <= MAX_FLOAT
-    kept = np.ones(len(rewards), dtype=bool)
-    same = _same_key(rows)
-    lost = conflicts = 0
-    if same.any():
-        repeated = np.zeros(len(rewards), dtype=bool)
-        repeated[1:] |= same
-        repeated[:-1] |= same
-        places = np.flatnonzero(repeated)
-        # Rows that agree with the one before are of its group.
-        groups = np.cumsum(~np.concatenate([[False], same])[places])
-        some = {name: values[places] for name, values in rows.items()}
-        order = np.lexsort([*_tie_breakers(some), _rule(some, duplicates), ~good[places], groups])
-        ordered = groups[order]
-        begins = np.concatenate([[True], ordered[1:] != ordered[:-1]])
-        winner = order[begins][np.cumsum(begins) - 1]
-        losers = order[~begins]
-        kept[places[losers]] = False
-        ours, theirs = some["reward"][losers], some["reward"][winner[~begins]]
-        equal = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs))
-        lost, conflicts = len(losers), int(np.count_nonzero(~equal))
-    undefined = int(np.count_nonzero(kept & ~good))
-    return Kept(np.flatnonzero(kept & good), lost, conflicts, undefined)
-
-
 def kept_in_order(
     rows: Mapping[str, Array], duplicates: str, user_id: int | str | None = None
 ) -> IntArray:
-    """(K,) positions of the rows of a log in memory that are kept, in order of user and time.
+    """(K,) positions of the rows of a log in memory that count, in order of user and time.
+
+    `ucfrec.logs.sorted_rows` says the same in SQL, of logs of any size.
 
     Args:
-        rows: (N,) columns as of `kept_rows`, in any order; `item` holds identifiers, and so
-            does `user` but for `user_id`.
+        rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
+            (position in the log) and perhaps those that break ties. `user` holds identifiers but
+            for `user_id`.
         duplicates: key of `DUPLICATES`.
         user_id: the only user.
     """
-    users, times = rows["user"], rows[schema.TIMESTAMP]
+    users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
     order = np.lexsort((times, users))
     apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
     if apart.all():
-        return np.asarray(order[np.abs(rows[schema.REWARD][order]) <= MAX_FLOAT])
-    ids, items = np.unique(rows[schema.ITEM], return_inverse=True)
-    order = np.lexsort((items, times, users))
-    found = {name: values[order] for name, values in {**rows, schema.ITEM: items}.items()}
-    one = None if user_id is None else digests([user_id])
-    hashes = Hashes(
-        lambda users: digests(users.tolist()) if one is None else one.repeat(len(users)),
-        lambda items: digests(ids[items].tolist()),
-    )
-    return order[in_hashed_order(found, kept_rows(found, duplicates).rows, hashes)[0]]
+        return np.asarray(order[finite[order]])
+    tied = np.zeros(len(users), dtype=bool)
+    tied[order[1:]] |= ~apart
+    tied[order[:-1]] |= ~apart
+    items, ties = np.zeros((2, len(users)), dtype=np.int64)
+    ids, items[tied] = np.unique(rows[schema.ITEM][tied], return_inverse=True)
+    names, places = np.unique(users[tied], return_inverse=True)
+    of_users = hash_ids([user_id] * len(names) if user_id is not None else names.tolist())[places]
+    multiplier = 1 + np.fmod(of_users * USER_FACTOR + times[tied], PRIME - 1)
+    ties[tied] = np.fmod(multiplier * (1 + hash_ids(ids.tolist())[items[tied]]), PRIME)
+    keys = [users, times, ties, items]
+    order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    return np.asarray(order[first & finite[order]])
 
 
-def in_hashed_order(
-    rows: Mapping[str, Array], kept: IntArray, hashes: Hashes
-) -> tuple[IntArray, int]:
-    """Put the rows of one user at one time in the order of a hash.
+def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
+    """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
+    is the first.
 
     Args:
-        rows: as of `kept_rows`.
-        kept: (K,) positions, in order, of the rows that are kept.
-
-    Returns:
-        (K,) the positions in the new order, and how many rows share their user and time.
+        rows: (N,) `reward`, `row` (position in the log) and those of `observation`, `propensity`,
+            `session` and `is_random` that the log has, which decide between rows that are equal to
+            the rule, so that the order of rows and files does not matter.
+        duplicates: key of `DUPLICATES`.
     """
-    users, times = rows["user"][kept], rows[schema.TIMESTAMP][kept]
-    tied = (users[1:] == users[:-1]) & (times[1:] == times[:-1])
-    if not tied.any():
-        return kept, 0
-    within = np.concatenate([[False], tied])
-    places = np.flatnonzero(within | np.concatenate([tied, [False]]))
-    groups = np.cumsum(~within)[places]
-    if schema.ITEM in rows:
-        key = hashes.of_items(rows[schema.ITEM][kept][places])
-    else:
-        key = np.zeros(len(places), dtype=np.uint64)
-        for column in rows[schema.ACTION][kept][places].view(np.uint32).T:
-            key = mixed(key + column)
-    key = mixed(key + mixed(hashes.of_users(users[places]) + times[places].view(np.uint64)))
-    ordered = kept.copy()
-    ordered[places] = kept[places[np.lexsort((key, groups))]]
-    return ordered, len(places)
+    rewards = rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
+    rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
+    keys = [~finite, np.where(finite, rule[duplicates], 0)]
+    for name in (schema.OBSERVATION, schema.PROPENSITY, "session", schema.IS_RANDOM):
+        if name in rows:
+            keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
+    return keys[::-1]
 
 
-def digests(ids: Sequence[object]) -> Digests:
-    """A hash (N,) of the text of each identifier."""
-    found = {each: _digest(str(each)) for each in dict.fromkeys(ids)}
-    return np.asarray([found[each] for each in ids], dtype=np.uint64)
+def hash_ids(ids: Sequence[object]) -> IntArray:
+    """A number (N,) below 2**28 of the text of each identifier, so that 7 and '7' have one.
 
-
-def _digest(text: str) -> int:
+    It is that of `HASH`.
+    """
     # Text of JSON may hold half a character.
-    return xxhash.xxh3_64_intdigest(text.encode("utf-8", "surrogatepass"))
+    texts = (str(each).encode("utf-8", "surrogatepass") for each in ids)
+    digests = (hashlib.md5(text, usedforsecurity=False).hexdigest() for text in texts)
+    return np.asarray([int(digest[:7], 16) for digest in digests], dtype=np.int64)
 
 
-def mixed(values: Digests) -> Digests:
+def mixed(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
     values have different results."""
     values = values + np.uint64(0x9E3779B97F4A7C15)
     values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return values ^ (values >> np.uint64(31))
-
-
-def _same_key(rows: Mapping[str, Array]) -> BoolArray:
-    """(N − 1,) whether each row but the first has the user, time and choice of the row before."""
-    user, times = rows["user"], rows[schema.TIMESTAMP]
-    same = (user[1:] == user[:-1]) & (times[1:] == times[:-1])
-    choice = rows[schema.ITEM] if schema.ITEM in rows else rows[schema.ACTION]
-    equal = choice[1:] == choice[:-1]
-    return np.asarray(same & (equal if equal.ndim == 1 else equal.all(axis=1)))
-
-
-def _rule(some: Mapping[str, Array], duplicates: str) -> Array:
-    """Sort key by which the row that the rule keeps comes first."""
-    rewards = some[schema.REWARD]
-    if duplicates == "highest":
-        return np.where(np.isnan(rewards), -np.inf, -rewards)
-    if duplicates == "lowest":
-        return rewards
-    return some["row"] if duplicates == "first" else -some["row"]
-
-
-def _tie_breakers(some: Mapping[str, Array]) -> list[Array]:
-    """Sort keys of the other columns, the least important first, as `numpy.lexsort` wants them."""
-    keys: list[Array] = []
-    for name in _TIE_BREAKERS:
-        if name in some:
-            keys += list(some[name].T) if some[name].ndim == 2 else [some[name]]
-    return keys[::-1]
 
 
 def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
@@ -259,20 +165,6 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
         known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
         conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
     return conditions
-
-
-def require_rewards_in_range(log: TypedLog, large: int, rows: int, largest: float) -> None:
-    """Check the count of rewards beyond `LARGEST_REWARD`.
-
-    Raises:
-        InputError: there are any.
-    """
-    if large:
-        raise InputError(
-            f"{log.tables[0].files[0]}: {large:,} of {rows:,} rewards are beyond "
-            f"±{schema.LARGEST_REWARD:g} (up to {largest:.3g}), too large to train with in "
-            "float32; divide them in the reward expression"
-        )
 
 
 def note_dropped(

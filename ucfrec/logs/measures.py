@@ -1,28 +1,40 @@
 """What a log's episodes hold, counted in one pass over its sorted rows, and its distributions."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, Final
 
+import duckdb
 import numpy as np
-import numpy.typing as npt
+import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array, IntArray
 from ucfrec.errors import InputError
+from ucfrec.logs.engine import as_arrow
 from ucfrec.logs.kept import mixed
-from ucfrec.logs.sessions import Cut, Episodes, episodes
-from ucfrec.logs.spool import BLOCK, Spool
+from ucfrec.logs.sessions import Cut, Episodes, read_episodes
+from ucfrec.logs.sorted_rows import ITEM, SortedRows
+from ucfrec.logs.typed import TypedLog
 
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""
-_NAMED: Final = 5
-"""Users of the longest sessions that are named."""
 SAMPLE_ROWS: Final = 100_000
 """Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
 used whole."""
+QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+EPISODES: Final = "episodes"
+"""Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
+`begins_session` and `terminated`."""
+USED_USERS, USED_ITEMS = "used_users", "used_items"
+"""Tables of the users and items in the steps: id, `code` and `train_count`; of users `longest`, the
+steps of their longest episode, and `ended`, whether their last one is terminated; of items
+`steps`."""
+
+Distribution = dict[str, Any]
+"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
+right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 
 
 @dataclass
@@ -98,97 +110,178 @@ class Moments:
 
 
 @dataclass
-class Measures:
-    """Counts and statistics of the steps in episodes that are kept."""
+class StepCounts:
+    """Counts and statistics of the steps in episodes."""
 
-    users: Spool
-    """Users in order: `user`, and `train_count`, the number of their training steps."""
     item_steps: IntArray
     """(items,) number of steps that show each item, by code."""
     item_train_steps: IntArray
     """(items,) number of those in the training split."""
     steps: int = 0
-    episodes: int = 0
-    sessions: int = 0
-    unfinished: int = 0
-    """Episodes that are not terminated."""
-    censored: int = 0
-    """Users whose last episode is not terminated."""
-    first_ms: int = 0
+    first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
+    rewards: Moments = field(default_factory=lambda: Moments(1))
+    values: ValueCounts = field(default_factory=ValueCounts)
+    lowest: float = np.inf
+    highest: float = -np.inf
+    returns: Moments = field(default_factory=lambda: Moments(2))
+    """Of training steps: rewards and number of steps from there to the end of the episode."""
+    long_rows: int = 0
+    """Rows of episodes that are dropped as too long."""
     unknown_propensities: int = 0
     not_above_0: int = 0
     """Propensities of 0 or less."""
     lowest_propensity: float = 0.0
     above_1: int = 0
-    """Propensities of items above 1."""
+    """Propensities above 1."""
     highest_propensity: float = 0.0
-    splits: IntArray = field(default_factory=lambda: np.zeros((3, 2), dtype=np.int64))
-    """Episodes and steps of each split."""
-    rewards: Moments = field(default_factory=lambda: Moments(1))
-    lowest: float = np.inf
-    highest: float = -np.inf
-    returns: Moments = field(default_factory=lambda: Moments(2))
-    """Of training steps: rewards and number of steps from there to the end of the episode."""
-    lengths: dict[int, int] = field(default_factory=dict)
-    """Length in steps to the number of episodes."""
-    longest: list[tuple[int, int]] = field(default_factory=list)
-    """Steps of the longest episode of the users who have the longest, and these users."""
-    long_rows: int = 0
-    """Rows of episodes that are dropped as too long."""
-    values: ValueCounts = field(default_factory=ValueCounts)
-    """Rewards by value."""
+
+    def add(self, episodes: Episodes) -> None:
+        """Count the steps of episodes."""
+        self.long_rows += episodes.long_rows
+        times, rewards = (episodes.rows[name] for name in (schema.TIMESTAMP, schema.REWARD))
+        if not len(times):
+            return
+        self.steps += len(times)
+        self.first_ms = min(self.first_ms, int(times.min()))
+        self.last_ms = max(self.last_ms, int(times.max()))
+        self.rewards.add(rewards)
+        self.values.add(rewards)
+        self.lowest = min(self.lowest, float(rewards.min()))
+        self.highest = max(self.highest, float(rewards.max()))
+        training = np.repeat(episodes.splits == 0, episodes.lengths)
+        ends = np.cumsum(episodes.lengths)
+        ahead = np.repeat(ends, episodes.lengths) - np.arange(len(rewards))
+        before = np.append(0.0, np.cumsum(rewards))
+        rest = np.repeat(before[ends], episodes.lengths) - before[:-1]
+        self.returns.add(rest[training], ahead[training])
+        if ITEM in episodes.rows:
+            items, size = episodes.rows[ITEM], len(self.item_steps)
+            self.item_steps += np.bincount(items, minlength=size)
+            self.item_train_steps += np.bincount(items[training], minlength=size)
+        if schema.PROPENSITY in episodes.rows:
+            propensities = episodes.rows[schema.PROPENSITY]
+            self.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
+            self.not_above_0 += int(np.count_nonzero(propensities <= 0))
+            self.above_1 += int(np.count_nonzero(propensities > 1))
+            lowest, highest = np.fmin.reduce(propensities), np.fmax.reduce(propensities)
+            self.lowest_propensity = float(np.fmin(self.lowest_propensity, lowest))
+            self.highest_propensity = float(np.fmax(self.highest_propensity, highest))
 
 
-def measure(spool: Spool, cut: Cut, log_end: int, items: int, folder: Path) -> Measures:
-    """Go through all episodes once.
+def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
+    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
 
-    Args:
-        spool: rows in the order of the store, at least one.
-        log_end: time (ms) of the log's last usable row.
-        items: number of items that have a code.
+    Only training steps count in `train_count`.
 
     Raises:
-        InputError: no episode remains, or none in the training split.
+        InputError: no episode is left, none is in the training split, or a propensity is none.
     """
-    measures = Measures(
-        Spool(folder), np.zeros(items, dtype=np.int64), np.zeros(items, dtype=np.int64)
+    connection = rows.log.connection
+    items = rows.log.one("SELECT count(*) FROM item_codes")[0] if _has_items(rows) else 0
+    counts = StepCounts(np.zeros(items, dtype=np.int64), np.zeros(items, dtype=np.int64))
+    names = ("user_code", "split", "steps", "begins_session", "terminated")
+    whole_numbers = pa.schema([(name, pa.int64()) for name in names])
+
+    def count() -> Iterator[pa.RecordBatch]:
+        for episodes in read_episodes(rows, cut):
+            counts.add(episodes)
+            columns = [episodes.users, episodes.splits, episodes.lengths]
+            flags = [episodes.begins_session, episodes.terminated]
+            columns += [values.astype(np.int64) for values in flags]
+            yield pa.record_batch([as_arrow(values) for values in columns], schema=whole_numbers)
+
+    connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
+    connection.execute(
+        f"CREATE TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, user_code, split, "
+        "steps, begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
     )
-    user, trained, ended = None, 0, True
-    for found in episodes(spool, cut, log_end):
-        measures.long_rows += found.long_rows
-        if not len(found.lengths):
-            continue
-        _count_episodes(measures, found)
-        _count_steps(measures, found, spool)
-        starts = np.flatnonzero(np.append(True, found.users[1:] != found.users[:-1]))
-        users = found.users[starts]
-        training = np.where(found.splits == 0, found.lengths, 0)
-        train_counts = np.add.reduceat(training, starts)
-        last = np.append(starts[1:], len(found.users)) - 1
-        ends = found.terminated[last]
-        if user is not None and users[0] == user:
-            train_counts[0] += trained
-        elif user is not None:
-            measures.users.append({"user": np.array([user]), "train_count": np.array([trained])})
-            measures.censored += not ended
-        measures.users.append({"user": users[:-1], "train_count": train_counts[:-1]})
-        measures.censored += int(np.count_nonzero(~ends[:-1]))
-        user, trained, ended = users[-1], train_counts[-1], bool(ends[-1])
-    if user is not None:
-        measures.users.append({"user": np.array([user]), "train_count": np.array([trained])})
-        measures.censored += not ended
-    _require_training(measures, cut, len(spool))
-    return measures
+    connection.execute(
+        f"""
+        CREATE TABLE {USED_USERS} AS
+        SELECT {schema.USER_ID}, code, train_count, longest, ended FROM user_codes JOIN (
+            SELECT user_code AS code, max(steps) AS longest, arg_max(terminated, episode) AS ended,
+                CAST(coalesce(sum(steps) FILTER (split = 0), 0) AS BIGINT) AS train_count
+            FROM {EPISODES} GROUP BY user_code
+        ) USING (code)
+        """
+    )
+    if _has_items(rows):
+        shown = np.flatnonzero(counts.item_steps)
+        columns = (shown, counts.item_steps[shown], counts.item_train_steps[shown])
+        connection.register(
+            "shown",
+            pa.record_batch([as_arrow(each) for each in columns], ["code", "steps", "train_count"]),
+        )
+        connection.execute(
+            f"CREATE TABLE {USED_ITEMS} AS SELECT {schema.ITEM_ID}, code, steps, train_count "
+            "FROM item_codes JOIN shown USING (code)"
+        )
+    _require_training(rows, cut, counts.steps)
+    if schema.PROPENSITY in rows.log.columns:
+        _require_propensities(rows.log, counts)
+    return counts
 
 
-def _require_training(measures: Measures, cut: Cut, rows: int) -> None:
-    if measures.steps == 0:
+def _has_items(rows: SortedRows) -> bool:
+    return rows.log.key == schema.ITEM_ID
+
+
+def report_steps(rows: SortedRows, counts: StepCounts) -> dict[str, Any]:
+    """Counts and statistics of the episodes, for the report."""
+    log = rows.log
+    splits = {name: {"episodes": 0, "steps": 0} for name in schema.SPLITS}
+    for split, episodes, steps in log.connection.sql(
+        f"SELECT split, count(*), CAST(sum(steps) AS BIGINT) FROM {EPISODES} GROUP BY split"
+    ).fetchall():
+        splits[schema.SPLITS[split]] = {"episodes": episodes, "steps": steps}
+    sessions, unfinished = log.one(
+        f"SELECT count(*) FILTER (begins_session), count(*) FILTER (NOT terminated) FROM {EPISODES}"
+    )
+    users, censored = log.one(f"SELECT count(*), count(*) FILTER (NOT ended) FROM {USED_USERS}")
+    report: dict[str, Any] = {
+        "steps": counts.steps,
+        "episodes": sum(split["episodes"] for split in splits.values()),
+        "sessions": sessions,
+        "sessions_cut": unfinished - censored,
+        "sessions_censored": censored,
+        "return_length_share": _explain_returns(counts.returns),
+        "users": users,
+        "splits": splits,
+        "time_range_ms": [counts.first_ms, counts.last_ms],
+        "reward_statistics": {
+            "mean": float(counts.rewards.mean[0]),
+            "std": float(np.sqrt(counts.rewards.covariance[0, 0])),
+            "min": counts.lowest,
+            "max": counts.highest,
+        },
+    }
+    if _has_items(rows):
+        report["items"] = int(np.count_nonzero(counts.item_steps))
+    if schema.PROPENSITY in log.columns:
+        report["unknown_propensities"] = counts.unknown_propensities
+    return report
+
+
+def _explain_returns(returns: Moments) -> float | None:
+    """Share of the variance of training returns-to-go that the number of steps left explains.
+
+    Of the whole rest of the session; None if either does not vary.
+    """
+    (rest, both), (_, ahead) = returns.covariance
+    # What is left of the rounding errors of equal returns is not variance.
+    if rest <= 1e-24 * returns.mean[0] ** 2 or not ahead:
+        return None
+    return float(both**2 / (rest * ahead))
+
+
+def _require_training(rows: SortedRows, cut: Cut, steps: int) -> None:
+    if not steps:
         raise InputError(
-            f"no session is left: none of the {rows} clean rows is in an episode of "
+            f"no session is left: none of the {rows.count} clean rows is in an episode of "
             f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
         )
-    if measures.splits[0, 1] == 0:
+    if not rows.log.one(f"SELECT count(*) FROM {EPISODES} WHERE split = 0")[0]:
         ends = datetime.fromtimestamp(cut.bounds[0] / 1000, UTC)
         raise InputError(
             f"no row is in the training split, before {ends:%Y-%m-%d %H:%M:%S} UTC: all are of "
@@ -196,121 +289,28 @@ def _require_training(measures: Measures, cut: Cut, rows: int) -> None:
         )
 
 
-def _count_episodes(measures: Measures, found: Episodes) -> None:
-    measures.steps += int(found.lengths.sum())
-    measures.episodes += len(found.lengths)
-    measures.sessions += int(np.count_nonzero(found.begins_session))
-    measures.unfinished += int(np.count_nonzero(~found.terminated))
-    measures.splits[:, 0] += np.bincount(found.splits, minlength=3)
-    weighted = np.bincount(found.splits, weights=found.lengths, minlength=3)
-    measures.splits[:, 1] += weighted.astype(np.int64)
-    for length, count in zip(*np.unique(found.lengths, return_counts=True), strict=True):
-        measures.lengths[int(length)] = measures.lengths.get(int(length), 0) + int(count)
-    longest = {user: length for length, user in measures.longest}
-    for number in np.argsort(-found.lengths, kind="stable")[: 10 * _NAMED]:
-        user, length = int(found.users[number]), int(found.lengths[number])
-        longest[user] = max(length, longest.get(user, 0))
-    pairs = ((length, user) for user, length in longest.items())
-    measures.longest = sorted(pairs, reverse=True)[:_NAMED]
+def _require_propensities(log: TypedLog, counts: StepCounts) -> None:
+    name = schema.PROPENSITY
+    if counts.not_above_0:
+        lowest = f"{counts.lowest_propensity:.6g}"
+        raise InputError(
+            f"{log.name}: {name} is not above 0, down to {lowest}, in {counts.not_above_0:,} of "
+            f"{counts.steps:,} rows; of a logarithm give --column propensity='exp(propensity)'; "
+            f"if {lowest} means unknown, --column propensity='nullif(propensity, {lowest})'"
+        )
+    if counts.above_1 and log.key == schema.ITEM_ID:
+        raise InputError(
+            f"{log.name}: {name} is above 1, up to {counts.highest_propensity:.6g}, in "
+            f"{counts.above_1:,} of {counts.steps:,} rows; give the probability that the item was "
+            "shown: of a percentage with --column propensity='propensity / 100', or ignore the "
+            "column with --column propensity="
+        )
 
 
-def _count_steps(measures: Measures, found: Episodes, spool: Spool) -> None:
-    times = found.column(spool, schema.TIMESTAMP)
-    rewards = found.column(spool, schema.REWARD)
-    low, high = int(times.min()), int(times.max())
-    first = measures.steps == int(found.lengths.sum())
-    measures.first_ms = low if first else min(measures.first_ms, low)
-    measures.last_ms = max(measures.last_ms, high)
-    measures.rewards.add(rewards)
-    measures.lowest = min(measures.lowest, float(rewards.min()))
-    measures.highest = max(measures.highest, float(rewards.max()))
-    measures.values.add(rewards)
-    training = np.repeat(found.splits == 0, found.lengths)
-    ends = np.cumsum(found.lengths)
-    ahead = np.repeat(ends, found.lengths) - np.arange(len(rewards))
-    before = np.concatenate([[0.0], np.cumsum(rewards)])
-    rest = np.repeat(before[ends], found.lengths) - before[:-1]
-    measures.returns.add(rest[training], ahead[training])
-    if schema.ITEM in spool.names:
-        choice = found.column(spool, schema.ITEM)
-        items = len(measures.item_steps)
-        measures.item_steps += np.bincount(choice, minlength=items)
-        measures.item_train_steps += np.bincount(choice[training], minlength=items)
-    if schema.PROPENSITY in spool.names:
-        propensities = found.column(spool, schema.PROPENSITY)
-        measures.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
-        if (below := propensities <= 0).any():
-            measures.not_above_0 += int(np.count_nonzero(below))
-            lowest = float(propensities[below].min())
-            measures.lowest_propensity = min(measures.lowest_propensity, lowest)
-        if schema.ITEM in spool.names and (above := propensities > 1).any():
-            measures.above_1 += int(np.count_nonzero(above))
-            highest = float(propensities[above].max())
-            measures.highest_propensity = max(measures.highest_propensity, highest)
-
-
-def sampled_rewards(spool: Spool, cut: Cut, log_end: int, steps: int) -> Array:
-    """Rewards of about `SAMPLE_ROWS` of the `steps` steps, ascending; of all if there are fewer."""
-    every = max(1, round(steps / SAMPLE_ROWS))
-    sample = []
-    for found in episodes(spool, cut, log_end, BLOCK):
-        rewards = found.column(spool, schema.REWARD)
-        if every > 1:
-            # By hash, so that the order of rows in the files does not matter.
-            users = np.repeat(found.users, found.lengths)
-            keys = _hash(users, found.column(spool, schema.TIMESTAMP))
-            rewards = rewards[keys % np.uint64(every) == 0]
-        sample.append(rewards)
-    return np.sort(np.concatenate(sample))
-
-
-def _hash(users: Array, times: Array) -> npt.NDArray[np.uint64]:
-    """A number for each row that depends on its user and time: the finaliser of SplitMix64."""
-    own = (users.astype(np.uint64) - np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-    return mixed(own + times.astype(np.uint64))
-
-
-def binned_rewards(
-    spool: Spool, cut: Cut, log_end: int, low: float, high: float, bins: int
-) -> IntArray:
-    """Steps by reward in `bins` bins of equal width from `low` to `high`.
-
-    The first and the last bin include the values beyond them.
-    """
-    counts = np.zeros(bins, dtype=np.int64)
-    width = (high - low) / bins
-    for found in episodes(spool, cut, log_end, BLOCK):
-        rewards = found.column(spool, schema.REWARD)
-        places = np.clip(np.floor((rewards - low) / width), 0, bins - 1).astype(np.int64)
-        counts += np.bincount(places, minlength=bins)
-    return counts
-
-
-QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
-
-Distribution = dict[str, Any]
-"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
-right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
-
-
-@dataclass(frozen=True)
-class RewardPasses:
-    """Passes over the steps that only rewards of many values need."""
-
-    sampled: Callable[[], Array]
-    """See `ucfrec.logs.measures.sampled_rewards`."""
-    binned: Callable[[float, float, int], IntArray]
-    """See `ucfrec.logs.measures.binned_rewards`."""
-
-
-def distributions(
-    measures: Measures, popularity: IntArray | None, passes: RewardPasses
+def measure_distributions(
+    rows: SortedRows, cut: Cut, counts: StepCounts
 ) -> dict[str, Distribution]:
-    """Distributions over the steps, as JSON values.
-
-    Args:
-        popularity: (items,) number of steps that show each item; None for logs without items.
-        passes: over the log's rewards.
+    """Distributions over the steps, as JSON values; after the tables of users and items.
 
     Returns:
         `session_lengths`: episodes by length in steps (each piece of a session that a split cuts
@@ -319,14 +319,32 @@ def distributions(
         number of steps that show them, in bins of doubling width; items that only the feature
         tables list have 0.
     """
-    lengths = np.array(sorted(measures.lengths.items()), dtype=np.int64).T
-    result = {"session_lengths": _counts(*lengths), "rewards": _rewards(measures, passes)}
-    if popularity is not None:
-        result["item_popularity"] = _counts(*np.unique(popularity, return_counts=True))
+    connection, values = rows.log.connection, counts.values
+    lengths = _count_values(connection, f"SELECT steps FROM {EPISODES}")
+    result = {"session_lengths": _bin(*lengths)}
+    if values.few:
+        result["rewards"] = {
+            "values": values.values.tolist(),
+            "counts": values.counts.tolist(),
+            "quantiles": _weigh_quantiles(values.values, values.counts),
+        }
+    else:
+        result["rewards"] = _bin_rewards(rows, cut, counts)
+    if _has_items(rows):
+        shown = f"SELECT coalesce(steps, 0) FROM items LEFT JOIN {USED_ITEMS} USING (item_id)"
+        result["item_popularity"] = _bin(*_count_values(connection, shown))
     return result
 
 
-def _counts(values: IntArray, counts: IntArray) -> Distribution:
+def _count_values(connection: duckdb.DuckDBPyConnection, query: str) -> tuple[Array, IntArray]:
+    """Distinct values of a query of one column, ascending, and how often each occurs."""
+    rows = connection.sql(
+        f"SELECT value, count(*) FROM ({query}) AS of_query(value) GROUP BY value ORDER BY value"
+    ).fetchall()
+    return np.array([value for value, _ in rows]), np.array([count for _, count in rows])
+
+
+def _bin(values: IntArray, counts: IntArray) -> Distribution:
     """Distribution of distinct integers ≥ 0, ascending, in bins 0, 1, 2–3, 4–7, …"""
     edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
     edges = edges[1:] if values[0] > 0 else edges
@@ -334,34 +352,37 @@ def _counts(values: IntArray, counts: IntArray) -> Distribution:
     return {
         "edges": edges,
         "counts": binned.astype(np.int64).tolist(),
-        "quantiles": _quantiles(values, counts),
+        "quantiles": _weigh_quantiles(values, counts),
     }
 
 
-def _rewards(measures: Measures, passes: RewardPasses) -> Distribution:
-    counted = measures.values
-    if counted.few:
-        return {
-            "values": counted.values.tolist(),
-            "counts": counted.counts.tolist(),
-            "quantiles": _quantiles(counted.values, counted.counts),
-        }
-    sample = passes.sampled()
-    quantiles = _quantiles(sample, np.ones(len(sample), dtype=np.int64))
+def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution:
+    """Distribution of rewards of many values."""
+    every, sample = max(1, round(counts.steps / SAMPLE_ROWS)), []
+    for episodes in read_episodes(rows, cut):
+        rewards, times = (episodes.rows[name] for name in (schema.REWARD, schema.TIMESTAMP))
+        # By hash, so that the order of rows in the files does not matter.
+        keys = np.repeat(episodes.users, episodes.lengths).astype(np.uint64) << np.uint64(41)
+        sample.append(rewards[mixed(keys + times.astype(np.uint64)) % np.uint64(every) == 0])
+    ordered = np.sort(np.concatenate(sample))
+    quantiles = _weigh_quantiles(ordered, np.ones(len(ordered), dtype=np.int64))
     ends = list(quantiles.values())
     low, high = ends[1], ends[-2]
     if not low < high:
-        low, high = measures.lowest, measures.highest
+        low, high = counts.lowest, counts.highest
+    edges = np.linspace(low, high, FEW_VALUES + 1)
+    within = np.array([-np.inf, *edges[1:-1], np.inf])
+    filled = sum(np.histogram(e.rows[schema.REWARD], within)[0] for e in read_episodes(rows, cut))
     return {
-        "edges": np.linspace(low, high, FEW_VALUES + 1).tolist(),
-        "counts": passes.binned(low, high, FEW_VALUES).tolist(),
+        "edges": edges.tolist(),
+        "counts": np.asarray(filled).tolist(),
         "quantiles": quantiles,
     }
 
 
-def _quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
+def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
     """Quantiles, each one of the ascending values, of which there are `counts`."""
     cumulative = np.cumsum(counts)
     ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
-    found = values[np.searchsorted(cumulative, ranks)].tolist()
-    return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
+    chosen = values[np.searchsorted(cumulative, ranks)].tolist()
+    return {f"{share:g}": value for share, value in zip(QUANTILES, chosen, strict=True)}

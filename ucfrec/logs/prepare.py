@@ -1,8 +1,8 @@
 """Turn Parquet and CSV logs into an episode store: clean rows, form sessions, write episodes.
 
-An embedded DuckDB reads and sorts the rows once, out of core. What follows goes through the sorted
-rows in batches: faults and duplicates (`sorted_rows`), sessions (`sessions`), counts (`measures`)
-and the store (`steps`).
+An embedded DuckDB reads and sorts the rows once, out of core (`sorted_rows`). What follows are
+passes over the sorted rows in batches: sessions and splits (`sessions`), counts (`measures`) and
+the steps of the store (`ids`).
 """
 
 import math
@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
@@ -34,9 +33,7 @@ from ucfrec.logs.ids import (
     ID_TABLES,
     ITEMS_FILE,
     USERS_FILE,
-    StepNumbers,
     number_ids,
-    popularity,
     text_ids,
     write_episode_users,
     write_ids,
@@ -44,17 +41,9 @@ from ucfrec.logs.ids import (
 )
 from ucfrec.logs.kept import DUPLICATES, require_rows
 from ucfrec.logs.mapping import SESSIONS, FeatureTable, LogMapping, log_files
-from ucfrec.logs.measures import (
-    Measures,
-    RewardPasses,
-    binned_rewards,
-    distributions,
-    measure,
-    sampled_rewards,
-)
-from ucfrec.logs.sessions import Cut, Episodes, by_sessions, count_unsorted, episodes, split_bounds
-from ucfrec.logs.sorted_rows import SortedRows, check_sorted, sorted_batches
-from ucfrec.logs.spool import Spool
+from ucfrec.logs.measures import count_steps
+from ucfrec.logs.sessions import Cut, split_bounds
+from ucfrec.logs.sorted_rows import SortedRows, sort_rows
 from ucfrec.logs.summary import (
     build_report,
     note_bots,
@@ -207,16 +196,14 @@ def prepare(
             explained(found.rows.log.connection, found.rows.log.tables, out.parent),
         ):
             log, report = found.rows.log, found.report
-            numbers = StepNumbers.of(log, found.measures, found.scratch)
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = write_steps(folder, found.episodes(), found.spool, numbers, bar)
+                writer = write_steps(found.rows, found.cut, folder, bar)
             ids = {**write_ids(log, folder), **_feature_digests(found)}
             record = writer.finish(report["reward"], report, ids)
             if log.key == schema.ITEM_ID:
                 _write_states(found, folder, options.embedding_size, like)
             if like is not None:
-                users = (each.users for each in found.episodes())
-                write_episode_users(log, folder / EPISODE_USERS, users)
+                write_episode_users(log, folder / EPISODE_USERS)
             record.seal(folder)
     return report
 
@@ -252,18 +239,11 @@ class PreparedLog:
     """A log that is sorted and counted."""
 
     rows: SortedRows
-    spool: Spool
-    """The usable rows in the order of the store."""
     cut: Cut
-    measures: Measures
     features: Features
     report: dict[str, Any]
     scratch: Path
     """Folder for scratch."""
-
-    def episodes(self) -> Iterator[Episodes]:
-        """Those of the store."""
-        return episodes(self.spool, self.cut, self.rows.last_ms)
 
 
 @contextmanager
@@ -291,54 +271,51 @@ def prepared_log(
             mapping, reward = settled(connection, tables, mapping, reward)
             typed = connection, tables, mapping, reward, session_by
             if options.engine == "spark":
-                from ucfrec.logs.spark import sorted_with_spark  # an extra
+                from ucfrec.logs.spark import sort_with_spark  # an extra
 
-                log, batches = sorted_with_spark(*typed, known, scratch, options.spark_master)
+                rows = sort_with_spark(
+                    *typed, known, scratch, options.duplicates, options.spark_master
+                )
             else:
                 log = typed_log(*typed, spill, text_ids(onto or like))
                 with explained(connection, log.tables, spill):
-                    batches = sorted_batches(log, known, scratch)
+                    by_session = log.session_by == schema.SESSION_ID
+                    rows = sort_rows(log, known, options.duplicates, scratch, by_session)
+            log = rows.log
             with explained(connection, log.tables, spill):
-                rows = check_sorted(log, batches, options.duplicates, scratch)
-                require_rows(log, len(rows.clean), rows.dropped, onto)
+                require_rows(log, rows.count, rows.dropped, onto)
                 note_losses(rows, reward, mapping.where)
                 if like is None and onto is None:
                     require_variety(rows)
                     note_unread_features(files, mapping)
                 note_equal_times(rows, mapping.columns.get(schema.TIMESTAMP, schema.TIMESTAMP))
                 stage.update()
-                spool, cut = _cut(rows, options, like, scratch)
-                stage.update()
-                measures = measure(spool, cut, rows.last_ms, rows.items, scratch / "users")
-                _require_probabilities(log, measures)
-                if like is None and onto is None:
-                    note_one_item(rows, measures)
-                    if len(options.split) == 2:
-                        note_empty_splits(rows, cut, measures)
-                note_bots(rows, measures, mapping.columns.get(schema.USER_ID, schema.USER_ID))
+                cut = _cut(rows, options, like)
+                counts = count_steps(rows, cut)
                 stage.update()
                 features = _features(log, mapping, like)
-                number_ids(log, measures, features, like, onto)
+                number_ids(log, features, like, onto)
+                report = {"reward": reward, **build_report(rows, cut, counts)}
+                if like is None and onto is None:
+                    note_one_item(rows, report)
+                    if len(options.split) == 2:
+                        note_empty_splits(rows, report)
+                note_bots(rows, report, mapping.columns.get(schema.USER_ID, schema.USER_ID))
+                stage.update()
                 _require_known_ids(log, mapping, features, noted=onto is None)
-                report = _report(rows, spool, cut, measures)
-                report = {"reward": reward, **report, "duplicates": options.duplicates}
+                report |= {"duplicates": options.duplicates}
                 report |= {"dataset": options.dataset, **_remembered(mapping)}
                 report |= {"min_steps": options.min_steps, "max_session": options.max_session}
                 report["features"] = [name for name, names in features.items() if names]
                 stage.update()
-        yield PreparedLog(rows, spool, cut, measures, features, report, scratch)
+        yield PreparedLog(rows, cut, features, report, scratch)
 
 
-def _cut(
-    rows: SortedRows, options: PrepareOptions, like: Path | None, scratch: Path
-) -> tuple[Spool, Cut]:
-    """The usable rows in the order of the store, and how they form episodes."""
+def _cut(rows: SortedRows, options: PrepareOptions, like: Path | None) -> Cut:
+    """How the rows form episodes."""
     bounds = split_bounds(rows, options.split if like is None else (1.0, 0.0, 0.0))
     gap_ms = round(options.gap_minutes * 60_000)
-    cut = Cut(rows.log.session_by, gap_ms, options.min_steps, bounds, options.max_session)
-    if cut.session_by == schema.SESSION_ID:
-        return by_sessions(rows, scratch / "sessions"), cut
-    return rows.clean, cut
+    return Cut(rows.log.session_by, gap_ms, options.min_steps, bounds, options.max_session)
 
 
 def _remembered(mapping: LogMapping) -> dict[str, Any]:
@@ -348,17 +325,6 @@ def _remembered(mapping: LogMapping) -> dict[str, Any]:
         if (text := getattr(mapping, name)) is not None:
             found[name] = str(text)
     return found | ({"partitions": True} if mapping.partitions else {})
-
-
-def _report(rows: SortedRows, spool: Spool, cut: Cut, measures: Measures) -> dict[str, Any]:
-    shown = None if rows.log.key != schema.ITEM_ID else popularity(rows.log, measures)
-
-    given = spool, cut, rows.last_ms
-    passes = RewardPasses(
-        partial(sampled_rewards, *given, measures.steps), partial(binned_rewards, *given)
-    )
-    summary = distributions(measures, shown, passes)
-    return build_report(rows, cut, measures, count_unsorted(rows.placed), summary)
 
 
 def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features:
@@ -386,27 +352,9 @@ def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
     return {schema.USER_ID: mapping.user_features, schema.ITEM_ID: mapping.item_features}
 
 
-def _require_probabilities(log: TypedLog, measures: Measures) -> None:
-    if measures.not_above_0:
-        lowest = f"{measures.lowest_propensity:.6g}"
-        raise InputError(
-            f"{log.name}: {schema.PROPENSITY} is not above 0, down to {lowest}, in "
-            f"{measures.not_above_0:,} of {measures.steps:,} rows; of a logarithm give --column "
-            f"propensity='exp(propensity)'; if {lowest} means unknown, --column "
-            f"propensity='nullif(propensity, {lowest})'"
-        )
-    if measures.above_1:
-        raise InputError(
-            f"{log.name}: {schema.PROPENSITY} is above 1, up to {measures.highest_propensity:.6g}, "
-            f"in {measures.above_1:,} of {measures.steps:,} rows; give the probability that the "
-            "item was shown: of a percentage with --column propensity='propensity / 100', or "
-            "ignore the column with --column propensity="
-        )
-
-
 def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features, noted: bool) -> None:
     """Check that feature tables are about users and items of the log; after `number_ids`."""
-    kept = {name: f"kept_{table}" for name, table, _ in ID_TABLES}
+    kept = {name: f"used_{table}" for name, table, _ in ID_TABLES}
     for name, names in features.items():
         tables = feature_tables(mapping)[name]
         require_known_ids(log.connection, tables, names, name, kept[name], noted)

@@ -1,95 +1,121 @@
-"""The usable rows of a log in order of user, time and choice: one sort, then one pass.
+"""The usable rows of a log in order of user and time: one ORDER BY, then one pass.
 
-The engine sorts, out of core; the pass over the sorted rows, in batches, drops faulty rows and
-duplicates and writes the others to a spool with numbers in place of ids.
+`coded_ids` and `in_order` are run by DuckDB or by Spark and mean the same to both. Their order says
+all that is to be known of a row: what follows compares it with the row before.
 """
 
+import io
 import mmap
-from collections.abc import Iterator, Mapping
-from contextlib import closing
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.errors import InputError
 from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import (
-    REASONS,
-    Digests,
-    Hashes,
-    digests,
-    faults,
-    in_hashed_order,
-    kept_rows,
-    require_rewards_in_range,
-)
-from ucfrec.logs.spool import Spool, whole_groups
+from ucfrec.logs.kept import HASH, REASONS, TIE, faults, order_duplicates
+from ucfrec.logs.tables import MAX_FLOAT
 from ucfrec.logs.typed import ROWS, WANTED, TypedLog
 
-CODES: Final = {schema.USER_ID: "user_codes", schema.ITEM_ID: "item_codes"}
-"""Id column to the table of its ids and their codes, numbers in the order of the ids."""
-_SESSION_CODES: Final = "session_codes"
-UNPLACED: Final = 128
-"""Added to the fault of rows without a user or a time, which have no place in the order."""
+USER, ITEM, SESSION = "user_code", "item_code", "session"
+"""Columns of the sorted rows: numbers of the ids, in the order of the ids."""
+CODES: Final = {
+    schema.USER_ID: ("user_codes", USER),
+    schema.ITEM_ID: ("item_codes", ITEM),
+    schema.SESSION_ID: ("session_codes", SESSION),
+}
+"""Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
+_NO_SESSION: Final = 2**31 - 1
+"""Number of rows without a session, where sessions are formed otherwise."""
+FAULTY: Final = "faulty"
+"""View of all rows, as of `with_faults`."""
+FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
 
 
 class RowVectors:
-    """The observation of every row of a log, in a file."""
+    """The observation of every row of a log, in a file or in memory.
 
-    def __init__(self, log: TypedLog, file: Path) -> None:
+    Long rows are not sorted: where a row was in the files, its observation is read at the end.
+    """
+
+    def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
         """
         Args:
-            log: with observations, all of them finite.
-            file: to write.
+            batches: `row`, from 1 on in order, and `observation`, finite.
+            size: of an observation.
+            file: to write; None for memory.
         """
-        self._file, self._size = file, log.vector_size[schema.OBSERVATION]
-        rows, query = 0, f"SELECT row, {schema.OBSERVATION} FROM {ROWS}"
-        with file.open("xb") as out:
-            for batch in log.connection.sql(query).to_arrow_reader(log.batch_rows):
+        rows, self._file = 0, file
+        memory = io.BytesIO()
+        with memory if file is None else file.open("xb") as out:
+            for batch in batches:
+                places = as_numpy(batch.column("row"))
                 # What is at the place of a row must be its own: the engine keeps their order.
-                places = as_numpy(batch.column(0))
                 assert np.array_equal(places, np.arange(rows + 1, rows + 1 + len(places)))
-                out.write(np.ascontiguousarray(as_numpy(batch.column(1).flatten())).data)
+                values = as_numpy(batch.column(schema.OBSERVATION).flatten())
+                out.write(np.ascontiguousarray(values).data)
                 rows += len(places)
-        self._values: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
-            file, np.float32, "r", shape=(rows, self._size)
-        )
-        # Neighbours of a row in the file are hardly ever its neighbours in the order.
-        self._advise("MADV_RANDOM")
+            self._memory = memory.getvalue()
+        self._shape = rows, size
 
-    def _advise(self, advice: str) -> None:
-        """Advise the system how the file is read; Windows takes no advice."""
-        if hasattr(mmap, advice):
-            self._map.madvise(getattr(mmap, advice))
-
-    @property
-    def _map(self) -> mmap.mmap:
-        found = self._values._mmap  # type: ignore[attr-defined]
-        assert isinstance(found, mmap.mmap)
-        return found
-
-    def of(self, rows: IntArray) -> Float32Array:
+    def of_rows(self, rows: IntArray) -> Float32Array:
         """(M, O) observations of the rows at the positions (M,), from 1."""
-        values = np.asarray(self._values[rows - 1])
-        # Pages of a mapped file count as the memory of a process that must keep to a limit.
-        self._advise("MADV_DONTNEED")
-        return values
+        if self._file is None:
+            values = np.frombuffer(self._memory, np.float32).reshape(self._shape)
+            return np.asarray(values[rows - 1])
+        # Mapped anew each time: mapped pages count as the memory of a process that must keep to a
+        # limit.
+        mapped: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
+            self._file, np.float32, "r", shape=self._shape
+        )
+        if hasattr(mmap, "MADV_RANDOM"):  # neighbours in the file are hardly ever so in the order
+            mapped._mmap.madvise(mmap.MADV_RANDOM)  # type: ignore[attr-defined]
+        return np.array(mapped[rows - 1])
 
-    def joined(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-        """Batches with the column `row`, each with the observations of its rows; then the file is
-        removed."""
-        for batch in batches:
-            values = self.of(as_numpy(batch.column("row")))
-            numbers = pa.Array.from_buffers(pa.float32(), values.size, [None, pa.py_buffer(values)])
-            column = pa.FixedSizeListArray.from_arrays(numbers, self._size)
-            yield batch.append_column(schema.OBSERVATION, column)
-        self._file.unlink()
+
+class RowFile:
+    """Batches of rows, column by column, in a scratch folder or in memory."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """
+        Args:
+            folder: of the files; it is made, and must not exist; None for memory.
+        """
+        if folder is not None:
+            folder.mkdir()
+        self._folder = folder
+        self._memory: list[dict[str, Array]] = []
+        self._batches = 0
+
+    def append(self, batch: dict[str, Array]) -> None:
+        """Append rows, the same columns every time."""
+        self._batches += 1
+        if self._folder is None:
+            self._memory.append(batch)
+            return
+        for name, values in batch.items():
+            with (self._folder / name).open("ab") as file:
+                np.save(file, values)
+
+    def read(self, *names: str) -> Iterator[dict[str, Array]]:
+        """Some columns of the batches, or all, in order."""
+        if self._folder is None or not self._batches:
+            yield from self._memory
+            return
+        with ExitStack() as stack:
+            files = {
+                path.name: stack.enter_context(path.open("rb"))
+                for path in self._folder.iterdir()
+                if path.name in names or not names
+            }
+            for _ in range(self._batches):
+                yield {name: np.load(file) for name, file in files.items()}
 
 
 @dataclass
@@ -97,25 +123,24 @@ class SortedRows:
     """The usable rows of a log, and what was found on the way."""
 
     log: TypedLog
-    clean: Spool
-    """Usable rows in order of user, time and hash: `user` (int64 in the order of the ids),
-    `item` (code, int32) or `action`, `timestamp`, `reward` (float64) and, if the log has them,
-    `session` (with sessions by session_id), `observation`, `propensity` (NaN if unknown) and
-    `is_random`."""
-    placed: Spool
-    """All rows with a user and a time, in that order: `user`, `timestamp` and `row`, their position
-    in the files."""
-    items: int = 0
-    """Number of items that have a code."""
-    dropped: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
+    file: RowFile
+    """The rows in order of user and time, all of a user in one batch: `USER`, `ITEM` or `action`,
+    `timestamp`, `reward` (float64), `row` (position in the files) and, if the log has them,
+    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown) and `is_random`."""
+    observations: RowVectors | None
+    dropped: dict[str, int]
     """Number of dropped rows by reason."""
-    read: int = 0
+    read: int
     """Number of rows."""
+    count: int = 0
+    """Number of usable rows: no duplicates, with a finite reward."""
     conflicts: int = 0
-    """Number of duplicates with another reward than the row that is kept."""
+    """Number of duplicates with another reward than the row that counts."""
     tied: int = 0
     """Number of usable rows that share their user and time."""
-    first_ms: int = 0
+    unsorted: int = 0
+    """Number of usable rows that are in the files before the row that precedes them in time."""
+    first_ms: int = np.iinfo(np.int64).max
     """Time of the earliest usable row."""
     last_ms: int = 0
     """Time of the latest usable row."""
@@ -123,198 +148,249 @@ class SortedRows:
     """Lowest reward."""
     highest: float = -np.inf
     """Highest reward."""
+    large: int = 0
+    """Number of rewards that are too large to train with."""
 
-    def count(self, clean: dict[str, Array]) -> None:
-        """Add usable rows to the counts."""
-        times, rewards = clean[schema.TIMESTAMP], clean[schema.REWARD]
-        if not len(times):
+    def add(self, batch: dict[str, Array], duplicates: str, by_session: bool) -> None:
+        """Add rows as of `in_order`, all of their users, without duplicates and undefined rewards.
+
+        Args:
+            duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
+            by_session: whether the rows of a session follow each other, as sessions of one user may
+                overlap.
+        """
+        keys = (USER, schema.TIMESTAMP, ITEM if ITEM in batch else schema.ACTION)
+        repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
+        if repeated.any():
+            batch = self._order_duplicates(batch, repeated, duplicates)
+            counted = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
+            own, other = batch[schema.REWARD][repeated], batch[schema.REWARD][counted[repeated]]
+            equal = (own == other) | (np.isnan(own) & np.isnan(other))
+            self.conflicts += int(np.count_nonzero(~equal))
+            self.dropped["duplicate"] += len(own)
+        undefined = np.isnan(batch[schema.REWARD]) & ~repeated
+        self.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
+        usable = ~(repeated | undefined)
+        if not usable.all():
+            batch = {name: values[usable] for name, values in batch.items()}
+        if not usable.any():
             return
-        if not len(self.clean):
-            self.first_ms = int(times[0])
+        times, rewards, rows = (batch[n] for n in (schema.TIMESTAMP, schema.REWARD, "row"))
+        same_user = _equal_before(batch[USER])
+        tied = np.concatenate([[False], same_user & _equal_before(times), [False]])
+        self.tied += int(np.count_nonzero(tied[1:] | tied[:-1]))
+        moved = same_user & (times[1:] > times[:-1]) & (rows[1:] < rows[:-1])
+        self.unsorted += int(np.count_nonzero(moved))
+        self.count += len(times)
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
+        self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
+        if by_session:
+            order = _order_by_session(batch)
+            batch = {name: values[order] for name, values in batch.items()}
+        self.file.append(batch)
+
+    def _order_duplicates(
+        self, batch: dict[str, Array], repeated: BoolArray, duplicates: str
+    ) -> dict[str, Array]:
+        """The rows with the one that counts as the first of its duplicates.
+
+        Args:
+            repeated: (M,) whether a row has the user, time and choice of the one before.
+        """
+        places = np.flatnonzero(repeated | np.append(repeated[1:], False))
+        some = {name: values[places] for name, values in batch.items()}
+        if self.observations is not None:
+            some[schema.OBSERVATION] = self.observations.of_rows(some["row"])
+        groups = np.cumsum(~repeated)[places]
+        order = places[np.lexsort([*order_duplicates(some, duplicates), groups])]
+        ordered = {}
+        for name, values in batch.items():
+            ordered[name] = values.copy()
+            ordered[name][places] = values[order]
+        return ordered
 
 
-def sorted_batches(
-    log: TypedLog, known_items: Path | None, folder: Path | None
-) -> Iterator[pa.RecordBatch]:
-    """Sort every row of a log with DuckDB, and make the tables of codes.
+def _equal_before(values: Array) -> BoolArray:
+    """(M − 1,) whether each of M values but the first is equal to the one before."""
+    equal = values[1:] == values[:-1]
+    return np.asarray(equal if equal.ndim == 1 else equal.all(axis=1))
+
+
+def _order_by_session(batch: dict[str, Array]) -> IntArray:
+    """(M,) order by user, first time of the session, session and time of rows in order of time."""
+    users, sessions, times = (batch[name] for name in (USER, SESSION, schema.TIMESTAMP))
+    grouped = np.lexsort((sessions, users))
+    starts = np.flatnonzero(
+        np.append(True, ~(_equal_before(users[grouped]) & _equal_before(sessions[grouped])))
+    )
+    began = np.empty(len(users), dtype=np.int64)
+    began[grouped] = np.repeat(times[grouped][starts], np.diff(np.append(starts, len(users))))
+    return np.lexsort((sessions, began, users))
+
+
+def _read_whole_users(batches: Iterable[dict[str, Array]]) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two users."""
+    pending: dict[str, Array] = {}
+    for batch in batches:
+        if pending:
+            ends = np.flatnonzero(~_equal_before(pending[USER]))
+            end = int(ends[-1]) + 1 if len(ends) else 0
+            if end:
+                yield {name: values[:end] for name, values in pending.items()}
+            batch = {name: np.concatenate([pending[name][end:], batch[name]]) for name in batch}
+        pending = batch
+    if pending and len(pending[USER]):
+        yield pending
+
+
+def sort_rows(
+    log: TypedLog,
+    known_items: Path | None,
+    duplicates: str,
+    folder: Path | None,
+    by_session: bool = False,
+) -> SortedRows:
+    """Sort the rows of a log with DuckDB.
 
     Args:
         log: its engine may open `known_items`.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        folder: scratch folder, of the observations; None for a log in memory.
-
-    Returns:
-        Rows as of `in_order`.
-    """
-    for name, table in code_tables(log):
-        log.connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
-    faulty = f"({with_faults(log, ROWS, faults(log, known_items))})"
-    if schema.OBSERVATION not in log.columns or folder is None:
-        return _read(log, in_order(log, faulty))
-    vectors = RowVectors(log, folder / "observations.bin")
-    return vectors.joined(_read(log, in_order(log, faulty, left_out=schema.OBSERVATION)))
-
-
-def _read(log: TypedLog, query: str) -> Iterator[pa.RecordBatch]:
-    yield from log.connection.sql(query).to_arrow_reader(log.batch_rows)
-
-
-def check_sorted(
-    log: TypedLog, batches: Iterator[pa.RecordBatch], duplicates: str, folder: Path | None
-) -> SortedRows:
-    """Check every row of a log.
-
-    Args:
-        log: its engine has the tables of `code_tables`.
-        batches: all its rows, as `in_order` selects them.
         duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
-        folder: scratch folder of the spools; None for memory.
+        folder: scratch folder; None for a log in memory.
+        by_session: whether the rows of a session follow each other.
 
     Raises:
         InputError: a reward is too large to train with.
     """
-    spools = [Spool(None if folder is None else folder / name) for name in ("clean", "placed")]
-    rows = SortedRows(log, spools[0], spools[1])
-    rewards = _Rewards()
-    # The connection itself answers no query before the last batch of its rows.
-    with closing(log.connection.cursor()) as asked:
-        hashes = _hashes(log, asked)
-        columns = (_columns(batch, log) for batch in batches)
-        # Equal times of a user stay together.
-        for batch in whole_groups(columns, "user", schema.TIMESTAMP):
-            _check_batch(rows, batch, duplicates, hashes, rewards)
-    if log.key == schema.ITEM_ID:
-        (rows.items,) = log.one("SELECT count(*) FROM item_codes")
-    require_rewards_in_range(log, rewards.large, len(rows.clean), rewards.largest)
-    return rows
+    connection = log.connection
+    connection.execute(f"CREATE VIEW {FAULTY} AS {with_faults(log, ROWS, known_items)}")
+    connection.execute("CREATE MACRO conv(digits, a, b) AS CAST('0x' || digits AS BIGINT)")
+    for name, table in code_tables(log).items():
+        connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
+    counts = dict(connection.sql(FAULT_COUNTS).fetchall())
+
+    def read(query: str) -> Iterator[pa.RecordBatch]:
+        yield from connection.sql(query).to_arrow_reader(log.batch_rows)
+
+    observations = read(f"SELECT row, {schema.OBSERVATION} FROM {ROWS}")
+    batches = read(in_order(log, FAULTY))
+    return check_sorted(log, counts, observations, batches, duplicates, folder, by_session)
 
 
-@dataclass
-class _Rewards:
-    """How large rewards are."""
-
-    large: int = 0
-    """Number of those that are too large."""
-    largest: float = 0.0
-
-
-def _check_batch(
-    rows: SortedRows, batch: dict[str, Array], duplicates: str, hashes: Hashes, rewards: _Rewards
-) -> None:
-    rows.read += len(batch["fault"])
-    placed = np.asarray(batch["fault"] < UNPLACED)
-    rows.placed.append(_where(placed, {n: batch[n] for n in ("user", "timestamp", "row")}))
-    reasons = list(REASONS)
-    counts = np.bincount(batch["fault"] % UNPLACED, minlength=len(reasons) + 1)
-    for reason, n in zip(reasons, counts[1:], strict=True):
-        rows.dropped[reason] += int(n)
-    usable = np.asarray(batch.pop("fault") == 0)
-    batch = _where(usable, batch)
-    kept = kept_rows(batch, duplicates)
-    rows.conflicts += kept.conflicts
-    rows.dropped["duplicate"] += kept.duplicates
-    rows.dropped["reward_not_finite"] += kept.undefined
-    order, tied = in_hashed_order(batch, kept.rows, hashes)
-    rows.tied += tied
-    good = {name: batch[name][order] for name in batch if name in _spooled(rows.log)}
-    size = np.abs(good[schema.REWARD])
-    rewards.large += int(np.count_nonzero(size > schema.LARGEST_REWARD))
-    rewards.largest = max(rewards.largest, float(size.max(initial=0)))
-    rows.count(good)
-    rows.clean.append(good)
-
-
-def _where(chosen: BoolArray, batch: dict[str, Array]) -> dict[str, Array]:
-    if chosen.all():
-        return batch
-    return {name: values[chosen] for name, values in batch.items()}
-
-
-def has_codes(log: TypedLog, name: str) -> bool:
-    """Whether the ids of a column of the log have codes; others are their own."""
-    return name == schema.ITEM_ID or log.id_type(name) != "BIGINT"
-
-
-def code_tables(log: TypedLog) -> Iterator[tuple[str, str]]:
-    """Id columns of the log that have codes, and the names of the tables of `coded_ids`."""
-    for name, table in (*CODES.items(), (schema.SESSION_ID, _SESSION_CODES)):
-        if name in log.columns and has_codes(log, name):
-            yield name, table
-
-
-# The SQL of `coded_ids` and `in_order` is run by DuckDB and by Spark, and means the same to both.
+def code_tables(log: TypedLog) -> dict[str, str]:
+    """Id columns of the log, and the tables of `coded_ids`."""
+    return {name: table for name, (table, _) in CODES.items() if name in log.columns}
 
 
 def coded_ids(name: str, rows: str) -> str:
-    """SQL of the ids in a column of some typed rows: each with `code`, its place in their order."""
+    """SQL of the ids in a column of some typed rows: `code`, its place in their order, `hash`."""
     return (
-        f"SELECT {name}, CAST(row_number() OVER (ORDER BY {name}) - 1 AS BIGINT) AS code "
+        f"SELECT {name}, CAST(row_number() OVER (ORDER BY {name}) - 1 AS INTEGER) AS code, "
+        f"{HASH.format(name)} AS hash "
         f"FROM (SELECT DISTINCT {name} FROM {rows} WHERE {name} IS NOT NULL) AS ids"
     )
 
 
-def with_faults(log: TypedLog, rows: str, conditions: Mapping[str, str]) -> str:
+def with_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
     """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault from 1.
+
+    Actions get a hash.
 
     Args:
         rows: relation of some of its typed rows.
-        conditions: as from `ucfrec.logs.kept.faults`.
+        known_items: `items.parquet` of a store: other items are a fault; None for none.
     """
     cases = " ".join(
-        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
+        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}"
+        for reason, sql in faults(log, known_items).items()
     )
-    unplaced = f"{schema.USER_ID} IS NULL OR {schema.TIMESTAMP} IS NULL"
-    fault = f"CASE {cases} ELSE 0 END + CASE WHEN {unplaced} THEN {UNPLACED} ELSE 0 END"
-    values = f"* EXCLUDE ({WANTED})" if log.has_condition else "*"
-    query = f"SELECT {values}, CAST({fault} AS SMALLINT) AS fault FROM {rows}"
-    if log.key == schema.ITEM_ID:
-        return query
-    zeros = [0.0] * log.vector_size[schema.ACTION]
-    action = f"CASE WHEN fault = 0 THEN action ELSE {zeros}::FLOAT[] END AS action"
-    return f"SELECT * REPLACE ({action}) FROM ({query})"
+    columns = [f"* EXCLUDE ({WANTED})" if log.has_condition else "*"]
+    if log.key == schema.ACTION:
+        text = f"md5(CAST({schema.ACTION} AS VARCHAR))"
+        columns.append(f"CAST('0x' || left({text}, 7) AS BIGINT) AS action_hash")
+    fault = f"CAST({f'CASE {cases} ELSE 0 END' if cases else 0} AS SMALLINT) AS fault"
+    return f"SELECT {', '.join(columns)}, {fault} FROM {rows}"
 
 
-def in_order(log: TypedLog, rows: str, left_out: str = "") -> str:
-    """SQL of typed rows with faults, with codes, in order, without missing values.
+def in_order(log: TypedLog, rows: str) -> str:
+    """SQL of the rows without a fault in order of user, time, the hash of `kept.TIE` and choice.
 
     Args:
-        rows: relation of all its rows, as of `with_faults`; beside it are the tables of
-            `code_tables`.
-        left_out: a column that is not read.
+        rows: relation of rows as of `with_faults`; beside it are the tables of `code_tables`.
     """
-    coded = dict(code_tables(log))
-    joins = "".join(f" LEFT JOIN {table} USING ({name})" for name, table in coded.items())
-    number = {name: f"{table}.code" for name, table in coded.items()}
-    user = number.get(schema.USER_ID, schema.USER_ID)
-    columns = [f"coalesce({user}, 0) AS user", f"coalesce({schema.TIMESTAMP}, 0) AS timestamp"]
-    if log.key == schema.ITEM_ID:
-        columns.append(f"CAST(coalesce({number[log.key]}, -1) AS INTEGER) AS item")
-    else:
-        columns.append(schema.ACTION)
-    if schema.SESSION_ID in log.columns:
-        session = number.get(schema.SESSION_ID, schema.SESSION_ID)
-        columns += [f"coalesce({session}, 0) AS session", f"{session} IS NULL AS no_session"]
-    columns.append(f"coalesce({schema.REWARD}, CAST('nan' AS DOUBLE)) AS {schema.REWARD}")
+    tables = code_tables(log)
+    joins = [
+        f"{'LEFT' if name == schema.SESSION_ID else ''} JOIN {table} USING ({name})"
+        for name, table in tables.items()
+    ]
+    columns = {CODES[name][1]: f"{table}.code" for name, table in tables.items()}
+    hashed = "item_codes.hash" if schema.ITEM_ID in tables else "action_hash"
+    finite = f"abs({schema.REWARD}) <= {MAX_FLOAT}"
+    columns |= {
+        schema.TIMESTAMP: schema.TIMESTAMP,
+        "tie": f"CAST({TIE.format('user_codes.hash', schema.TIMESTAMP, hashed)} AS INTEGER)",
+        "reward": f"CASE WHEN {finite} THEN reward ELSE CAST('nan' AS DOUBLE) END",
+        "row": "row",
+    }
+    if schema.SESSION_ID in tables:
+        columns[SESSION] = f"coalesce({columns[SESSION]}, {_NO_SESSION})"
+    columns |= {name: name for name in (schema.ACTION, schema.IS_RANDOM) if name in log.columns}
     if schema.PROPENSITY in log.columns:
-        nan = "CAST('nan' AS FLOAT)"
-        columns.append(f"coalesce({schema.PROPENSITY}, {nan}) AS {schema.PROPENSITY}")
-    others = (schema.OBSERVATION, schema.IS_RANDOM)
-    columns += [c for c in others if c in log.columns and c != left_out]
-    choice = schema.ITEM if log.key == schema.ITEM_ID else schema.ACTION
+        columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
+    choice = ITEM if schema.ITEM_ID in tables else schema.ACTION
+    values = ", ".join(f"{sql} AS {name}" for name, sql in columns.items())
+    names = ", ".join(name for name in columns if name != "tie")
     return (
-        f"SELECT {', '.join(columns)}, row, fault FROM {rows} AS faulty{joins} "
-        f"ORDER BY 1, 2, {choice}"
+        f"SELECT {names} FROM (SELECT {values} FROM {rows} AS faulty {' '.join(joins)} "
+        f"WHERE fault = 0) AS coded ORDER BY {USER}, {schema.TIMESTAMP}, tie, {choice}"
     )
 
 
-def _spooled(log: TypedLog) -> set[str]:
-    names = {"user", "item", "action", "timestamp", "reward", "observation", "propensity"}
-    names.add("is_random")
-    return names | ({"session"} if log.session_by == schema.SESSION_ID else set())
+def check_sorted(
+    log: TypedLog,
+    fault_counts: Mapping[int, int],
+    observations: Iterable[pa.RecordBatch],
+    batches: Iterable[pa.RecordBatch],
+    duplicates: str,
+    folder: Path | None,
+    by_session: bool,
+) -> SortedRows:
+    """Check the sorted rows of a log.
+
+    Args:
+        fault_counts: number of rows of the log by `fault`.
+        observations: as of `RowVectors`; read only of a log with observations.
+        batches: as of `in_order`, read after the observations.
+        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
+        folder: scratch folder; None for a log in memory.
+        by_session: whether the rows of a session follow each other.
+
+    Raises:
+        InputError: a reward is too large to train with.
+    """
+    vectors = None
+    if schema.OBSERVATION in log.columns:
+        file = None if folder is None else folder / "observations.bin"
+        vectors = RowVectors(observations, log.vector_size[schema.OBSERVATION], file)
+    rows = SortedRows(
+        log,
+        RowFile(None if folder is None else folder / "rows"),
+        vectors,
+        {reason: fault_counts.get(number, 0) for number, reason in enumerate(REASONS, 1)},
+        sum(fault_counts.values()),
+    )
+    for batch in _read_whole_users(_columns(batch, log) for batch in batches):
+        rows.add(batch, duplicates, by_session)
+    if rows.large:
+        raise InputError(
+            f"{log.tables[0].files[0]}: {rows.large:,} of {rows.count:,} rewards are beyond "
+            f"±{schema.LARGEST_REWARD:g} (up to {max(rows.highest, -rows.lowest):.3g}), too large "
+            "to train with in float32; divide them in the reward expression"
+        )
+    return rows
 
 
 def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
@@ -326,27 +402,3 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
         else:
             columns[name] = as_numpy(column)
     return columns
-
-
-def _hashes(log: TypedLog, asked: duckdb.DuckDBPyConnection) -> Hashes:
-    """Hashes by code, for which `asked` has the tables of `code_tables`."""
-    users_have_codes = has_codes(log, schema.USER_ID)
-
-    def of_codes(name: str, begin: int, end: int) -> Digests:
-        query = (
-            f"SELECT {name} FROM {CODES[name]} WHERE code BETWEEN {begin} AND {end} ORDER BY code"
-        )
-        return digests([each for (each,) in asked.execute(query).fetchall()])
-
-    @cache
-    def of_all_items() -> Digests:
-        return of_codes(schema.ITEM_ID, 0, np.iinfo(np.int32).max)
-
-    def of_users(codes: Array) -> Digests:
-        if not users_have_codes:
-            return digests(codes.tolist())
-        begin = int(codes[0])
-        found: Digests = of_codes(schema.USER_ID, begin, int(codes[-1]))[codes - begin]
-        return found
-
-    return Hashes(of_users, lambda codes: of_all_items()[codes])

@@ -30,9 +30,17 @@ from ucfrec import schema
 from ucfrec.errors import InputError, one_line
 from ucfrec.logs.binding import explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
-from ucfrec.logs.kept import faults
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import code_tables, coded_ids, in_order, with_faults
+from ucfrec.logs.sorted_rows import (
+    FAULT_COUNTS,
+    FAULTY,
+    SortedRows,
+    check_sorted,
+    code_tables,
+    coded_ids,
+    in_order,
+    with_faults,
+)
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
@@ -58,9 +66,9 @@ _COLUMNS: Final = {
     schema.PROPENSITY: "float",
     schema.IS_RANDOM: "boolean",
 }
+_SORTED: Final = "sorted"
 _COUNTS: Final = "file bigint, name string, size bigint, n bigint"
 _ROWS, _BAD = "rows", "bad"
-_TYPED: Final = "typed"
 _REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
 Files = Sequence[tuple[str, Table]]
 """Of each file, the SQL of its typed columns and the table that it is."""
@@ -98,7 +106,7 @@ def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Itera
             yield from tasks[number].run()
 
 
-def sorted_with_spark(
+def sort_with_spark(
     connection: duckdb.DuckDBPyConnection,
     tables: tuple[Table, ...],
     mapping: LogMapping,
@@ -106,22 +114,24 @@ def sorted_with_spark(
     session_by: str | None,
     known_items: Path | None,
     scratch: Path,
+    duplicates: str,
     master: str,
-) -> tuple[TypedLog, Iterator[pa.RecordBatch]]:
-    """Sort every row of a log.
+) -> SortedRows:
+    """Sort every row of a log with Spark, and load the sorted rows and the numbers of its ids.
 
     Args:
-        connection: engine that may open the tables; it reads no row.
+        connection: with the tables open; its engine is that of `ucfrec.logs.engine.engine`.
         tables: of the log's files.
         mapping: log columns to the files' columns.
         reward: scalar SQL expression over the files' columns.
         session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        scratch: folder for scratch, which driver and workers see.
+        scratch: scratch folder, which every worker sees.
+        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
 
     Returns:
-        What `ucfrec.logs.typed.typed_log` and `ucfrec.logs.sorted_rows.sorted_batches` return.
+        What `ucfrec.logs.sorted_rows.sort_rows` returns.
 
     Raises:
         InputError: a file, column or type makes the log unusable, an observation is missing or not
@@ -130,15 +140,20 @@ def sorted_with_spark(
     with spark_session(master) as spark, spark_failures():
         given = connection, tables, mapping, reward, session_by
         log, rows = typed_with_spark(spark, *given, known_items, scratch)
-        rows.createOrReplaceTempView(_TYPED)
-        for name, table in code_tables(log):
-            codes = _written(spark, spark.sql(coded_ids(name, _TYPED)), scratch / table)
+        rows.createOrReplaceTempView(FAULTY)
+        for name, table in code_tables(log).items():
+            codes = _written(spark, spark.sql(coded_ids(name, FAULTY)), scratch / table)
             codes.createOrReplaceTempView(table)
-        _written(spark, spark.sql(in_order(log, _TYPED)), scratch / ROWS)
-    shutil.rmtree(scratch / _TYPED)
-    for _, table in code_tables(log):
+        _written(spark, spark.sql(in_order(log, FAULTY)), scratch / _SORTED)
+        counts = {row[0]: row[1] for row in spark.sql(FAULT_COUNTS).collect()}
+    for table in code_tables(log).values():
         _load(connection, scratch / table, table)
-    return log, _batches(scratch / ROWS, log.batch_rows)
+    observations = _batches(scratch / FAULTY, log.batch_rows, ["row", schema.OBSERVATION])
+    batches = _batches(scratch / _SORTED, log.batch_rows)
+    by_session = log.session_by == schema.SESSION_ID
+    sorted_rows = check_sorted(log, counts, observations, batches, duplicates, scratch, by_session)
+    shutil.rmtree(scratch / FAULTY)
+    return sorted_rows
 
 
 def typed_with_spark(
@@ -151,7 +166,7 @@ def typed_with_spark(
     known_items: Path | None,
     scratch: Path,
 ) -> tuple[TypedLog, Any]:
-    """Read every row of a log; the arguments are those of `sorted_with_spark`.
+    """Read every row of a log; the arguments are those of `sort_with_spark`.
 
     Returns:
         The log, and a Spark frame of its rows as of `ucfrec.logs.sorted_rows.with_faults`, read
@@ -174,7 +189,7 @@ def typed_with_spark(
     log = typed.log(connection, vector_sizes(found.vectors), mapping)
     require_observations(tables, found.bad, sum(found.rows))
     tasks = _row_tasks(log, files, found.rows, known_items)
-    return log, _written(spark, _run(spark, tasks, _schema(log)), scratch / _TYPED)
+    return log, _written(spark, _run(spark, tasks, _schema(log)), scratch / FAULTY)
 
 
 @dataclass
@@ -221,12 +236,11 @@ def _row_tasks(
     log: TypedLog, files: Files, counts: Sequence[int], known_items: Path | None
 ) -> list[Task]:
     """Tasks that read the typed rows with faults of each file."""
-    conditions = faults(log, known_items)
     others = () if known_items is None else (known_items,)
     tasks, before = [], 0
     for (values, table), n in zip(files, counts, strict=True):
         rows = f"({numbered_rows([(values, table.sql)])})"
-        faulty = with_faults(log, rows, conditions)
+        faulty = with_faults(log, rows, known_items)
         query = f"SELECT * REPLACE (row + {before} AS row) FROM ({faulty})"
         tasks.append(Task(table, query, others))
         before += n
@@ -237,7 +251,10 @@ def _schema(log: TypedLog) -> str:
     """Spark's types of the rows of `_row_tasks`."""
     ids = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
     types = {n: _TYPES[log.id_type(n)] if n in ids else _COLUMNS[n] for n in log.columns}
-    types = {"row": "bigint", **types, schema.REWARD: "double", "fault": "smallint"}
+    types = {"row": "bigint", **types, schema.REWARD: "double"}
+    if schema.ACTION in types:
+        types["action_hash"] = "bigint"
+    types["fault"] = "smallint"
     return ", ".join(f"{name} {kind}" for name, kind in types.items())
 
 
@@ -260,20 +277,21 @@ def _parts(folder: Path) -> list[Path]:
     return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
 
 
-def _batches(folder: Path, rows: int = BATCH_ROWS) -> Iterator[pa.RecordBatch]:
+def _batches(
+    folder: Path, rows: int = BATCH_ROWS, columns: list[str] | None = None
+) -> Iterator[pa.RecordBatch]:
     for part in _parts(folder):
         with pq.ParquetFile(part) as file:
-            yield from file.iter_batches(rows, use_threads=False)
+            yield from file.iter_batches(rows, columns=columns, use_threads=False)
 
 
 def _load(connection: duckdb.DuckDBPyConnection, folder: Path, table: str) -> None:
-    """Create a table of the rows in a folder."""
-    parts = _parts(folder)
+    """Create a table of the rows in a folder, in order."""
     batches = (batch for batch in _batches(folder) if batch.num_rows)
-    reader = pa.RecordBatchReader.from_batches(pq.read_schema(parts[0]), batches)
-    connection.register("given_codes", reader)
-    connection.execute(f"CREATE TABLE {table} AS SELECT * FROM given_codes")
-    connection.unregister("given_codes")
+    reader = pa.RecordBatchReader.from_batches(pq.read_schema(_parts(folder)[0]), batches)
+    connection.register("loaded", reader)
+    connection.execute(f"CREATE TABLE {table} AS SELECT * FROM loaded")
+    connection.unregister("loaded")
 
 
 @contextmanager

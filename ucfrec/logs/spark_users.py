@@ -23,7 +23,6 @@ from ucfrec.logs.binding import settled
 from ucfrec.logs.engine import engine
 from ucfrec.logs.kept import REASONS, NoRowsError, note_dropped, require_rows
 from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
-from ucfrec.logs.sorted_rows import UNPLACED
 from ucfrec.logs.spark import spark_failures, spark_session, typed_with_spark
 from ucfrec.logs.tables import open_tables
 from ucfrec.logs.typed import TypedLog
@@ -97,10 +96,7 @@ _DONE: Final = "part bigint, count bigint"
 def _counted(log: TypedLog, rows: Any) -> tuple[int, dict[str, int]]:
     """How many rows have no fault, and how many are left out by reason."""
     faults = {row[0]: row[1] for row in rows.groupBy("fault").count().collect()}
-    dropped = dict.fromkeys(REASONS, 0)
-    for fault, count in faults.items():
-        if fault:
-            dropped[[*REASONS][fault % UNPLACED - 1]] += count
+    dropped = {reason: faults.get(number, 0) for number, reason in enumerate(REASONS, 1)}
     require_rows(log, faults.get(0, 0), dropped)
     note_dropped(log.name, dropped, sum(faults.values()))
     return faults[0], dropped

@@ -1,6 +1,5 @@
 """Report on what `prepare` read, dropped and kept, and warnings that a log's owner would want."""
 
-import math
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -8,7 +7,6 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 import duckdb
-import numpy as np
 
 from ucfrec import schema
 from ucfrec.episodes.long_sessions import LONG
@@ -16,9 +14,9 @@ from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.binding import bind
 from ucfrec.logs.kept import CLOCK_HINT, DUPLICATES, REASONS
-from ucfrec.logs.measures import Distribution, Measures
+from ucfrec.logs.measures import USED_USERS, StepCounts, measure_distributions, report_steps
 from ucfrec.logs.sessions import Cut
-from ucfrec.logs.sorted_rows import CODES, SortedRows, has_codes
+from ucfrec.logs.sorted_rows import SortedRows
 from ucfrec.logs.tables import Table, first_and_more, quoted, text
 from ucfrec.logs.typed import ROWS, TypedLog
 
@@ -34,78 +32,33 @@ def require_variety(rows: SortedRows) -> None:
     """
     if rows.lowest == rows.highest:
         raise InputError(
-            f"{rows.log.name}: all {len(rows.clean)} rewards equal {rows.lowest:g}, so there is "
+            f"{rows.log.name}: all {rows.count} rewards equal {rows.lowest:g}, so there is "
             "nothing to learn; choose another reward expression"
         )
 
 
-def build_report(
-    rows: SortedRows,
-    cut: Cut,
-    measures: Measures,
-    unsorted: int,
-    summary: Mapping[str, Distribution],
-) -> dict[str, Any]:
+def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, Any]:
     """Counts and statistics of a log, as JSON values.
 
     Times are in ms, `reward_statistics` in units of the reward.
-
-    Args:
-        unsorted: see `ucfrec.logs.sessions.count_unsorted`.
-        summary: of `ucfrec.logs.measures`.
     """
-    log = rows.log
-    report = {
-        "files": [origin(file) for table in log.tables for file in table.files],
+    return {
+        "files": [origin(file) for table in rows.log.tables for file in table.files],
         "rows_read": rows.read,
         "dropped": {
             **rows.dropped,
-            "long_session": measures.long_rows,
-            "short_episode": len(rows.clean) - measures.steps - measures.long_rows,
+            "long_session": counts.long_rows,
+            "short_episode": rows.count - counts.steps - counts.long_rows,
         },
         "conflicting_duplicates": rows.conflicts,
-        "unsorted_rows": unsorted,
+        "unsorted_rows": rows.unsorted,
         "equal_times": rows.tied,
-        "steps": measures.steps,
-        "episodes": measures.episodes,
-        "sessions": measures.sessions,
-        "sessions_cut": measures.unfinished - measures.censored,
-        "sessions_censored": measures.censored,
-        "return_length_share": _return_length_share(measures),
-        "users": len(measures.users),
-        "splits": {
-            name: {"episodes": int(episodes), "steps": int(steps)}
-            for name, (episodes, steps) in zip(schema.SPLITS, measures.splits, strict=True)
-        },
         "session_by": cut.session_by,
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": list(cut.bounds),
-        "time_range_ms": [measures.first_ms, measures.last_ms],
-        "summary": summary,
-        "reward_statistics": {
-            "mean": float(measures.rewards.mean[0]),
-            "std": math.sqrt(measures.rewards.covariance[0, 0]),
-            "min": measures.lowest,
-            "max": measures.highest,
-        },
+        "summary": measure_distributions(rows, cut, counts),
+        **report_steps(rows, counts),
     }
-    if log.key == schema.ITEM_ID:
-        report["items"] = int(np.count_nonzero(measures.item_steps))
-    if schema.PROPENSITY in log.columns:
-        report["unknown_propensities"] = measures.unknown_propensities
-    return report
-
-
-def _return_length_share(measures: Measures) -> float | None:
-    """Share of the variance of training returns-to-go that the number of steps left explains.
-
-    Of the whole rest of the session; None if either does not vary.
-    """
-    (rest, both), (_, ahead) = measures.returns.covariance
-    # What is left of the rounding errors of equal returns is not variance.
-    if rest <= 1e-24 * measures.returns.mean[0] ** 2 or not ahead:
-        return None
-    return float(both**2 / (rest * ahead))
 
 
 def format_report(report: Mapping[str, Any]) -> str:
@@ -173,6 +126,8 @@ def _clock(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
+_NAMED: Final = 5
+"""Users of the longest sessions that are named."""
 MANY: Final = 0.2
 """Share of the rows from which on what happens to them is worth a warning."""
 _REMEDIES: Final = {
@@ -234,57 +189,52 @@ def note_equal_times(rows: SortedRows, time: str) -> None:
     Args:
         time: expression over the columns of the files that gives the times.
     """
-    if rows.tied > MANY * len(rows.clean):
+    if rows.tied > MANY * rows.count:
         _note(
             rows,
-            f"{rows.tied / len(rows.clean):.0%} of the rows share their time with another row of "
+            f"{rows.tied / rows.count:.0%} of the rows share their time with another row of "
             "the user, so their order is unknown and is not learned; log finer times, or add the "
             f'place on a page: --column "timestamp={time} + position" for milliseconds, --column '
             f'"timestamp={time} + to_milliseconds(position)" for dates',
         )
 
 
-def note_one_item(rows: SortedRows, measures: Measures) -> None:
+def note_one_item(rows: SortedRows, report: Mapping[str, Any]) -> None:
     """Warn of a log that shows the same item everywhere."""
-    if rows.log.key == schema.ITEM_ID and np.count_nonzero(measures.item_steps) == 1:
+    if report.get("items") == 1:
         _note(
             rows,
-            f"all {measures.steps:,} rows show the same item, so there is nothing to choose "
+            f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
             "between; check --column item_id and --where",
         )
 
 
-def note_empty_splits(rows: SortedRows, cut: Cut, measures: Measures) -> None:
+def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:
     """Warn of times of a split that leave a part of the log without rows."""
-    of_splits = zip(schema.SPLITS, measures.splits, strict=True)
-    if names := [name for name, (_, steps) in of_splits if not steps]:
-        begin, end = (_clock(time) for time in (measures.first_ms, measures.last_ms))
+    if names := [name for name, split in report["splits"].items() if not split["steps"]]:
+        begin, end = map(_clock, report["time_range_ms"])
         _note(
             rows,
-            f"--split {','.join(_clock(time) for time in cut.bounds)} leaves no rows for "
+            f"--split {','.join(map(_clock, report['split_times_ms']))} leaves no rows for "
             f"{' and '.join(names)}: the rows are from {begin} to {end} UTC; give times between "
             "these, or three shares",
         )
 
 
-def note_bots(rows: SortedRows, measures: Measures, user: str) -> None:
+def note_bots(rows: SortedRows, report: Mapping[str, Any], user: str) -> None:
     """Warn of sessions that are much longer than most.
 
     Args:
         rows: of the log; its connection is free.
         user: expression over the columns of the files that gives the users.
     """
-    lengths = np.array(sorted(measures.lengths))
-    counts = np.cumsum([measures.lengths[int(length)] for length in lengths])
-    median = int(lengths[np.searchsorted(counts, counts[-1] / 2)])
-    if measures.longest[0][0] <= LONG * median:
+    median = report["summary"]["session_lengths"]["quantiles"]["0.5"]
+    found = rows.log.connection.sql(
+        f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
+        f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"
+    ).fetchall()
+    if not found:
         return
-    names = _user_ids(rows.log, [code for _, code in measures.longest])
-    found = [
-        (name, steps)
-        for (steps, _), name in zip(measures.longest, names, strict=True)
-        if steps > LONG * median
-    ]
     named = ", ".join(f"{name} ({steps:,} rows)" for name, steps in found)
     users = ", ".join(str(n) if isinstance(n, int) else text(str(n)) for n, _ in found)
     if not re.fullmatch(r"[\w' ,:@.-]*", users):
@@ -333,13 +283,3 @@ def _null_counts(
     query = f"SELECT {asked} FROM {table.sql} WHERE {undefined} AND ({where}\n)"
     (row,) = log.connection.sql(query).fetchall()
     return dict(zip(columns, row, strict=True))
-
-
-def _user_ids(log: TypedLog, codes: list[int]) -> list[object]:
-    if not has_codes(log, schema.USER_ID):
-        return list(codes)
-    wanted = ", ".join(map(str, codes))
-    table = CODES[schema.USER_ID]
-    query = f"SELECT code, {schema.USER_ID} FROM {table} WHERE code IN ({wanted})"
-    found = dict(log.connection.sql(query).fetchall())
-    return [found[code] for code in codes]

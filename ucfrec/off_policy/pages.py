@@ -57,10 +57,10 @@ def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = Non
     number = np.unique(page[order], return_inverse=True)[1]
     first = np.flatnonzero(np.diff(number, prepend=-1))
     user = None if steps.user is None else steps.user[order][first]
-    return replace(steps.regrouped(order, number, user), pages=True)
+    return replace(steps.regroup(order, number, user), pages=True)
 
 
-def pages_of(user: IntArray, time: IntArray) -> IntArray:
+def number_pages(user: IntArray, time: IntArray) -> IntArray:
     """(N,) number of the page of each step: of one user, each row within 10 ms of the one before.
 
     Args:

@@ -1,13 +1,14 @@
-"""The probability that a policy gives to each logged choice."""
+"""Logs read as a policy's training logs were, and its probability of each logged choice."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import pyarrow.parquet as pq
 import torch
@@ -22,10 +23,9 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.ids import EPISODE_USERS
-from ucfrec.logs.kept import note_unknown
+from ucfrec.logs.kept import mixed, note_unknown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.off_policy.training_rows import readable_store
 from ucfrec.progress import progress
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -35,6 +35,11 @@ UNKNOWN_ITEMS = "unknown_item_rows"
 """Metadata of a file of scores: number of rows left out because the run does not know the item."""
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
+MOST_SEEN: Final = 0.05
+"""Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
+with coarse timestamps some rows of other logs have the same user, item and time coincidentally."""
+
+KeyArray = npt.NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -337,3 +342,79 @@ def require_items(trained: TrainedPolicy) -> None:
             f"{trained.folder}: the actions of this policy are vectors; it chooses one for "
             "certain, so a logged action has no probability. Evaluate it with ucfrec evaluate"
         )
+
+
+def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
+    """Compute the share of logged rows that are in the run's training or validation data.
+
+    Rows are the same if their user, item and time are. A refit was trained on its test split too.
+
+    Args:
+        trained: the policy, with the record of its run.
+        logged: a store that numbers users and items as the run's store does
+            (`ucfrec.logs.prepare(like=…)`).
+
+    Returns:
+        The share, from 0 to 1, or None if the run's store has been moved, deleted or changed.
+    """
+    record = trained.record
+    if record.fingerprint == logged.record.fingerprint:
+        held_out = np.zeros(logged.n_episodes, dtype=bool)
+        if record.refit_of is None:
+            held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+        return float((~held_out)[logged.all_steps()[0]].mean())
+    return share_of_rows_seen(trained, np.concatenate(list(_hash_store(logged))))
+
+
+def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
+    """`share_seen` of rows by their `hash_rows`."""
+    store = readable_store(trained)
+    if store is None:
+        return None
+    keys, rows = np.unique(keys, return_counts=True)
+    seen = np.zeros(len(keys), dtype=bool)
+    # The training data may be far larger than the logs.
+    for name in schema.SPLITS if trained.record.refit_of is not None else ("train", "validation"):
+        for learnt in _hash_store(store.split(name)):
+            places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
+            seen[places[keys[places] == learnt]] = True
+    return float(rows[seen].sum() / rows.sum())
+
+
+def readable_store(trained: TrainedPolicy) -> EpisodeStore | None:
+    """The store that the run was trained on; None where it is gone, changed or damaged."""
+    try:
+        return trained.training_store()
+    except InputError:
+        return None
+
+
+def seen_too_often(seen: float | None) -> list[str]:
+    """What to say of a share of rows seen in training (`share_seen`); nothing if it is small."""
+    if seen is None or seen <= MOST_SEEN:
+        return []
+    return [
+        f"{seen:.0%} of the rows were seen in training: on these a policy looks "
+        "better than it is; give later logs, or no logs for the test split"
+    ]
+
+
+def _hash_store(store: EpisodeStore) -> Iterator[KeyArray]:
+    """Hash the (user, item, time) of each step to one number; some at a time, in order."""
+    if not store.n_episodes:
+        return
+    users: Array = store.episode_values(schema.USER)
+    for episodes, steps in store.step_batches():
+        yield hash_rows(
+            users[episodes],
+            store.step_values(schema.ITEM, episodes, steps),
+            store.step_values(schema.TIMESTAMP, episodes, steps),
+        )
+
+
+def hash_rows(users: Array, items: Array, times: Array) -> KeyArray:
+    """(N,) hash of each row's numbers of user and item, and its time (ms)."""
+    keys = np.zeros(len(users), dtype=np.uint64)
+    for values in (users, items, times):
+        keys = mixed(keys ^ values.astype(np.int64).view(np.uint64))
+    return keys

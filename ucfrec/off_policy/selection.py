@@ -20,7 +20,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.intervals import Resampled, resample
+from ucfrec.off_policy.intervals import Resamples, resample
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
@@ -96,51 +96,48 @@ def select(
         raise InputError(f"terms have shape {terms.shape}; give a column to each of {len(names)}")
     if not np.isfinite(terms).all():
         raise InputError(f"terms are not finite at {(~np.isfinite(terms)).sum()} places")
-    drawn = resample(terms, np.ones_like(terms), user, seed)
-    half = _critical(drawn) * drawn.error
-    again = drawn.value + drawn.shift
+    resamples = resample(terms, np.ones_like(terms), user, seed)
+    value, error = resamples.value, resamples.error
+    half = _critical(np.abs(_studentise(resamples))) * error
+    again = value + resamples.shift
     best = again == again.max(axis=1, keepdims=True)
     share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
-    order = np.argsort(-drawn.value, kind="stable")
-    standings = tuple(
-        Standing(
-            names[k],
-            float(drawn.value[k]),
-            float(drawn.error[k]),
-            float(drawn.value[k] - half[k]),
-            float(drawn.value[k] + half[k]),
-            float(share[k]),
-            rank,
-        )
-        for rank, k in enumerate(order, start=1)
-    )
+    standings = []
+    for rank, k in enumerate(np.argsort(-value, kind="stable"), start=1):
+        low, high = float(value[k] - half[k]), float(value[k] + half[k])
+        one = Standing(names[k], float(value[k]), float(error[k]), low, high, float(share[k]), rank)
+        standings.append(one)
     # What the first of each resample is worth there, beyond its worth in the whole sample.
-    luck = drawn.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
-    first = int(order[0])
-    corrected = float(drawn.value[first] - max(luck, 0.0))
-    return Selection(standings, corrected, _regret(terms, first, seed, user))
+    luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
+    first = int(np.argmax(value))
+    corrected = float(value[first] - max(luck, 0.0))
+    return Selection(tuple(standings), corrected, _find_regret(terms, first, seed, user))
 
 
-def _regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
+def _find_regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
     """Upper end of how much better than the first any other may be."""
     others = np.delete(terms, first, axis=1) - terms[:, [first]]
     if not others.shape[1]:
         return 0.0
-    drawn = resample(others, np.ones_like(others), user, seed)
+    resamples = resample(others, np.ones_like(others), user, seed)
     # Candidates that never differ are neither better nor worse.
-    differs = drawn.spreads
+    differs = resamples.spreads
     if not differs.any():
         return 0.0
-    upper = drawn.value + _critical(drawn, two_sided=False) * drawn.error
+    upper = resamples.value + _critical(-_studentise(resamples)) * resamples.error
     return float(max(upper[differs].max(), 0.0))
 
 
-def _critical(drawn: Resampled, two_sided: bool = True) -> float:
-    """Quantile of the largest studentised deviation over candidates."""
+def _studentise(resamples: Resamples) -> Float64Array:
+    """(B, K) deviations in standard errors of the resample; 0 where there is none."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        t = np.where(drawn.usable & drawn.spreads, drawn.shift / drawn.errors, 0.0)
-    largest = np.abs(t).max(axis=1) if two_sided else (-t).max(axis=1)
-    return float(np.quantile(largest, LEVEL))
+        deviations = resamples.shift / resamples.errors
+    return np.where(resamples.usable & resamples.spreads, deviations, 0.0)
+
+
+def _critical(deviations: Float64Array) -> float:
+    """Quantile of the largest deviation over candidates."""
+    return float(np.quantile(deviations.max(axis=1), LEVEL))
 
 
 @dataclass(frozen=True)

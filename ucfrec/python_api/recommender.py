@@ -44,8 +44,7 @@ from ucfrec.off_policy.evaluate import (
     OffPolicyReport,
     evaluate_off_policy,
 )
-from ucfrec.off_policy.score import score
-from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+from ucfrec.off_policy.score import score, seen_too_often, share_seen
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (

@@ -275,7 +275,7 @@ def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", ["ucf", "cql", "edt4rec"])
+@pytest.mark.parametrize("name", ["ucf", "dt", "edt4rec"])
 def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: str) -> None:
     quick = {"policy.cql_steps": 3} if name == "edt4rec" else {}
     size = {"train.steps": 4, "policy.dim": 16, "policy.context": 3, "crm.epochs": 1, **quick}

@@ -64,8 +64,12 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue
     from ucfrec.logs.summary import format_summary
-    from ucfrec.off_policy.score import held_out_sessions, logged_sessions
-    from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+    from ucfrec.off_policy.score import (
+        held_out_sessions,
+        logged_sessions,
+        seen_too_often,
+        share_seen,
+    )
     from ucfrec.provenance import shorten_paths
     from ucfrec.reporting.cards import card_of_ranking
     from ucfrec.reporting.tables import format_rows

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import duckdb
 from safetensors import SafetensorError
@@ -24,13 +24,9 @@ from ucfrec.logs.expressions import (
     with_numbers_for_truth_values,
 )
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
-from ucfrec.logs.tables import Table, first_line, quoted
+from ucfrec.logs.tables import Table, fault_of_line, first_line, quoted
 
 _NAME = re.compile(r"[^\W\d]\w*")
-_CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.DOTALL)
-_CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
-_MAX_FAULT: Final = 300
-"""Most characters of a message of DuckDB, which may quote values of any length."""
 
 
 class Bound(NamedTuple):
@@ -123,10 +119,10 @@ def explained(
             raise _disk_full(folder) from None
         if isinstance(error, duckdb.OutOfMemoryException):
             raise InputError(f"{first_line(error)}; raise memory_limit") from None
-        if fault := _fault_of_line(error):
+        if fault := fault_of_line(error):
             raise fault from None
         for file, damage in _unreadable(connection, tables):
-            raise _fault_of_line(damage) or InputError(
+            raise fault_of_line(damage) or InputError(
                 f"{file} cannot be read, it may be damaged ({first_line(damage)}); fetch it again"
             ) from None
         if isinstance(error, duckdb.InternalError):
@@ -135,19 +131,6 @@ def explained(
         raise InputError(
             f"{files}: {first_line(error)}; correct the values, or try_cast them in the mapping"
         ) from None
-
-
-def _fault_of_line(error: duckdb.Error) -> InputError | None:
-    """Error that names the line of a CSV file which cannot be read; None for other errors."""
-    message = str(error)
-    fault, column = _CSV_FAULT.search(message), _CSV_COLUMN.search(message)
-    if fault is None:
-        return None
-    detail = f"column {column[1]}: {column[2]}" if column else first_line(error)
-    return InputError(
-        f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write the log "
-        "as Parquet, where a column states its type"
-    )
 
 
 def _is_disk_full(error: Exception) -> bool:

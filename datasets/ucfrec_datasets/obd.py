@@ -77,7 +77,7 @@ def _only_campaign(logs: Sequence[Path]) -> str:
     if len(campaigns) > 1:
         raise InputError(
             f"{' and '.join(map(str, campaigns.values()))} are of the campaigns "
-            f"{' and '.join(campaigns)}, which have no item in common; prepare one at a time"
+            f"{' and '.join(campaigns)}, which share no item; prepare one campaign at a time"
         )
     return next(iter(campaigns))
 

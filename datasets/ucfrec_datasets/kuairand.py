@@ -64,23 +64,25 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(
+    paths: Sequence[str | Path], mapping: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
     """All given logs, with user and basic video features of the same paths or the logs' folder.
 
     Logs may have any name if none is called as in the releases. Video statistics are used only if a
     path names their file.
     """
-    named = log_files(paths)
-    others = tuple(file for file in named if not file.name.startswith(FEATURES))
-    logs = tuple(file for file in others if file.name.startswith(LOGS)) or others
+    files = log_files(paths)
+    plain = tuple(file for file in files if not file.name.startswith(FEATURES))
+    logs = tuple(file for file in plain if file.name.startswith(LOGS)) or plain
     if not logs:
         raise InputError(
-            f"no KuaiRand log among {len(named)} file(s) such as {named[0]}, only tables of "
+            f"no KuaiRand log among {len(files)} file(s) such as {files[0]}, only tables of "
             f"features; name the log too, e.g. {LOGS[0]}*"
         )
-    candidates = (*named, *log_files([logs[0].parent]))
-    wanted = [path for path in paths if Path(path).name.startswith(STATISTIC)]
-    statistics = log_files(wanted) if wanted else ()
+    candidates = (*files, *log_files([logs[0].parent]))
+    statistic_paths = [path for path in paths if Path(path).name.startswith(STATISTIC)]
+    statistics = log_files(statistic_paths) if statistic_paths else ()
     defaults = LogMapping(
         item_features=(
             *_table(candidates, BASIC, "video_id", BASIC_COLUMNS),
@@ -88,7 +90,7 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
         ),
         user_features=_table(candidates, USERS, "user_id", USER_COLUMNS),
     )
-    return logs, given.over(defaults).over(MAPPING)
+    return logs, mapping.over(defaults).over(MAPPING)
 
 
 def _table(

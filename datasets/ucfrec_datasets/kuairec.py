@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
+from ucfrec.logs.mapping import Dataset, LogMapping, Release
+from ucfrec_datasets.generic import official_files, official_table
 from ucfrec_datasets.kuairand import PROFILE
 
 TRAINING, EVALUATION = "big_matrix", "small_matrix"
@@ -38,41 +38,22 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(
+    paths: Sequence[str | Path], mapping: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
     """The given matrices, or `big_matrix` of a given folder, with features of the logs' folder.
 
     `small_matrix` is read only if a path names it, because the `kuairec` simulator is made from it.
     """
-    named = log_files(paths)
-    folders = [Path(path) for path in paths if Path(path).is_dir()]
-    logs = tuple(
-        file
-        for file in named
-        if file.name.startswith(TRAINING)
-        or (not file.name.startswith(FEATURES) and file.parent not in folders)
-    )
-    if not logs:
-        raise InputError(
-            f"no KuaiRec log among {len(named)} file(s) such as {named[0]}; name a folder or file "
-            f"with {TRAINING}, or the file {EVALUATION}"
-        )
-    candidates = (*named, *log_files([logs[0].parent]))
+    logs, files = official_files(paths, TRAINING, FEATURES)
     defaults = LogMapping(
         item_features=(
-            *_table(candidates, CATEGORIES, "video_id", CATEGORY_COLUMNS),
-            *_table(candidates, DAILY, "video_id", DAILY_COLUMNS, first_by="date"),
+            *official_table(files, CATEGORIES, "video_id", CATEGORY_COLUMNS),
+            *official_table(files, DAILY, "video_id", DAILY_COLUMNS, first_by="date"),
         ),
-        user_features=_table(candidates, USERS, "user_id", USER_COLUMNS),
+        user_features=official_table(files, USERS, "user_id", USER_COLUMNS),
     )
-    return logs, given.over(defaults).over(MAPPING)
-
-
-def _table(
-    files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...], first_by: str = ""
-) -> tuple[FeatureTable, ...]:
-    """The first file of one kind as a table; empty if there is none."""
-    named = [file for file in files if file.name.partition(".")[0] == prefix]
-    return (FeatureTable((named[0],), key, columns, first_by),) if named else ()
+    return logs, mapping.over(defaults).over(MAPPING)
 
 
 DATASET: Final = Dataset(

@@ -1,12 +1,11 @@
 """MovieLens (Harper & Konstan, 2015): ratings of movies, `ratings.csv` and `movies.csv`."""
 
-import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
+from ucfrec.logs.mapping import Dataset, LogMapping, Release
+from ucfrec_datasets.generic import official_files, official_table
 
 RATINGS, MOVIES, USERS = "ratings", "movies", "users"
 GENRES: Final = (
@@ -27,38 +26,16 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(
+    paths: Sequence[str | Path], mapping: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
     """The ratings, with genres and users of the same paths or of the ratings' folder."""
-    named = log_files(paths)
-    folders = [Path(path) for path in paths if Path(path).is_dir()]
-    logs = tuple(
-        file
-        for file in named
-        if _stem(file) == RATINGS
-        or (_stem(file) not in (MOVIES, USERS) and file.parent not in folders)
-    )
-    if not logs:
-        raise InputError(
-            f"no MovieLens ratings among {len(named)} file(s) such as {named[0]}; name a folder "
-            f"or file with {RATINGS}.csv"
-        )
-    candidates = (*named, *log_files([logs[0].parent]))
+    logs, files = official_files(paths, RATINGS, (MOVIES, USERS))
     defaults = LogMapping(
-        item_features=_table(candidates, MOVIES, "movieId", MOVIE_COLUMNS),
-        user_features=_table(candidates, USERS, "userId", USER_COLUMNS),
+        item_features=official_table(files, MOVIES, "movieId", MOVIE_COLUMNS),
+        user_features=official_table(files, USERS, "userId", USER_COLUMNS),
     )
-    return logs, given.over(defaults).over(MAPPING)
-
-
-def _stem(file: Path) -> str:
-    return file.name.partition(".")[0]
-
-
-def _table(
-    files: Sequence[Path], name: str, key: str, columns: tuple[str, ...]
-) -> tuple[FeatureTable, ...]:
-    found = next((file for file in files if _stem(file) == name), None)
-    return () if found is None else (FeatureTable((found,), key, columns),)
+    return logs, mapping.over(defaults).over(MAPPING)
 
 
 def _convert_100k(folder: Path) -> None:
@@ -66,29 +43,22 @@ def _convert_100k(folder: Path) -> None:
 
     They are `u.data` (tabs), `u.item` and `u.user` (bars, Latin-1), without heads.
     """
+    import pandas as pd
+
     source = folder / "ml-100k"
-    ratings = (row[:4] for row in _rows(source / "u.data", "\t"))
-    _write(source / f"{RATINGS}.csv", ("userId", "movieId", "rating", "timestamp"), ratings)
-    movies = ((row[0], row[1], _genres(row[5:])) for row in _rows(source / "u.item", "|"))
-    _write(source / f"{MOVIES}.csv", ("movieId", "title", "genres"), movies)
-    users = (row[:4] for row in _rows(source / "u.user", "|"))
-    _write(source / f"{USERS}.csv", ("userId", *USER_COLUMNS), users)
-
-
-def _genres(flags: Sequence[str]) -> str:
-    return "|".join(genre for genre, flag in zip(GENRES, flags, strict=True) if flag == "1")
-
-
-def _rows(file: Path, separator: str) -> Iterator[list[str]]:
-    with file.open(encoding="latin-1", newline="") as lines:
-        yield from csv.reader(lines, delimiter=separator, quoting=csv.QUOTE_NONE)
-
-
-def _write(file: Path, head: Sequence[str], rows: Iterator[Sequence[str]]) -> None:
-    with file.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.writer(lines)
-        writer.writerow(head)
-        writer.writerows(rows)
+    ratings = pd.read_csv(source / "u.data", sep="\t", header=None).iloc[:, :4]
+    ratings.columns = pd.Index(["userId", "movieId", "rating", "timestamp"])
+    ratings.to_csv(source / f"{RATINGS}.csv", index=False)
+    layout: dict[str, Any] = {"sep": "|", "header": None, "encoding": "latin-1", "quoting": 3}
+    movies = pd.read_csv(source / "u.item", dtype=str, **layout)
+    flags = movies.iloc[:, 5:].eq("1").to_numpy()
+    movies["genres"] = [
+        "|".join(g for g, flag in zip(GENRES, f, strict=True) if flag) for f in flags
+    ]
+    movies = movies[[0, 1, "genres"]].set_axis(["movieId", "title", "genres"], axis=1)
+    movies.to_csv(source / f"{MOVIES}.csv", index=False)
+    users = pd.read_csv(source / "u.user", dtype=str, **layout).iloc[:, :4]
+    users.set_axis(["userId", *USER_COLUMNS], axis=1).to_csv(source / f"{USERS}.csv", index=False)
 
 
 DATASET: Final = Dataset(

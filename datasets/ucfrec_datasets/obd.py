@@ -31,7 +31,9 @@ MAPPING: Final = LogMapping(
 )
 
 
-def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path, ...], LogMapping]:
+def _resolve(
+    paths: Sequence[str | Path], mapping: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
     """Logs of one campaign, with item features of the same paths or of the first log's folder.
 
     Items are called `<campaign>/<number>`, so that no run of one campaign reads the logs of another
@@ -40,17 +42,16 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
     Raises:
         InputError: no log is named, or its campaign is not known, or there are several.
     """
-    named = log_files(paths)
-    logs = tuple(file for file in named if not file.name.startswith(ITEMS))
+    files = log_files(paths)
+    logs = tuple(file for file in files if not file.name.startswith(ITEMS))
     if not logs:
-        raise InputError(f"{named[0]} has features, not impressions; name a log, e.g. all.csv")
-    item_id = given.columns.get(schema.ITEM_ID)
+        raise InputError(f"{files[0]} has features, not impressions; name a log, e.g. all.csv")
+    item_id = mapping.columns.get(schema.ITEM_ID)
     campaign = None if item_id is not None else _only_campaign(logs)
     item_id = item_id or f"concat('{campaign}/', item_id)"
-    candidates = (*named, *log_files([logs[0].parent]))
     items = [
         file
-        for file in candidates
+        for file in (*files, *log_files([logs[0].parent]))
         if file.name.startswith(ITEMS) and _campaign(file) in (None, campaign or _campaign(file))
     ]
     defaults = LogMapping(
@@ -59,11 +60,11 @@ def _resolve(paths: Sequence[str | Path], given: LogMapping) -> tuple[tuple[Path
         item_features=(FeatureTable((items[0],), item_id, ITEM_FEATURES),) if items else (),
         user_features=(FeatureTable(logs, USER, USER_FEATURES, first_by='"timestamp"'),),
     )
-    return logs, given.over(defaults).over(MAPPING)
+    return logs, mapping.over(defaults).over(MAPPING)
 
 
 def _only_campaign(logs: Sequence[Path]) -> str:
-    found: dict[str, Path] = {}
+    campaigns: dict[str, Path] = {}
     for log in logs:
         campaign = _campaign(log)
         if campaign is None:
@@ -72,13 +73,13 @@ def _only_campaign(logs: Sequence[Path]) -> str:
                 f"({', '.join(CAMPAIGNS)}), whose items have numbers of their own; rename the file,"
                 " e.g. random_men.csv"
             )
-        found.setdefault(campaign, log)
-    if len(found) > 1:
+        campaigns.setdefault(campaign, log)
+    if len(campaigns) > 1:
         raise InputError(
-            f"{' and '.join(map(str, found.values()))} are of the campaigns "
-            f"{' and '.join(found)}, which have no item in common; prepare one campaign at a time"
+            f"{' and '.join(map(str, campaigns.values()))} are of the campaigns "
+            f"{' and '.join(campaigns)}, which share no item; prepare one campaign at a time"
         )
-    return next(iter(found))
+    return next(iter(campaigns))
 
 
 def _campaign(file: Path) -> str | None:

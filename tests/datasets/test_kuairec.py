@@ -116,7 +116,7 @@ def test_rows_without_a_time_are_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     folder = official(tmp_path / "data")
-    with pytest.raises(InputError, match="no KuaiRec log among 1 file"):
+    with pytest.raises(InputError, match="no log among 1 file"):
         DATASET.resolve([folder / "user_features.csv"], LogMapping())
 
 

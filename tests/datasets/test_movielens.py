@@ -46,7 +46,7 @@ def test_a_folder_has_ratings_and_genres(tmp_path: Path) -> None:
     frame = store.to_frame()
     assert frame.timestamp.min() == RATINGS.timestamp.min() * 1000
     assert set(frame.reward) == {1, 2, 3, 4, 5}
-    with pytest.raises(InputError, match="no MovieLens ratings"):
+    with pytest.raises(InputError, match="no log among"):
         DATASET.resolve([folder / "movies.csv"], LogMapping())
 
 

@@ -568,3 +568,13 @@ def test_another_encoding_is_named(tmp_path: Path, encoding: str) -> None:
     log.to_csv(tmp_path / "log.csv", index=False, encoding=encoding)
     with pytest.raises(InputError, match="not in UTF-8; convert it"):
         prepared(tmp_path / "log.csv", tmp_path / "store")
+
+
+def test_a_field_of_50_megabytes_is_refused_in_a_second(tmp_path: Path) -> None:
+    rows = [f"1,{n % 9},{START + n},{n % 2},b" for n in range(6000)]
+    rows[5000] += "a" * 50_000_000
+    (tmp_path / "log.csv").write_text("\n".join(["user_id,item_id,timestamp,reward,x", *rows]))
+    began = time.process_time()
+    with pytest.raises(InputError, match=r"log\.csv, line 5002: .*Maximum line size"):
+        validate([tmp_path / "log.csv"], LogMapping())
+    assert time.process_time() - began < 2

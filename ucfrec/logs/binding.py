@@ -4,13 +4,12 @@ Of a later log, which of the columns are those that a run remembers of its train
 """
 
 import difflib
-import errno
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import duckdb
 from safetensors import SafetensorError
@@ -24,13 +23,11 @@ from ucfrec.logs.expressions import (
     with_numbers_for_truth_values,
 )
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
-from ucfrec.logs.tables import Table, first_line, quoted
+from ucfrec.logs.tables import Table, fault_of_line, first_line, quoted
 
 _NAME = re.compile(r"[^\W\d]\w*")
-_CSV_FAULT = re.compile(r"CSV Error on Line: (\d+).*?\n\s*file = ([^\n]+)", re.DOTALL)
-_CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
-_MAX_FAULT: Final = 300
-"""Most characters of a message of DuckDB, which may quote values of any length."""
+_DISK_FULL = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
+"""In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
 
 class Bound(NamedTuple):
@@ -45,59 +42,64 @@ class Bound(NamedTuple):
     """Whether it is the name of a column."""
 
 
-def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, given: str) -> Bound:
+def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, expression: str) -> Bound:
     """Resolve a column name or scalar expression against the columns of `table`.
 
     An expression that computes with truth values, such as `is_click + 2 * is_like`, takes them as 0
     and 1.
 
     Args:
-        given: column name (case does not matter) or SQL expression.
+        expression: column name (case does not matter) or SQL expression.
 
     Raises:
-        InputError: a name is not a column of the table, or `given` is not a scalar expression.
+        InputError: a name is not a column of the table, or `expression` is no scalar expression.
     """
     columns = table.columns
     names = {name.casefold(): name for name in columns}
-    if given.casefold() in names:
-        name = names[given.casefold()]
+    if expression.casefold() in names:
+        name = names[expression.casefold()]
         return Bound(quoted(name), columns[name], (name,), True)
-    if _NAME.fullmatch(given):
-        raise InputError(_missing(table, what, given))
+    if _NAME.fullmatch(expression):
+        raise _missing(table, what, expression)
     try:
         # DuckDB would read some names that are not columns as the current user or time.
-        found = columns_of(connection, given)
-        for name in found:
+        reads = columns_of(connection, expression)
+        for name in reads:
             if name.casefold() not in names:
-                raise InputError(_missing(table, what, name))
-        used = tuple(dict.fromkeys(names[name.casefold()] for name in found))
-        like = ", ".join(f"CAST(NULL AS {columns[name]}) AS {quoted(name)}" for name in used)
-        like = f"FROM (SELECT {like})" if like else ""
+                raise _missing(table, what, name)
+        used = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
         try:
-            sql = f"({given}\n)"
-            described = connection.sql(f"DESCRIBE SELECT {sql} AS x {like}").fetchall()
+            sql = f"({expression}\n)"
+            kind = _type_of(connection, sql, {name: columns[name] for name in used})
         except duckdb.BinderException:
             truth = {name for name in used if columns[name] == "BOOLEAN"}
-            sql = f"({with_numbers_for_truth_values(connection, given, truth)}\n)"
             if not truth:
                 raise
-            described = connection.sql(f"DESCRIBE SELECT {sql} AS x {like}").fetchall()
+            sql = f"({with_numbers_for_truth_values(connection, expression, truth)}\n)"
+            kind = _type_of(connection, sql, {name: columns[name] for name in used})
     except (duckdb.Error, NotScalarError) as error:
-        raise refused(what, given, str(table.files[0]), first_line(error)) from None
-    return Bound(sql, str(described[0][1]), used, False)
+        raise refused(what, expression, str(table.files[0]), first_line(error)) from None
+    return Bound(sql, kind, used, False)
 
 
-def _missing(table: Table, what: str, name: str) -> str:
+def _type_of(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping[str, str]) -> str:
+    """DuckDB type of an expression over columns of some types."""
+    nulls = ", ".join(f"CAST(NULL AS {kind}) AS {quoted(name)}" for name, kind in columns.items())
+    source = f"FROM (SELECT {nulls})" if nulls else ""
+    return str(connection.sql(f"DESCRIBE SELECT {sql} AS x {source}").fetchall()[0][1])
+
+
+def _missing(table: Table, what: str, name: str) -> InputError:
     folded = {column.casefold(): column for column in table.columns}
     near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
     hint = ", ".join(folded[column] for column in near)
     hint = f"nearest: {hint}" if hint else f"it has {', '.join(table.columns)}"
-    return f"{table.files[0]} has no column {name!r} ({what}); {hint}"
+    return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
 
 
-def wrong_type(table: Table, what: str, given: str, kind: str, wanted: str) -> InputError:
+def wrong_type(table: Table, what: str, expression: str, kind: str, remedy: str) -> InputError:
     """Error for a column of an unsupported type."""
-    return InputError(f"{table.files[0]}: {what} ({given}) is {kind}; {wanted}")
+    return InputError(f"{table.files[0]}: {what} ({expression}) is {kind}; {remedy}")
 
 
 @contextmanager
@@ -114,64 +116,40 @@ def explained(
     """
     try:
         yield
-    except (OSError, SafetensorError) as error:
-        if not _is_disk_full(error):
+    except (OSError, SafetensorError, duckdb.Error) as error:
+        if any(phrase in str(error) for phrase in _DISK_FULL):
+            raise InputError(
+                f"no space left on the disk of {folder}; free space or write elsewhere"
+            ) from None
+        if not isinstance(error, duckdb.Error):
             raise
-        raise _disk_full(folder) from None
-    except duckdb.Error as error:
-        if _is_disk_full(error):
-            raise _disk_full(folder) from None
         if isinstance(error, duckdb.OutOfMemoryException):
             raise InputError(f"{first_line(error)}; raise memory_limit") from None
-        if fault := _fault_of_line(error):
-            raise fault from None
-        for file, damage in _unreadable(connection, tables):
-            raise _fault_of_line(damage) or InputError(
-                f"{file} cannot be read, it may be damaged ({first_line(damage)}); fetch it again"
-            ) from None
-        if isinstance(error, duckdb.InternalError):
-            raise
-        files = ", ".join(str(file) for table in tables for file in table.files[:3])
-        raise InputError(
-            f"{files}: {first_line(error)}; correct the values, or try_cast them in the mapping"
-        ) from None
+        raise _fault_of_files(connection, tables, error) or error from None
 
 
-def _fault_of_line(error: duckdb.Error) -> InputError | None:
-    """Error that names the line of a CSV file which cannot be read; None for other errors."""
-    message = str(error)
-    fault, column = _CSV_FAULT.search(message), _CSV_COLUMN.search(message)
-    if fault is None:
-        return None
-    detail = f"column {column[1]}: {column[2]}" if column else first_line(error)
-    return InputError(
-        f"{fault[2]}, line {fault[1]}: {detail:.{_MAX_FAULT}}; correct the line, or write the log "
-        "as Parquet, where a column states its type"
-    )
-
-
-def _is_disk_full(error: Exception) -> bool:
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return True
-    # Messages of safetensors and DuckDB, of DuckDB's own disk limit, and of numpy.
-    phrases = ("No space left", "max_temp_directory_size", "requested and")
-    return any(phrase in str(error) for phrase in phrases)
-
-
-def _disk_full(folder: Path) -> InputError:
-    return InputError(f"no space left on the disk of {folder}; free space or write elsewhere")
-
-
-def _unreadable(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]
-) -> Iterator[tuple[Path, duckdb.Error]]:
+def _fault_of_files(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], error: duckdb.Error
+) -> InputError | None:
+    """The file, and its line or values, that an error is about; None for an error of DuckDB."""
+    if fault := fault_of_line(error):
+        return fault
     for table in tables:
         for file in table.files:
-            single = replace(table, files=(file,))
             try:
+                single = replace(table, files=(file,))
                 connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
-            except duckdb.Error as error:
-                yield file, error
+            except duckdb.Error as damage:
+                return fault_of_line(damage) or InputError(
+                    f"{file} cannot be read, it may be damaged ({first_line(damage)}); fetch it "
+                    "again"
+                )
+    if isinstance(error, duckdb.InternalError):
+        return None
+    files = ", ".join(str(file) for table in tables for file in table.files[:3])
+    return InputError(
+        f"{files}: {first_line(error)}; correct the values, or try_cast them in the mapping"
+    )
 
 
 def settled(
@@ -222,20 +200,19 @@ class _Missing:
 
     def __init__(self, connection: duckdb.DuckDBPyConnection, tables: Sequence[Table]) -> None:
         self._connection, self._tables = connection, tables
-        self._names = [{name.casefold() for name in table.columns} for table in tables]
 
-    def of(self, text: str) -> Table | None:
+    def of(self, expression: str) -> Table | None:
         """The first of them; None if all tables have what the column or expression reads."""
-        for table, names in zip(self._tables, self._names, strict=True):
-            if text.casefold() in names:
+        for table in self._tables:
+            names = {name.casefold() for name in table.columns}
+            if expression.casefold() in names:
                 continue
-            if text.isidentifier():
+            if expression.isidentifier():
                 return table
             try:
-                needed = columns_of(self._connection, text)
+                reads = columns_of(self._connection, expression)
             except (duckdb.Error, NotScalarError):
-                # It is refused where it is bound, with the reason.
-                continue
-            if not {name.casefold() for name in needed} <= names:
+                continue  # it is refused where it is bound, with the reason
+            if not {name.casefold() for name in reads} <= names:
                 return table
         return None

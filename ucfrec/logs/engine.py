@@ -64,16 +64,11 @@ def engine(
             str(work / "rows.duckdb"), config={**_CLOSED, "temp_directory": spill}
         )
         try:
-            try:
-                if memory_limit is not None:
-                    connection.execute("SET memory_limit = ?", [memory_limit])
-                    if (limit := bytes_of(memory_limit)) and shared:
-                        own = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
-                        connection.execute("SET memory_limit = ?", [f"{own} B"])
-            except duckdb.Error:
-                raise InputError(
-                    f"memory_limit {memory_limit!r} is not a size; write e.g. 2GB"
-                ) from None
+            if memory_limit is not None:
+                _set_memory_limit(connection, memory_limit)
+                if (limit := bytes_of(memory_limit)) and shared:
+                    rest = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
+                    _set_memory_limit(connection, f"{rest} B")
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
@@ -81,6 +76,13 @@ def engine(
             yield connection
         finally:
             connection.close()
+
+
+def _set_memory_limit(connection: duckdb.DuckDBPyConnection, size: str) -> None:
+    try:
+        connection.execute("SET memory_limit = ?", [size])
+    except duckdb.Error:
+        raise InputError(f"memory_limit {size!r} is not a size; write e.g. 2GB") from None
 
 
 def anonymous_bytes(process: int | None = None) -> int:
@@ -101,11 +103,11 @@ def anonymous_bytes(process: int | None = None) -> int:
 
 def bytes_of(size: str) -> int | None:
     """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
-    if found is None:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
+    if match is None:
         return None
-    base = 1024 if found[3] else 1000
-    return int(float(found[1]) * base ** " kmgt".index(found[2] or " "))
+    number, prefix, binary = match.groups()
+    return int(float(number) * (1024 if binary else 1000) ** " kmgt".index(prefix or " "))
 
 
 def rows_of_batch(numbers: int) -> int:
@@ -127,7 +129,7 @@ def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBP
     connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
     try:
         if memory_limit is not None:
-            connection.execute("SET memory_limit = ?", [memory_limit])
+            _set_memory_limit(connection, memory_limit)
         _set_semantics(connection)
         _close(connection, (), None)
         yield connection

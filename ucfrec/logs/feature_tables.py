@@ -71,16 +71,13 @@ def load_features(
     names = []
     for number, table in enumerate(tables):
         name = f"{kind}_features_{number}"
-        parts = [
-            _part(connection, opened, table, kind)
-            for opened in open_tables(connection, log_files(table.files))
-        ]
+        opened = open_tables(connection, log_files(table.files))
+        parts = [_part(connection, part, table, kind) for part in opened]
         types = _common_types(parts, kind)
-        selects = " UNION ALL ".join(_rows(part, types, id_type) for part in parts)
-        tables_read = [part.table for part in parts]
-        with explained(connection, tables_read, tables_read[0].files[0].parent):
+        rows_of_parts = " UNION ALL ".join(_select_rows(part, types, id_type) for part in parts)
+        with explained(connection, opened, opened[0].files[0].parent):
             connection.execute(
-                f"CREATE TABLE {name} AS SELECT * FROM ({selects}) WHERE id IS NOT NULL"
+                f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
             )
         ((rows, ids),) = connection.sql(
             f"SELECT count(*), count(DISTINCT id) FROM {name}"
@@ -104,9 +101,8 @@ def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) 
     for name in names:
         columns = connection.sql(f"DESCRIBE {name}").fetchall()
         digest.update(repr([(column[0], column[1]) for column in columns]).encode())
-        for batch in connection.sql(f"SELECT * FROM {name} ORDER BY id").to_arrow_reader(
-            BATCH_ROWS
-        ):
+        rows = connection.sql(f"SELECT * FROM {name} ORDER BY id")
+        for batch in rows.to_arrow_reader(BATCH_ROWS):
             for column in batch.columns:
                 if str(column.type) == "double":
                     values = np.asarray(column.fill_null(np.nan))
@@ -120,28 +116,31 @@ def _part(
     connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
 ) -> _Part:
     key = bind(connection, opened, f"key of {kind} features", table.key)
-    keys = {name.casefold() for name in key.columns}
-    given = table.columns or tuple(
-        c for c in opened.columns if c.casefold() not in keys and not PANDAS_INDEX.fullmatch(c)
+    key_columns = {name.casefold() for name in key.columns}
+    names = table.columns or tuple(
+        name
+        for name in opened.columns
+        if name.casefold() not in key_columns and not PANDAS_INDEX.fullmatch(name)
     )
     # The text of a CSV file is what its keys are, not what DuckDB makes of it.
     raw = key.columns if key.is_column and not opened.columnar else ()
     if raw:
         key = Bound(quoted(raw_name(raw[0])), "VARCHAR", (), False)
-    bound = {name: bind(connection, opened, f"{kind} feature", name) for name in given}
-    first_by = None
-    if table.first_by:
-        first_by = bind(connection, opened, f"first_by of {kind} features", table.first_by)
-    features = {}
-    for name, (sql, type_, *_) in bound.items():
-        comparable = _comparable(sql, type_)
+    sources, features, first_by = [key], {}, ""
+    for name in names:
+        feature = bind(connection, opened, f"{kind} feature", name)
+        comparable = _comparable(feature.sql, feature.kind)
         if comparable is None:
-            wanted = "cast it to a number, text, or a list of either"
-            raise wrong_type(opened, f"{kind} feature", name, type_, wanted)
+            remedy = "cast it to a number, text, or a list of either"
+            raise wrong_type(opened, f"{kind} feature", name, feature.kind, remedy)
         features[name.casefold()] = comparable
-    everything = (key, *bound.values(), *([first_by] if first_by else []))
-    used = (column for each in everything for column in each.columns)
-    return _Part(opened.of(used, raw), key, first_by.sql if first_by else "", features)
+        sources.append(feature)
+    if table.first_by:
+        order = bind(connection, opened, f"first_by of {kind} features", table.first_by)
+        sources.append(order)
+        first_by = order.sql
+    columns = (column for source in sources for column in source.columns)
+    return _Part(opened.of(columns, raw), key, first_by, features)
 
 
 def _common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
@@ -151,35 +150,33 @@ def _common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
         InputError: two parts differ.
     """
     types: dict[str, str] = {}
-    seen: dict[str, Table] = {}
+    files: dict[str, Path] = {}
     for part in parts:
         for name, (_, type_) in part.features.items():
-            known = types.setdefault(name, type_)
-            if known == NOTHING:
-                types[name] = type_
-            elif type_ not in (known, NOTHING):
+            earlier = types.get(name, NOTHING)
+            if earlier == NOTHING:
+                types[name], files[name] = type_, part.table.files[0]
+            elif type_ not in (earlier, NOTHING):
                 raise InputError(
-                    f"{part.table.files[0]}: {kind} feature {name} is {type_} here and {known} in "
-                    f"{seen[name].files[0]}; write it in one type"
+                    f"{part.table.files[0]}: {kind} feature {name} is {type_} here and {earlier} "
+                    f"in {files[name]}; write it in one type"
                 )
-            if types[name] != NOTHING:
-                seen.setdefault(name, part.table)
     return {name: "VARCHAR" if type_ == NOTHING else type_ for name, type_ in types.items()}
 
 
-def _rows(part: _Part, types: dict[str, str], id_type: str) -> str:
+def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
     """SQL of the rows of a part: `id`, `f0`, …."""
-    id_sql, first = _as_id(part.key.sql, part.key.kind, id_type), ""
+    id_sql, first = _cast_id(part.key.sql, part.key.kind, id_type), ""
     columns = [
-        f"CAST({part.features[name][0] if name in part.features else 'NULL'} AS {type_})"
+        f"CAST({part.features.get(name, ('NULL', ''))[0]} AS {type_})"
         for name, type_ in types.items()
     ]
     if part.first_by:
         # Ties are broken by the features, so that the order of rows does not matter.
         order = ", ".join([part.first_by, *columns])
         first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
-    named = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
-    return f"SELECT {id_sql} AS id{named} FROM {part.table.sql}{first}"
+    values = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
+    return f"SELECT {id_sql} AS id{values} FROM {part.table.sql}{first}"
 
 
 def require_known_ids(
@@ -202,25 +199,26 @@ def require_known_ids(
         InputError: none of the ids of a table occurs in the log.
     """
     for table, name in zip(tables, names, strict=True):
-        ((every, having),) = connection.sql(
-            f"SELECT count(*), count(id) FROM {kept} LEFT JOIN {name} ON id = {kind}"
-        ).fetchall()
+        count = _count(connection, kept)
+        without_row = _count(connection, f"{kept} ANTI JOIN {name} ON id = {kind}")
         files = ", ".join(map(str, table.files))
-        if noted and 0 < having < (1 - _MANY_LACKING) * every:
+        if without_row == count:
+            ids, log_ids = (
+                connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
+                for column, rows in (("id", name), (kind, kept))
+            )
+            keys = f"is {_list_values(ids)}" if ids else "is never such an id"
+            raise InputError(
+                f"{files}: no row belongs to a {kind} of the log, which "
+                f"are {_list_values(log_ids)}, and {table.key} {keys}; let the key be an "
+                "expression that gives the same ids, or leave the file out"
+            )
+        if noted and without_row > _MANY_LACKING * count:
             warnings.warn(
-                f"{files}: {every - having:,} of {every:,} {kind}s of the log have no row; their "
+                f"{files}: {without_row:,} of {count:,} {kind}s of the log have no row; their "
                 "features count as missing",
                 InputNote,
                 stacklevel=3,
-            )
-        if not having:
-            ids = connection.sql(f"SELECT id FROM {name} ORDER BY id").limit(3).fetchall()
-            known = connection.sql(f"SELECT {kind} FROM {kept} ORDER BY {kind}").limit(3).fetchall()
-            theirs = f"is {_listed(ids)}" if ids else "is never such an id"
-            raise InputError(
-                f"{files}: no row belongs to a {kind} of the log, which "
-                f"are {_listed(known)}, and {table.key} {theirs}; let the key be an expression "
-                "that gives the same ids, or leave the file out"
             )
 
 
@@ -241,25 +239,23 @@ def note_lacking(
         new: SQL of the new ids of the log, in the column `kind`.
         lost: the store, if it was made with such tables; empty otherwise.
     """
-    every, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
+    count, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
     what = "embeddings" if ids == "item" else "features"
-    remedy = "give a current table with --mapping"
-    if lost and every and not tables:
-        warnings.warn(
+    notes = []
+    if lost and count and not tables:
+        notes.append(
             f"{lost} was prepared with {ids} features and none are given now: the {what} of all "
-            f"{every:,} new {ids}s begin at the mean; {remedy}",
-            InputNote,
-            stacklevel=3,
+            f"{count:,} new {ids}s begin at the mean"
         )
     for table, name in zip(tables, names, strict=True):
         lacking = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
         if lacking:
-            warnings.warn(
-                f"{', '.join(map(str, table.files))}: {lacking:,} of {every:,} new {ids}s have no "
-                f"row in the {ids} features; their {what} say nothing of them; {remedy}",
-                InputNote,
-                stacklevel=3,
+            notes.append(
+                f"{', '.join(map(str, table.files))}: {lacking:,} of {count:,} new {ids}s have no "
+                f"row in the {ids} features; their {what} say nothing of them"
             )
+    for note in notes:
+        warnings.warn(f"{note}; give a current table with --mapping", InputNote, stacklevel=3)
 
 
 def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
@@ -267,11 +263,11 @@ def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
     return int(count)
 
 
-def _listed(rows: Sequence[tuple[object, ...]]) -> str:
+def _list_values(rows: Sequence[tuple[object, ...]]) -> str:
     return ", ".join([*(f"{value!r:.40}" for (value,) in rows), "…"])
 
 
-def _as_id(key: str, key_type: str, id_type: str) -> str:
+def _cast_id(key: str, key_type: str, id_type: str) -> str:
     """SQL that casts a key to an id type, NULL where no cast does."""
     if is_number(key_type) and not is_integer(key_type):
         # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id, as the
@@ -313,10 +309,10 @@ def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:
         files: of the log.
     """
     folders = dict.fromkeys(file.parent for file in files)
-    for name, given in (("items", mapping.item_features), ("users", mapping.user_features)):
-        found = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
-        table = next((file for file in found if is_table(file) and file not in files), None)
-        if table is not None and not given:
+    for name, tables in (("items", mapping.item_features), ("users", mapping.user_features)):
+        beside = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
+        table = next((file for file in beside if is_table(file) and file not in files), None)
+        if table is not None and not tables:
             warnings.warn(
                 f"{table} lies beside the log and is not read; if it holds features of {name}, "
                 f"name the folder {table.parent}, or the file too",

@@ -74,7 +74,7 @@ def item_tags(
     ]
     if not cases:
         return np.zeros((count, 0), dtype=np.int64)
-    found = connection.sql(f"""
+    rows = connection.sql(f"""
         WITH cases AS ({" UNION ALL ".join(cases)}),
         tags AS (
             SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
@@ -85,51 +85,40 @@ def item_tags(
             row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
         FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
     """).fetchnumpy()
-    numbers, places = found["number"].astype(np.int64), found["place"].astype(np.int64)
+    places = rows["place"].astype(np.int64)
     tags = np.full((count, int(places.max(initial=-1)) + 1), -1, dtype=np.int64)
-    tags[numbers, places] = found["tag_number"]
+    tags[rows["number"].astype(np.int64), places] = rows["tag_number"]
     return tags
 
 
 def _encode(
     connection: duckdb.DuckDBPyConnection, joined: str, column: str, kind: str, count: int
 ) -> Features:
-    if kind == "DOUBLE":
-        return _numbers(connection, joined, column, count)
-    if kind == "FLOAT[]":
-        return _vectors(connection, joined, column, count)
+    if kind in ("DOUBLE", "FLOAT[]"):
+        vector = column if kind == "FLOAT[]" else f"[{column}]"
+        return _numbers(connection, joined, column, vector, count)
     value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
     return _categories(connection, joined, value, count)
 
 
 def _numbers(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, count: int
-) -> Features:
-    found = connection.sql(
-        f"SELECT number, train_count > 0 AS trained, {column} AS value FROM {joined} "
-        f"WHERE isfinite({column}) ORDER BY number"
-    ).fetchnumpy()
-    return _standardised(found["number"], found["trained"], found["value"][:, None], count)
-
-
-def _vectors(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, count: int
+    connection: duckdb.DuckDBPyConnection, joined: str, column: str, vector: str, count: int
 ) -> Features:
     sizes = connection.sql(
-        f"SELECT DISTINCT len({column}) FROM {joined} WHERE {column} IS NOT NULL"
+        f"SELECT DISTINCT len({vector}) FROM {joined} WHERE {column} IS NOT NULL"
     ).fetchall()
-    if len(sizes) != 1:
+    if len(sizes) > 1:
         raise InputError(f"a vector feature has lists of unequal length {sizes}; make them equal")
-    found = connection.sql(
-        f"SELECT number, train_count > 0 AS trained, {column} AS value FROM {joined} "
-        f"WHERE list_bool_and([coalesce(isfinite(v), false) FOR v IN {column}]) ORDER BY number"
+    rows = connection.sql(
+        f"SELECT number, train_count > 0 AS trained, {vector} AS value FROM {joined} "
+        f"WHERE list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}]) ORDER BY number"
     ).to_arrow_table()
-    values = found["value"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    trained = found["trained"].to_numpy()
-    return _standardised(found["number"].to_numpy(), trained, values.reshape(-1, *sizes[0]), count)
+    values = rows["value"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    numbers, trained = rows["number"].to_numpy(), rows["trained"].to_numpy()
+    return _standardise(numbers, trained, values.reshape(-1, *(sizes[0] if sizes else (1,))), count)
 
 
-def _standardised(rows: Array, trained: Array, values: Array, count: int) -> Features:
+def _standardise(rows: Array, trained: Array, values: Array, count: int) -> Features:
     training = values[trained.astype(bool)]
     if not len(training):
         return _sparse(values[:0, :0], rows[:0], rows[:0], (count, 0))
@@ -145,7 +134,7 @@ def _standardised(rows: Array, trained: Array, values: Array, count: int) -> Fea
 def _categories(
     connection: duckdb.DuckDBPyConnection, joined: str, value: str, count: int
 ) -> Features:
-    found = connection.sql(f"""
+    rows = connection.sql(f"""
         WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
         kept AS (
             SELECT value, row_number() OVER (ORDER BY count(*) DESC, value) - 1 AS column_index
@@ -155,9 +144,9 @@ def _categories(
         SELECT number, column_index FROM cases JOIN kept USING (value)
         ORDER BY number, column_index
     """).fetchnumpy()
-    size = int(found["column_index"].max()) + 1 if len(found["column_index"]) else 0
-    ones = np.ones(len(found["number"]), dtype=np.float32)
-    return _sparse(ones, found["number"], found["column_index"], (count, size))
+    size = int(rows["column_index"].max(initial=-1)) + 1
+    ones = np.ones(len(rows["number"]), dtype=np.float32)
+    return _sparse(ones, rows["number"], rows["column_index"], (count, size))
 
 
 def _sparse(values: Array, rows: Array, columns: Array, shape: tuple[int, int]) -> Features:

@@ -1,11 +1,11 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final
+from typing import Final
 
 import duckdb
 import pyarrow.parquet as pq
@@ -16,11 +16,16 @@ from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import bind, explained
 from ucfrec.logs.engine import BATCH_ROWS, engine
-from ucfrec.logs.feedback import feedback_columns, holds_feedback, names_of
-from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined
-from ucfrec.logs.tables import Table, open_tables, quoted
+from ucfrec.logs.tables import (
+    PANDAS_INDEX,
+    Table,
+    first_and_more,
+    is_number,
+    open_tables,
+    quoted,
+)
 from ucfrec.logs.typed import WANTED, typed_columns
 
 FEEDBACK: Final = "feedback"
@@ -48,6 +53,8 @@ _SAME_KEY: Final = (
     "AND CAST(f.item_id AS VARCHAR) = CAST(e.item_id AS VARCHAR)"
 )
 """Whether feedback `f` and exposure `e` are of the same user and item."""
+_WRITE_NUMBERS: Final = "write numbers as 12.50, truth values as true and false"
+_DAY_MS: Final = 86_400_000
 
 
 @dataclass(frozen=True)
@@ -109,69 +116,75 @@ def join_feedback(
         InputError: a file or column is missing, or of a wrong type; a file of feedback is one of
             exposures; or `out` is one of them.
     """
-    files = log_files(exposures), log_files(feedback)
-    require_other_files([out], [*files[0], *files[1]])
+    shown_files, feedback_files = log_files(exposures), log_files(feedback)
+    files = [*shown_files, *feedback_files]
+    require_other_files([out], files)
+    mapping = mapping or LogMapping()
     with (
         scratch_folder(Path(gettempdir()), "join") as folder,
-        engine([*files[0], *files[1]], folder, memory_limit, shared=True) as connection,
+        engine(files, folder, memory_limit, shared=True) as connection,
     ):
-        mapping = mapping or LogMapping()
-        shown = tuple(open_tables(connection, files[0]))
-        given = tuple(open_tables(connection, files[1], mapping.partitions))
-        with explained(connection, (*shown, *given), folder):
-            kept = _make_exposures(connection, shown)
-            _require_feedback(given)
-            columns = _make_feedback(connection, given, mapping)
-            _match(connection, within_ms)
-            _write(connection, columns, kept, out)
-            joined = _counts(connection, columns)
+        shown_tables = tuple(open_tables(connection, shown_files))
+        tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
+        with explained(connection, (*shown_tables, *tables), folder):
+            further = _make_exposures(connection, shown_tables)
+            columns = _make_feedback(connection, tables, mapping)
+            connection.execute(
+                "CREATE TABLE matches AS SELECT f.row AS feedback_row, e.row AS row FROM feedback f"
+                f" JOIN exposures e ON {_SAME_KEY} "
+                f"AND (f.{_REQUEST} IS NULL OR f.{_REQUEST} = e.{_REQUEST}) "
+                f"AND f.timestamp BETWEEN e.timestamp AND e.timestamp + {int(within_ms)} "
+                "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
+            )
+            _write(connection, columns, further, out)
+            joined = _count(connection, columns)
             if not joined.matched:
                 warnings.warn(_why_unmatched(connection, joined), InputNote, stacklevel=2)
             return joined
 
 
 @dataclass(frozen=True)
-class _More:
+class _Further:
     """A further column of the exposures, as those of a log that was joined before."""
 
     name: str
-    value: str
+    alias: str
     """Its name in the table `exposures`, so that any name is possible."""
     is_number: bool
     """Or a truth value, in all files that have it."""
 
 
-def _further(tables: Sequence[Table], taken: Collection[str]) -> dict[str, _More]:
-    """Further columns of the exposures, by their names in lower case.
+def _names_of(table: Table) -> dict[str, str]:
+    """Column names in lower case to those of the files, without a pandas index: case does not
+    matter."""
+    return {name.casefold(): name for name in table.columns if not PANDAS_INDEX.fullmatch(name)}
 
-    Args:
-        taken: names in lower case of the columns that exposures have.
-    """
-    found: dict[str, _More] = {}
-    for table in tables:
-        for key, name in names_of(table).items():
-            if key not in taken:
-                one = found.get(key) or _More(name, f"more_{len(found)}", is_number=True)
-                number = one.is_number and holds_feedback(table.columns[name])
-                found[key] = replace(one, is_number=number)
-    return found
+
+def _holds_feedback(kind: str) -> bool:
+    return is_number(kind) or kind == "BOOLEAN"
 
 
 def _make_exposures(
     connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...]
-) -> dict[str, _More]:
+) -> dict[str, _Further]:
     """Create the table `exposures`, each once, with its `row`; returns its further columns."""
     for table in tables:
-        missing = [name for name in _EXPOSURE if name not in {*names_of(table), schema.ARM}]
+        missing = [name for name in _EXPOSURE if name not in {*_names_of(table), schema.ARM}]
         if missing:
             raise InputError(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
     typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
-    more = _further(tables, {*typed.names, *_EXPOSURE})
+    further: dict[str, _Further] = {}
+    for table in tables:
+        for key, name in _names_of(table).items():
+            if key not in {*typed.names, *_EXPOSURE}:
+                column = further.get(key) or _Further(name, f"more_{len(further)}", True)
+                number = column.is_number and _holds_feedback(table.columns[name])
+                further[key] = replace(column, is_number=number)
     rows = " UNION ALL BY NAME ".join(
-        f"SELECT {keys}, {_others(whole, more)} FROM {_with_others(whole, narrow, more).sql}"
+        f"SELECT {keys}, {_select_others(whole, narrow, further)}"
         for whole, narrow, keys in zip(tables, typed.tables, typed.selects, strict=True)
     )
     connection.execute(f"CREATE TABLE given_exposures AS {rows}")
@@ -180,41 +193,29 @@ def _make_exposures(
         f"(ORDER BY timestamp, {_ONE_EXPOSURE}) AS row FROM given_exposures "
         f"QUALIFY row_number() OVER (PARTITION BY {_ONE_EXPOSURE} ORDER BY timestamp) = 1"
     )
-    return more
+    return further
 
 
-def _require_feedback(tables: Sequence[Table]) -> None:
-    """Refuse exposures as feedback, which a pattern that the shell expands makes of them."""
-    for table in tables:
-        if names_of(table).keys() >= {*_ONLY_SHOWN}:
-            raise InputError(
-                f"{table.files[0]} is not feedback: it has the columns of exposures "
-                f"({', '.join(_ONLY_SHOWN)}), as a log of join has; name the exposures once, by "
-                "their folder or as a pattern in quotes that the shell does not expand, and then "
-                "files of feedback"
+def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -> str:
+    """SQL of the columns of exposures besides the keys, and of the rows that they are read from.
+
+    Args:
+        keys: the same table with the columns of the keys only.
+    """
+    values, columns, texts = {schema.ARM: "''"}, [], []
+    for key, name in _names_of(table).items():
+        if _OTHERS.get(key) == "VARCHAR":
+            texts.append(name)
+            value = table.text_of(name)
+            values[key] = f"coalesce({value}, '')" if key == schema.ARM else value
+        elif key in _OTHERS or key in further:
+            columns.append(name)
+            other = key in _OTHERS
+            values[key if other else further[key].alias] = (
+                f"CAST({quoted(name)} AS {_OTHERS[key]})" if other else quoted(name)
             )
-
-
-def _others(table: Table, more: Mapping[str, _More]) -> str:
-    """SQL of the columns of exposures besides the keys; the arm is empty where there is none."""
-    names = names_of(table)
-    found = {
-        name: table.text_of(names[name]) if kind == "VARCHAR" else f"CAST({name} AS {kind})"
-        for name, kind in _OTHERS.items()
-        if name in names
-    }
-    found |= {more[key].value: quoted(name) for key, name in names.items() if key in more}
-    found[schema.ARM] = f"coalesce({found.get(schema.ARM, 'NULL')}, '')"
-    return ", ".join(f"{value} AS {name}" for name, value in found.items())
-
-
-def _with_others(table: Table, narrow: Table, more: Mapping[str, _More]) -> Table:
-    """A table of the keys, with the columns that `_others` reads."""
-    kinds = {name: _OTHERS[key] for key, name in names_of(table).items() if key in _OTHERS}
-    texts = [name for name, kind in kinds.items() if kind == "VARCHAR"]
-    columns = [name for name in kinds if name not in texts]
-    columns += [name for key, name in names_of(table).items() if key in more]
-    return narrow.with_texts(columns, texts)
+    selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
+    return f"{selects} FROM {keys.with_texts(columns, texts).sql}"
 
 
 def _make_feedback(
@@ -224,32 +225,104 @@ def _make_feedback(
 
     Their values are its columns `_value(0)`, …, so that any name is possible.
     """
+    for table in tables:
+        if _names_of(table).keys() >= {*_ONLY_SHOWN}:
+            raise InputError(
+                f"{table.files[0]} is not feedback: it has the columns of exposures "
+                f"({', '.join(_ONLY_SHOWN)}), as a log of join has; name the exposures once, by "
+                "their folder or as a pattern in quotes that the shell does not expand, and then "
+                "files of feedback"
+            )
     typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
-    read = _keys_read(connection, tables, mapping)
-    used = {*_EXPOSURE, FEEDBACK, *read}
-    columns = feedback_columns(connection, tables, used, FEEDBACK, {*_OTHERS} - {_REQUEST} - read)
+    keys = {
+        column.casefold()
+        for table in tables
+        for name in _KEYS
+        for column in bind(
+            connection, table, f"for {name}", mapping.columns.get(name, name)
+        ).columns
+    }
+    keys |= {name.casefold() for table in tables for name, _ in table.partitions}
+    columns = _feedback_columns(connection, tables, keys)
     selects = []
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
-        names = names_of(whole)
-        has = [
-            (n, names[key]) for n, name in enumerate(columns) if (key := name.casefold()) in names
+        names = _names_of(whole)
+        present = {
+            n: names[key] for n, key in enumerate(map(str.casefold, columns)) if key in names
+        }
+        values = [
+            f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in present.items()
         ]
-        values = [f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in has]
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
-        source = narrow.with_texts([name for _, name in has], requests)
+        source = narrow.with_texts(present.values(), requests)
         selects.append(f"SELECT {select}, {', '.join(values)} FROM {source.sql}")
-    rows = " UNION ALL BY NAME ".join(selects)
-    conditions = ["true"] if mapping.where is None else [WANTED]
+    conditions = ["true"]
     if mapping.where is not None:
         note_undefined(connection, tables, mapping.where)
+        conditions.append(WANTED)
     if mapping.earliest is not None:
         conditions.append(f"timestamp >= {int(mapping.earliest_ms)}")
     connection.execute(
-        f"CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row FROM ({rows}) "
-        f"WHERE {' AND '.join(conditions)}"
+        "CREATE TABLE feedback AS SELECT *, row_number() OVER () AS row "
+        f"FROM ({' UNION ALL BY NAME '.join(selects)}) WHERE {' AND '.join(conditions)}"
     )
     return columns
+
+
+def _feedback_columns(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
+) -> tuple[str, ...]:
+    """Columns of numbers and truth values, each once, with a note on those that are left out.
+
+    Args:
+        keys: names in lower case that are none of feedback, besides those of exposures.
+
+    Raises:
+        InputError: a column has numbers in one file, and something else in another.
+    """
+    columns: dict[str, tuple[str, Path]] = {}
+    left_out: dict[str, str] = {}
+    others = []
+    for table in tables:
+        for key, name in _names_of(table).items():
+            kind = table.columns[name]
+            if key in keys or key in (*_KEYS, _REQUEST):
+                continue
+            if key in _OTHERS:
+                left_out[name] = "of the exposures, too"
+            elif not _holds_feedback(kind):
+                others.append((table, key, name, kind))
+            elif key == FEEDBACK:
+                left_out[name] = "the log has its own, the number of rows; rename it"
+            else:
+                columns.setdefault(key, (name, table.files[0]))
+    for table, key, name, kind in others:
+        if key not in columns and kind != "VARCHAR":
+            continue
+        ((values, words, sample),) = connection.sql(
+            "SELECT count(x), count(x) FILTER (n), min(x) FILTER (n) FROM (SELECT x, "
+            "NOT coalesce(isfinite(TRY_CAST(x AS DOUBLE)), false) AS n FROM (SELECT "
+            f"trim(CAST({quoted(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
+        ).fetchall()
+        told = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
+        if words and key in columns:
+            raise InputError(
+                f"{table.files[0]}: column {name} has numbers in {columns[key][1]}, but here "
+                f"{told}; {_WRITE_NUMBERS}, or remove the column"
+            )
+        if values and key not in columns:
+            left_out[name] = f"text, {told if words else 'though all are numbers'}"
+    if left_out:
+        files = first_and_more([file for table in tables for file in table.files])
+        names = ", ".join(f"{name} ({why})" for name, why in left_out.items())
+        warnings.warn(
+            f"{files}: columns are left out: {names}; where one is feedback, {_WRITE_NUMBERS}, in "
+            "a column of its own name",
+            InputNote,
+            stacklevel=4,
+        )
+    return tuple(name for name, _ in columns.values())
 
 
 def _value(n: int) -> str:
@@ -258,7 +331,7 @@ def _value(n: int) -> str:
 
 def _as_number(name: str, kind: str) -> str:
     """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
-    value = quoted(name) if holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
+    value = quoted(name) if _holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
     return f"CAST({value} AS DOUBLE)"
 
 
@@ -268,50 +341,33 @@ def _keys_of(mapping: LogMapping) -> LogMapping:
     return replace(mapping, columns={**mapping.columns, **absent})
 
 
-def _keys_read(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], mapping: LogMapping
-) -> set[str]:
-    """Columns, in lower case, that user, item and time are read from, and those of folders."""
-    given = [(table, name, mapping.columns.get(name) or name) for table in tables for name in _KEYS]
-    read = (bind(connection, table, f"for {name}", each) for table, name, each in given)
-    folders = {name.casefold() for table in tables for name, _ in table.partitions}
-    return folders | {column.casefold() for bound in read for column in bound.columns}
-
-
-def _match(connection: duckdb.DuckDBPyConnection, within_ms: int) -> None:
-    """Create the table `matches`, feedback row to exposure row."""
-    connection.execute(
-        "CREATE TABLE matches AS SELECT f.row AS feedback_row, e.row AS row FROM feedback f "
-        f"JOIN exposures e ON {_SAME_KEY} "
-        f"AND (f.{_REQUEST} IS NULL OR f.{_REQUEST} = e.{_REQUEST}) "
-        f"AND f.timestamp BETWEEN e.timestamp AND e.timestamp + {int(within_ms)} "
-        "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
-    )
-
-
 def _write(
     connection: duckdb.DuckDBPyConnection,
     columns: Sequence[str],
-    more: Mapping[str, _More],
+    further: Mapping[str, _Further],
     out: Path,
 ) -> None:
     """Write the log, users as numbers if the feedback has numbers."""
-    values = [_value(n) for n in range(len(columns))]
-    found = ", ".join(
-        ["m.row AS row", f"count(*) AS {FEEDBACK}", *(f"max({each}) AS {each}" for each in values)]
-    )
-    named = dict(zip((FEEDBACK, *columns), (FEEDBACK, *values), strict=True))
-    again = {name.casefold() for name in named}
-    filled = [f"{one.value} AS {quoted(one.name)}" for k, one in more.items() if k not in again]
-    for name, each in named.items():
-        before = more.get(name.casefold())
-        filled.append(f"{_filled(each, before, name == FEEDBACK)} AS {quoted(name)}")
-    internal = "row", FEEDBACK, *values, *(each.value for each in more.values())
-    user = "CAST(user_id AS BIGINT) AS user_id" if _whole_users(connection) else "user_id"
+    values = {FEEDBACK: FEEDBACK, **{name: _value(n) for n, name in enumerate(columns)}}
+    largest = "".join(f", max({_value(n)}) AS {_value(n)}" for n in range(len(columns)))
+    again = {name.casefold() for name in values}
+    selects = [f"{c.alias} AS {quoted(c.name)}" for key, c in further.items() if key not in again]
+    for name, value in values.items():
+        sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
+        if earlier is not None and earlier.is_number:
+            sql = (
+                f"{sql} + CAST(coalesce({earlier.alias}, 0) AS BIGINT)"
+                if name == FEEDBACK
+                else f"greatest({sql}, CAST(coalesce({earlier.alias}, 0) AS DOUBLE))"
+            )
+        selects.append(f"{sql} AS {quoted(name)}")
+    internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
+    user = "CAST(user_id AS BIGINT) AS user_id" if _are_users_numbers(connection) else "user_id"
     query = (
-        f"SELECT {user}, * EXCLUDE (user_id, {', '.join(internal)}), {', '.join(filled)} "
-        f"FROM exposures LEFT JOIN (SELECT {found} FROM matches m JOIN feedback f "
-        "ON f.row = m.feedback_row GROUP BY m.row) USING (row) ORDER BY exposures.row"
+        f"SELECT {user}, * EXCLUDE ({', '.join(internal)}), {', '.join(selects)} FROM exposures "
+        f"LEFT JOIN (SELECT m.row AS row, count(*) AS {FEEDBACK}{largest} FROM matches m "
+        "JOIN feedback f ON f.row = m.feedback_row GROUP BY m.row) USING (row) "
+        "ORDER BY exposures.row"
     )
     with atomic_file(out) as scratch:
         batches = connection.sql(query).to_arrow_reader(BATCH_ROWS)
@@ -320,68 +376,41 @@ def _write(
                 writer.write_batch(batch)
 
 
-def _filled(value: str, before: _More | None, counts: bool) -> str:
-    """SQL of a column of feedback, with what an earlier join found of it.
-
-    Args:
-        counts: whether it counts rows, which are added; of other columns the larger value is kept.
-    """
-    value = f"coalesce({value}, 0)"
-    if before is None or not before.is_number:
-        return value
-    if counts:
-        return f"{value} + CAST(coalesce({before.value}, 0) AS BIGINT)"
-    return f"greatest({value}, CAST(coalesce({before.value}, 0) AS DOUBLE))"
-
-
-def _whole_users(connection: duckdb.DuckDBPyConnection) -> bool:
+def _are_users_numbers(connection: duckdb.DuckDBPyConnection) -> bool:
     """Whether the feedback's users are numbers, and all exposures' are written as numbers are."""
-    kinds = {row[0]: row[1] for row in connection.sql("DESCRIBE feedback").fetchall()}
-    if kinds[schema.USER_ID] != "BIGINT":
-        return False
-    ((others,),) = connection.sql(
-        "SELECT bool_or(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS DISTINCT FROM "
-        "CAST(user_id AS VARCHAR)) FROM exposures"
+    ((whole,),) = connection.sql(
+        "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
+        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
+        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
     ).fetchall()
-    return not others
+    return bool(whole)
 
 
-def _counts(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
-    def count(of: str) -> int:
-        ((number,),) = connection.sql(f"SELECT count({of}").fetchall()
-        return int(number)
-
-    shown, given = count("*) FROM exposures"), count("*) FROM given_exposures")
-    matched = count("*) FROM matches")
-    return Joined(
-        exposures=shown,
-        repeated=given - shown,
-        with_feedback=count("DISTINCT row) FROM matches"),
-        matched=matched,
-        unmatched=count("*) FROM feedback") - matched,
-        columns=columns,
-    )
+def _count(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
+    ((shown, written, rows, matched, with_feedback),) = connection.sql(
+        "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
+        "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
+    ).fetchall()
+    return Joined(shown, written - shown, with_feedback, matched, rows - matched, columns)
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:
     """What may be wrong with feedback of which no row matches."""
-
-    def one(sql: str) -> tuple[Any, ...]:
-        row: tuple[Any, ...] = connection.sql(sql).fetchall()[0]
-        return row
-
-    reasons = []
-    requests, known, sample, wanted = one(
+    ((requests, equal, request, other_request, users, midnight),) = connection.sql(
         f"SELECT count({_REQUEST}), "
-        f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), "
-        f"min({_REQUEST}), (SELECT min({_REQUEST}) FROM exposures) FROM feedback"
-    )
-    if requests and not known:
+        f"count(*) FILTER ({_REQUEST} IN (SELECT {_REQUEST} FROM exposures)), min({_REQUEST}), "
+        f"(SELECT min({_REQUEST}) FROM exposures), "
+        f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
+        f"coalesce(bool_and(timestamp % {_DAY_MS} = 0), false) FROM feedback"
+    ).fetchall()
+    reasons = []
+    if requests and not equal:
         reasons.append(
-            f"none of its {requests:,} values of {_REQUEST} (such as {sample!r:.60}) is one of the "
-            f"exposures (such as {wanted!r:.60}), log the one that was served or omit the column"
+            f"none of its {requests:,} values of {_REQUEST} (such as {request!r:.60}) is one of the"
+            f" exposures (such as {other_request!r:.60}), log the one that was served or omit the "
+            "column"
         )
-    if not one(f"SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}")[0]:
+    if not users:
         reasons.append(
             "none of its users was shown any of their items, check --column user_id and item_id"
         )
@@ -391,7 +420,7 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         "seconds need --column timestamp='COLUMN * 1000', microseconds "
         "--column timestamp='COLUMN / 1000', and later feedback a larger --within"
     )
-    if one(f"SELECT coalesce(bool_and(timestamp % {DAY_MS} = 0), false) FROM feedback")[0]:
+    if midnight:
         reasons.append(
             "its dates have no time of day and count as midnight, before what was shown on that "
             "day: log the time, too"
@@ -403,12 +432,12 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
 def _time_range(connection: duckdb.DuckDBPyConnection, rows: str) -> str:
     """The first and the last time of a table, in UTC; as a number where no calendar has it."""
     first, last = (
-        f"coalesce(strftime(TRY(make_timestamp_ms({each})), '%Y-%m-%d %H:%M:%S'), "
-        f"CAST({each} AS VARCHAR), '(none)')"
-        for each in ("first", "last")
+        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
+        f"CAST({time} AS VARCHAR), '(none)')"
+        for time in ("first", "last")
     )
-    ((told,),) = connection.sql(
+    ((times,),) = connection.sql(
         f"SELECT {first} || ' to ' || {last} FROM "
         f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
     ).fetchall()
-    return str(told)
+    return str(times)

@@ -1,6 +1,5 @@
 """Column mappings of logs, written as data, and the datasets that supply them."""
 
-import difflib
 import glob
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +12,9 @@ from ucfrec import schema
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import read_toml
+from ucfrec.files.remote import RECORDS
 from ucfrec.logs.expressions import Expression
+from ucfrec.settings import nearest
 
 SUFFIXES: Final = (".parquet", ".csv", ".csv.gz")
 _OTHER_TABLES: Final = (
@@ -31,8 +32,6 @@ OPTIONAL_COLUMNS: Final = (
 )
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
-_RECORDS: Final = ("meta.json", "run.json")
-"""Files that make a folder a store or a run."""
 SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
 """Ways in which rows form sessions."""
 
@@ -59,11 +58,9 @@ class FeatureTable:
     e.g. the first day of daily features. Empty: a repeated key is an error."""
 
     def __post_init__(self) -> None:
-        for name, given in (("files", self.files), ("columns", self.columns)):
-            if isinstance(given, str | Path):
-                raise InputError(
-                    f"{name} of features is {str(given)!r}; write a list: [{str(given)!r}]"
-                )
+        for name, value in (("files", self.files), ("columns", self.columns)):
+            if isinstance(value, str | Path):
+                raise InputError(f"{name} of features is {value!s}; write a list: ['{value!s}']")
 
 
 @dataclass(frozen=True)
@@ -102,21 +99,18 @@ class LogMapping:
     where nothing else is given and the files have the columns they need."""
 
     def __post_init__(self) -> None:
-        known = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
+        names = (*KEY_COLUMNS, *OPTIONAL_COLUMNS)
         for name in self.columns:
-            if name not in known:
-                raise InputError(f"{name!r} is not a log column; use one of {', '.join(known)}")
+            if name not in names:
+                raise InputError(f"{name!r} is not a log column; use one of {', '.join(names)}")
         if self.session_by not in (None, *SESSIONS):
             raise InputError(
                 f"session_by is {self.session_by!r}; use {', '.join(SESSIONS)}, and map a column "
                 f"of sessions as {schema.SESSION_ID}"
             )
-
         for name in ("item_features", "user_features"):
-            given = getattr(self, name)
-            if not isinstance(given, (tuple, list)) or not all(
-                isinstance(each, FeatureTable) for each in given
-            ):
+            tables = getattr(self, name)
+            if not isinstance(tables, (tuple, list)) or {type(t) for t in tables} - {FeatureTable}:
                 raise InputError(
                     f"{name} takes a list of FeatureTable, such as FeatureTable(['items.parquet'], "
                     "key='item_id'); write a frame to a file first"
@@ -142,20 +136,12 @@ class LogMapping:
 
     def over(self, defaults: "LogMapping") -> "LogMapping":
         """This mapping, with its empty fields filled from `defaults`."""
-        return LogMapping(
-            {**defaults.columns, **self.columns},
-            self.reward or defaults.reward,
-            self.session_by or defaults.session_by,
-            self.item_features or defaults.item_features,
-            self.user_features or defaults.user_features,
-            self.time_format or defaults.time_format,
-            self.earliest or defaults.earliest,
-            self.where or defaults.where,
-            self.partitions or defaults.partitions,
-            self.remembered.over(defaults.remembered)
-            if self.remembered and defaults.remembered
-            else self.remembered or defaults.remembered,
-        )
+        remembered = self.remembered or defaults.remembered
+        if self.remembered and defaults.remembered:
+            remembered = self.remembered.over(defaults.remembered)
+        values = {f.name: getattr(self, f.name) or getattr(defaults, f.name) for f in fields(self)}
+        columns = {**defaults.columns, **self.columns}
+        return LogMapping(**values | {"columns": columns, "remembered": remembered})
 
     @classmethod
     def of_source(cls, source: Source, origin: str) -> "LogMapping":
@@ -247,55 +233,44 @@ def read_mapping(path: Path) -> LogMapping:
     Raises:
         InputError: the file is missing, is not TOML, or has an unknown field.
     """
-    given = read_toml(path)
-    _require_keys(path, "", given, LogMapping)
+    values, origin = read_toml(path), str(path)
+    _require_keys(origin, values, LogMapping)
     try:
-        for name, value in given.get("columns", {}).items():
-            given["columns"][name] = Expression(value, str(path))
-        for name in ("reward", "where"):
-            if name in given:
-                given[name] = Expression(given[name], str(path))
-        for kind in ("item_features", "user_features"):
-            for table in given.get(kind, []):
-                _require_keys(path, f"[[{kind}]]", table, FeatureTable)
-            tables = (FeatureTable(**table) for table in given.get(kind, []))
-            given[kind] = tuple(
+        columns = values.get("columns", {})
+        values["columns"] = {name: Expression(text, origin) for name, text in columns.items()}
+        for name in {"reward", "where"} & values.keys():
+            values[name] = Expression(values[name], origin)
+        for kind in {"item_features", "user_features"} & values.keys():
+            for table in values[kind]:
+                _require_keys(f"[[{kind}]]", table, FeatureTable)
+            values[kind] = tuple(
                 replace(
-                    table,
-                    files=tuple(_beside(path, file) for file in table.files),
-                    key=Expression(table.key, str(path)),
-                    columns=tuple(Expression(column, str(path)) for column in table.columns),
-                    first_by=Expression(table.first_by, str(path)),
+                    features,
+                    files=tuple(_beside(path, file) for file in features.files),
+                    key=Expression(features.key, origin),
+                    columns=tuple(Expression(column, origin) for column in features.columns),
+                    first_by=Expression(features.first_by, origin),
                 )
-                for table in tables
+                for features in (FeatureTable(**table) for table in values[kind])
             )
-        return LogMapping(**given)
+        return LogMapping(**values)
     except (AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _require_keys(path: Path, place: str, given: object, known: type) -> None:
+def _require_keys(where: str, table: object, kind: type) -> None:
     """Check that a table of a mapping file has the keys of a class.
-
-    Args:
-        place: the name of the table, as it is written; empty for the file.
 
     Raises:
         InputError: it is no table, or has an unknown key, or lacks one.
     """
-    if not isinstance(given, dict):
-        raise InputError(f"{path}: write {place} in double brackets, with its keys in lines below")
-    parts = [each for each in fields(known) if each.name != "remembered"]
-    names, where = [each.name for each in parts], f"{path}{place and f', {place}'}"
-    for key in given:
-        if key not in names:
-            near = difflib.get_close_matches(key, names, n=1)
-            meant = f"did you mean {near[0]!r}? The" if near else "the"
-            raise InputError(
-                f"{where}: there is no key {key!r}; {meant} keys are {', '.join(names)}"
-            )
-    for part in parts:
-        if part.name not in given and part.default is part.default_factory is MISSING:
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: write it in double brackets, with its keys in lines below")
+    names = [part.name for part in fields(kind) if part.name != "remembered"]
+    for key in table.keys() - set(names):
+        raise InputError(f"{where}: there is no key {key!r}; {nearest(key, names)}")
+    for part in fields(kind):
+        if part.name not in table and part.default is part.default_factory is MISSING:
             raise InputError(f"{where}: it has no key {part.name!r}; add it")
 
 
@@ -337,8 +312,7 @@ def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
 
 def table_name(file: Path) -> str:
     """Name of the table that a file is, or is a part of: a folder `items.parquet/` is a table."""
-    folders = (each.name for each in file.parents if each.name.endswith(SUFFIXES))
-    return next(folders, file.name)
+    return next((p.name for p in file.parents if p.name.endswith(SUFFIXES)), file.name)
 
 
 def _matches(path: Path) -> list[Path]:
@@ -350,31 +324,29 @@ def _matches(path: Path) -> list[Path]:
         return [path]
     if not glob.has_magic(str(path)):
         raise InputError(f"{path} does not exist; check the path")
-    found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-    shown = [each for each in found if not each.name.startswith(".")]
-    return [table for each in shown for table in _tables(each)]
+    matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+    return [table for match in matches if match.name[:1] != "." for table in _tables(match)]
 
 
-def _tables(path: Path, above: tuple[Path, ...] = ()) -> list[Path]:
+def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
     """The tables at a path, those of a folder and its sub-folders by name.
 
     Args:
-        above: the folders that it lies in, without links: a link may lead back to one of them.
+        parents: the folders that it lies in, without links: a link may lead back to one of them.
     """
     if not path.is_dir():
         if path.name.lower().endswith(_OTHER_TABLES):
             warnings.warn(f"{path} is not read; {_CONVERT}", InputNote, stacklevel=4)
         return [path] if is_table(path) else []
-    if (real := path.resolve()) in above:
-        return []
-    if above and any((path / name).is_file() for name in _RECORDS):
+    real = path.resolve()
+    if real in parents or (parents and any((path / name).is_file() for name in RECORDS)):
         return []
     entries = sorted(
-        each
-        for each in path.iterdir()
-        if each.name[0] != "." and not (each.name[0] == "_" and each.is_dir())
+        entry
+        for entry in path.iterdir()
+        if entry.name[0] != "." and not (entry.name[0] == "_" and entry.is_dir())
     )
-    return [table for each in entries for table in _tables(each, (*above, real))]
+    return [table for entry in entries for table in _tables(entry, (*parents, real))]
 
 
 def is_table(path: Path) -> bool:

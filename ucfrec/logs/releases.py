@@ -6,13 +6,10 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from textwrap import shorten
-from typing import Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping, Release
-
-_CHUNK: Final = 2**20
 
 
 def load_release(
@@ -32,7 +29,7 @@ def load_release(
     part = next(iter(release.parts)) if part is None else part
     if part not in release.parts:
         raise InputError(f"{name} has no part {part!r}; it has {', '.join(release.parts)}")
-    path = _unpacked(name, release, folder) / release.parts[part]
+    path = _unpack(name, release, folder) / release.parts[part]
     if not path.exists():
         raise InputError(f"{path} is missing; delete {folder / name} and load it again")
     files, mapping = dataset.resolve([path], LogMapping())
@@ -45,13 +42,13 @@ def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
     Raises:
         InputError: none has.
     """
-    known = {each: adapter for adapter, dataset in datasets.items() for each in dataset.releases}
-    if name not in known:
-        raise InputError(f"no data set is called {name!r}; there are {', '.join(sorted(known))}")
-    return known[name]
+    adapters = {release: key for key, dataset in datasets.items() for release in dataset.releases}
+    if name not in adapters:
+        raise InputError(f"no data set is called {name!r}; there are {', '.join(sorted(adapters))}")
+    return adapters[name]
 
 
-def _unpacked(name: str, release: Release, folder: Path) -> Path:
+def _unpack(name: str, release: Release, folder: Path) -> Path:
     """The folder with the files of a release."""
     target = folder / name
     if target.is_dir():
@@ -84,28 +81,22 @@ def _download(name: str, release: Release, archive: Path) -> None:
         raise InputError(
             f"downloading {name} needs pooch; install ucfrec[datasets], or {by_hand}"
         ) from None
-    archive.parent.mkdir(parents=True, exist_ok=True)
-    logger = pooch.get_logger()
-    logger.setLevel("WARNING")
+    pooch.get_logger().setLevel("WARNING")
     try:
         pooch.retrieve(release.url, release.checksum, archive.name, archive.parent)
     except Exception as error:  # of several libraries, for names, connections, certificates, status
         if "does not match the known hash" in str(error):
             raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"{name} cannot be downloaded ({shorten(reason, 200, placeholder=' …')}); {by_hand}"
-        ) from None
+        reason = shorten(str(error) or type(error).__name__, 200, placeholder=" …")
+        raise InputError(f"{name} cannot be downloaded ({reason}); {by_hand}") from None
 
 
 def _require_checksum(release: Release, archive: Path) -> None:
-    kind, _, expected = release.checksum.partition(":")
-    found = hashlib.new(kind, usedforsecurity=False)
+    kind, _, stated = release.checksum.partition(":")
     with archive.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            found.update(chunk)
-    if found.hexdigest() != expected:
+        checksum = hashlib.file_digest(file, kind).hexdigest()
+    if checksum != stated:
         raise InputError(
-            f"{archive} has {kind} {found.hexdigest()}, the release {expected}; it is damaged or "
-            f"another version: delete it and load it again"
+            f"{archive} has {kind} {checksum}, the release {stated}; it is damaged or another "
+            "version: delete it and load it again"
         )

@@ -11,14 +11,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TextIO, cast
+from typing import Any, Final, TextIO, cast
 
 import duckdb
 import pyarrow.parquet as pq
 
 from ucfrec.errors import InputError
-from ucfrec.files.parquet import require_plausible_rows
-from ucfrec.logs.compressed import require_plausible_size, require_short_lines
+from ucfrec.files.parquet import require_plausible_rows, require_plausible_size
 
 _MAGIC = re.compile(r"[\[*?]")
 _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
@@ -31,6 +30,10 @@ _EXACT = {
     "TIMESTAMP": "TIMESTAMP WITH TIME ZONE",
 }
 """DuckDB type of a CSV column to the type that keeps what a cast to it would cut off."""
+_CSV_FAULT = re.compile(
+    r"CSV Error on Line: (\d+)(?:\nOriginal Line: .*)?\n(.*)(?:.|\n)*?\n\s*file = (.+)"
+)
+_CSV_COLUMN = re.compile(r'converting column "([^"]+)"\. ([^\n]+)')
 _MAX_FAULT = 300
 """Most characters of a message of DuckDB, which may quote values of any length."""
 NOTHING: Final = '"NULL"'
@@ -92,23 +95,21 @@ class Table:
     @property
     def sql(self) -> str:
         """SQL of the rows: NaN is missing, integers of fewer than 64 bits have 64."""
-        kinds = dict(self.types)
-        names = kinds if self.used is None else [name for name in self.used if name in kinds]
-        read = [self._value(name, kinds[name]) for name in names]
-        read += [f"{quoted(name)} AS {quoted(raw_name(name))}" for name in self.raw]
-        read += [
-            f"{_of_folder(name, kind)} AS {quoted(name)}"
-            for name, kind in self.partitions
-            if self.used is None or name in self.used
+        kinds, folders = dict(self.types), dict(self.partitions)
+        used = [*kinds, *folders] if self.used is None else self.used
+        values = []
+        for name in (name for name in used if name in kinds):
+            column, kind = quoted(name), kinds[name]
+            if name in self.raw and kind != "VARCHAR":
+                column = f"CAST({column} AS {kind})"
+            values.append(f"{_computed(column, kind)} AS {quoted(name)}")
+        values += [f"{quoted(name)} AS {quoted(raw_name(name))}" for name in self.raw]
+        values += [
+            f"{_folder_value(name, folders[name])} AS {quoted(name)}"
+            for name in used
+            if name in folders
         ]
-        return f"(SELECT {', '.join(read) or '1'} FROM {self.source})"
-
-    def _value(self, name: str, kind: str) -> str:
-        column = quoted(name)
-        if name in self.raw and kind != "VARCHAR":
-            column = f"CAST({column} AS {kind})"
-        read = _read(column, kind)
-        return read if read == quoted(name) else f"{read} AS {quoted(name)}"
+        return f"(SELECT {', '.join(values) or '1'} FROM {self.source})"
 
     @property
     def source(self) -> str:
@@ -119,14 +120,15 @@ class Table:
             options += f", filename = {text(_FILE)}"
         if self.columnar:
             return f"read_parquet([{files}], {options})"
-        kinds = {name: "VARCHAR" if name in self.raw else kind for name, kind in self.types}
-        kinds = {name: "VARCHAR" if kind == NOTHING else kind for name, kind in kinds.items()}
-        types = ", ".join(f"{text(name)}: {text(kind)}" for name, kind in kinds.items())
-        given = f", types = {{{types}}}" if types else ""
+        types = ", ".join(
+            f"{text(name)}: {text('VARCHAR' if name in self.raw or kind == NOTHING else kind)}"
+            for name, kind in self.types
+        )
         # DuckDB would take quotes for text if the first rows have none, and sometimes leave out
         # lines that begin with #.
         options += ", quote = '\"', escape = '\"', comment = ''"
-        return f"read_csv([{files}], header = true, {options}{given})"
+        options += f", types = {{{types}}}" if types else ""
+        return f"read_csv([{files}], header = true, {options})"
 
 
 def raw_name(name: str) -> str:
@@ -134,7 +136,7 @@ def raw_name(name: str) -> str:
     return _RAW + name
 
 
-def _of_folder(name: str, kind: str = "VARCHAR") -> str:
+def _folder_value(name: str, kind: str = "VARCHAR") -> str:
     """SQL of the value of a column in the name of a folder."""
     pattern = f"(?:^|[/\\\\]){re.escape(name)}=([^/\\\\]*)[/\\\\]"
     value = f"url_decode(regexp_extract({quoted(_FILE)}, {text(pattern)}, 1))"
@@ -152,7 +154,7 @@ def _computed_as(kind: str) -> str:
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
 
 
-def _read(column: str, kind: str) -> str:
+def _computed(column: str, kind: str) -> str:
     """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
     if kind in ("FLOAT", "DOUBLE"):
         # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would exclude
@@ -242,49 +244,48 @@ def open_tables(
         raise InputError(
             f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"
         )
-    return _with_whole_numbers(tables)
+    return _type_partitions(tables)
 
 
 def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tuple[str, str], ...]:
     """Columns that only the folders of a file name."""
     (file,) = table.files
-    found = [part.partition("=")[0] for part in file.parts[:-1] if "=" in part.strip("=")]
     columns = {name.casefold(): name for name in table.columns}
-    for name in [name for name in found if name.casefold() in columns]:
-        column = columns[name.casefold()]
-        named = replace(table, partitions=((name, "VARCHAR"),)).source
-        differs = f"CAST({quoted(column)} AS VARCHAR) IS DISTINCT FROM {_of_folder(name)}"
-        other = connection.sql(
-            f"SELECT CAST({quoted(column)} AS VARCHAR) FROM {named} WHERE {differs} LIMIT 1"
+    names = [name for name, _ in _folder_values(file)]
+    for name in names:
+        column = columns.get(name.casefold())
+        if column is None:
+            continue
+        source = replace(table, partitions=((name, "VARCHAR"),)).source
+        value = f"CAST({quoted(column)} AS VARCHAR)"
+        differing = connection.sql(
+            f"SELECT {value} FROM {source} WHERE {value} IS DISTINCT FROM {_folder_value(name)} "
+            "LIMIT 1"
         ).fetchall()
-        if other:
+        if differing:
             raise InputError(
-                f"{file}: {column} is {other[0][0]!r:.60} in the file, but its folder says another "
-                "value; omit --partitions, or rename the folders"
+                f"{file}: {column} is {differing[0][0]!r:.60} in the file, but its folder says "
+                "another value; omit --partitions, or rename the folders"
             )
-    return tuple((name, "VARCHAR") for name in found if name.casefold() not in columns)
+    return tuple((name, "VARCHAR") for name in names if name.casefold() not in columns)
 
 
-def _with_whole_numbers(tables: list[Table]) -> list[Table]:
+def _folder_values(file: Path) -> list[tuple[str, str]]:
+    """Names and values of the folders of a file that are called NAME=VALUE."""
+    pairs = [part.partition("=") for part in file.parts[:-1] if "=" in part.strip("=")]
+    return [(name, value) for name, _, value in pairs]
+
+
+def _type_partitions(tables: list[Table]) -> list[Table]:
     """Make columns of folders whole numbers, if the names of all folders are."""
-    folders = [
-        part.split("=", 1)
-        for table in tables
-        for file in table.files
-        for part in file.parts[:-1]
-        if "=" in part.strip("=")
-    ]
-    whole = rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}"
-    words = {name for name, value in folders if not re.fullmatch(whole, value)}
-    return [
-        replace(
-            table,
-            partitions=tuple(
-                (name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions
-            ),
-        )
+    whole = re.compile(rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}")
+    values = [pair for table in tables for file in table.files for pair in _folder_values(file)]
+    words = {name for name, value in values if not whole.fullmatch(value)}
+    types = [
+        [(name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions]
         for table in tables
     ]
+    return [replace(t, partitions=tuple(p)) for t, p in zip(tables, types, strict=True)]
 
 
 def _columns(
@@ -302,8 +303,6 @@ def _columns(
         )
     if file.suffix.lower() == ".gz":
         require_plausible_size(file)
-    if not is_parquet:
-        require_short_lines(file)
     source = Table((file,), ()).source
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
@@ -317,7 +316,7 @@ def _columns(
             raise InputError(
                 f"{file} is not in UTF-8; convert it, e.g. with iconv -t UTF-8"
             ) from None
-        raise InputError(
+        raise fault_of_line(error) or InputError(
             f"{file} cannot be read, it may be truncated ({first_line(error)}); fetch it again"
         ) from None
     columns = tuple((str(name), str(kind)) for name, kind, *_ in types)
@@ -327,22 +326,22 @@ def _columns(
     if not first_row:
         return None
     _require_distinct(file, names)
-    return columns if is_parquet else _of_all_rows(connection, file, columns)
+    return columns if is_parquet else _types_of_all_rows(connection, file, columns)
 
 
 def _require_header(file: Path, columns: Sequence[str]) -> None:
     """Refuse a CSV file whose first line is no header, or whose lines have other numbers of fields:
     DuckDB reads such a file as one column, or skips lines."""
-    first = _written_names(file)
-    numbers = sum(re.fullmatch(r"[-+]?\d+(\.\d+)?", name) is not None for name in first)
-    if 2 * numbers >= len(first):
+    names = _written_names(file)
+    numbers = sum(re.fullmatch(r"[-+]?\d+(\.\d+)?", name) is not None for name in names)
+    if 2 * numbers >= len(names):
         raise InputError(
-            f"{file}, line 1 has values ({', '.join(first):.60}) instead of the names of the "
+            f"{file}, line 1 has values ({', '.join(names):.60}) instead of the names of the "
             "columns; add a line with these"
         )
-    if len(columns) == len(first):
+    if len(columns) == len(names):
         return
-    with _opened(file) as lines, contextlib.suppress(csv.Error):
+    with _open_text(file) as lines, contextlib.suppress(csv.Error):
         separator = max(",;\t|", key=lines.readline().count)
         lines.seek(0)
         rows = csv.reader(lines, delimiter=separator)
@@ -356,9 +355,17 @@ def _require_header(file: Path, columns: Sequence[str]) -> None:
                 )
 
 
-def _opened(file: Path) -> TextIO:
-    kind = gzip.open if file.suffix.lower() == ".gz" else open
-    return cast(TextIO, kind(file, "rt", encoding="utf-8-sig", errors="replace"))
+def _open_text(file: Path) -> TextIO:
+    opener = gzip.open if file.suffix.lower() == ".gz" else open
+    return cast(TextIO, opener(file, "rt", encoding="utf-8-sig", errors="replace"))
+
+
+def _written_names(file: Path) -> list[str]:
+    """Names of the columns as the file has them."""
+    if file.suffix.lower() == ".parquet":
+        return list(pq.read_schema(file).names)
+    with _open_text(file) as lines:
+        return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
 
 
 def _require_distinct(file: Path, columns: Sequence[str]) -> None:
@@ -369,15 +376,7 @@ def _require_distinct(file: Path, columns: Sequence[str]) -> None:
         raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
 
 
-def _written_names(file: Path) -> list[str]:
-    """Names of the columns as the file has them."""
-    if file.suffix.lower() == ".parquet":
-        return list(pq.read_schema(file).names)
-    with _opened(file) as lines:
-        return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
-
-
-def _of_all_rows(
+def _types_of_all_rows(
     connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
     """Types of the columns of a CSV file, given those that DuckDB inferred from its first rows.
@@ -387,51 +386,68 @@ def _of_all_rows(
     do not begin with the year stay text: DuckDB guesses their order. A column without any value has
     the type `NOTHING`.
     """
-    exact = {name: _EXACT[kind] for name, kind in types if kind in _EXACT}
-    dated = [name for name, kind in types if kind == "DATE" or kind.startswith("TIMESTAMP")]
-    whole = [name for name, kind in types if kind == "BIGINT"]
-    words = _never_filled(connection, file, types)
-    asked = dict.fromkeys([*exact, *dated])
-    if not asked and not words:
-        return types
-    as_text = Table((file,), tuple((n, "VARCHAR" if n in asked else kind) for n, kind in types))
-    source = f"{as_text.source[:-1]}, ignore_errors = true)"
     kinds = dict(types)
-    conditions = [
-        f"TRY_CAST({quoted(n)} AS {wide}) <> TRY_CAST({quoted(n)} AS {kinds[n]})"
-        for n, wide in exact.items()
-    ]
-    conditions += [f"NOT regexp_full_match(trim({quoted(n)}), {text(ISO_TIME)})" for n in dated]
-    conditions += [f"regexp_full_match({quoted(n)}, '-?0\\d+')" for n in whole]
-    conditions += [f"{quoted(n)} IS NOT NULL" for n in words]
-    every = ", ".join(f"coalesce(bool_or({each}), false)" for each in conditions)
-    try:
-        (row,) = connection.sql(f"SELECT {every} FROM {source}").fetchall()
-    except duckdb.Error:
-        return types  # reading the rows shows what is wrong with the file
-    told = iter(row)
-    changed = {name: exact[name] for name in exact if next(told)}
-    changed |= {name: "VARCHAR" for name in (*dated, *whole) if next(told)}
-    changed |= {name: NOTHING for name in words if not next(told)}
-    return tuple((name, changed.get(name, kind)) for name, kind in types)
-
-
-def _never_filled(
-    connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
-) -> list[str]:
-    """Columns of text without a value in the first rows of a CSV file."""
+    # A column without a value is text; most columns of text have one in the first rows.
     words = [name for name, kind in types if kind == "VARCHAR"]
-    if not words:
-        return []
-    some = ", ".join(f"count({quoted(name)})" for name in words)
-    source = f"{Table((file,), types).source[:-1]}, ignore_errors = true)"
+    counts = _first_row(
+        connection, Table((file,), types), [f"count({quoted(n)})" for n in words], 1000
+    )
+    words = [name for name, count in zip(words, counts, strict=False) if not count]
+    changes: list[tuple[str, str, str]] = [
+        (name, NOTHING, f"count({quoted(name)}) = 0") for name in words
+    ]
+    for name, kind in types:
+        column = quoted(name)
+        if kind in _EXACT:
+            differs = f"TRY_CAST({column} AS {_EXACT[kind]}) <> TRY_CAST({column} AS {kind})"
+            changes.append((name, _EXACT[kind], f"bool_or({differs})"))
+        if kind == "DATE" or kind.startswith("TIMESTAMP"):
+            iso = f"regexp_full_match(trim({column}), {text(ISO_TIME)})"
+            changes.append((name, "VARCHAR", f"bool_or(NOT {iso})"))
+        if kind == "BIGINT":
+            changes.append((name, "VARCHAR", f"bool_or(regexp_full_match({column}, '-?0\\d+'))"))
+    as_text = {name: "VARCHAR" for name, _, _ in changes}
+    source = Table((file,), tuple((kinds | as_text).items()))
+    found = _first_row(connection, source, [condition for *_, condition in changes])
+    for (name, kind, _), holds in zip(changes, found, strict=False):
+        kinds[name] = kind if holds else kinds[name]
+    return tuple(kinds.items())
+
+
+def _first_row(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    values: Sequence[str],
+    rows: int | None = None,
+) -> tuple[Any, ...]:
+    """Aggregates of a CSV file, or of its first rows; none where it cannot be read, which reading
+    the rows shows."""
+    if not values:
+        return ()
+    source = f"{table.source[:-1]}, ignore_errors = true)"
+    limit = f" LIMIT {rows}" if rows else ""
     try:
-        (row,) = connection.sql(f"SELECT {some} FROM (FROM {source} LIMIT 1000)").fetchall()
+        (row,) = connection.sql(
+            f"SELECT {', '.join(values)} FROM (FROM {source}{limit})"
+        ).fetchall()
     except duckdb.Error:
-        return []
-    return [name for name, count in zip(words, row, strict=True) if not count]
+        return ()
+    return tuple(row)
 
 
 def first_line(error: Exception) -> str:
     """The first line of a message, cut off where it is long."""
     return f"{str(error).splitlines()[0]:.{_MAX_FAULT}}"
+
+
+def fault_of_line(error: duckdb.Error) -> InputError | None:
+    """Error that names the line of a CSV file which cannot be read; None for other errors."""
+    fault, column = _CSV_FAULT.search(str(error)), _CSV_COLUMN.search(str(error))
+    if fault is None:
+        return None
+    line, detail, file = fault.groups()
+    detail = f"column {column[1]}: {column[2]}" if column else detail
+    return InputError(
+        f"{file}, line {line}: {detail:.{_MAX_FAULT}}; correct the line, or write the log as "
+        "Parquet, where a column states its type"
+    )

@@ -107,15 +107,8 @@ class TypedColumns:
         mapping: LogMapping,
     ) -> TypedLog:
         """The log of these columns, whose rows `connection` has."""
-        return TypedLog(
-            connection,
-            self.tables,
-            self.names,
-            vector_size,
-            self.session_by,
-            mapping.earliest_ms,
-            mapping.where is not None,
-        )
+        how = self.session_by, mapping.earliest_ms, mapping.where is not None
+        return TypedLog(connection, self.tables, self.names, vector_size, *how)
 
 
 def typed_columns(
@@ -135,28 +128,25 @@ def typed_columns(
     """
     columns = _present(tables, mapping, session_by)
     _note_partial(tables, {*columns, *mapping.columns})
-    found = [_select(connection, table, mapping, columns, reward) for table in tables]
-    for name in (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID):
+    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    for name in _IDS:
         if name in columns:
-            _unify_ids(connection, found, name, name in as_text)
+            _unify_ids(connection, selects, name, name in as_text)
     return TypedColumns(
         columns,
-        tuple(
-            ", ".join(f"{sql} AS {name}" for name, (sql, _) in select.values.items())
-            for select in found
-        ),
-        tuple(select.table for select in found),
+        tuple(", ".join(f"{s} AS {name}" for name, (s, _) in x.values.items()) for x in selects),
+        tuple(select.table for select in selects),
         session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
     )
 
 
-def numbered_rows(given: Iterable[tuple[str, str]]) -> str:
+def numbered_rows(selects: Iterable[tuple[str, str]]) -> str:
     """SQL of typed rows with `row`, their position from 1.
 
     Args:
-        given: for each table, values as of `TypedColumns.selects` and the SQL of the table.
+        selects: for each table, values as of `TypedColumns.selects` and the SQL of the table.
     """
-    union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in given)
+    union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in selects)
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
@@ -205,16 +195,13 @@ def _present(
     tables: Sequence[Table], mapping: LogMapping, session_by: str | None
 ) -> tuple[str, ...]:
     """Log columns that every file has, and the required ones, which `bind` reports if missing."""
-    named = {name: value for name, value in mapping.columns.items() if value}
-    switched_off = mapping.columns.keys() - named.keys()
+    mapped = {name for name, value in mapping.columns.items() if value}
     everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
-    present = (set(named) | everywhere) - switched_off
+    present = mapped | (everywhere - mapping.columns.keys())
     if session_by == schema.SESSION_ID:
         present.add(session_by)
-    if schema.ACTION in named or (schema.ACTION in present and schema.ITEM_ID not in present):
-        key = schema.ACTION
-    else:
-        key = schema.ITEM_ID
+    vectors_only = schema.ACTION in present and schema.ITEM_ID not in present
+    key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
     optional = (name for name in OPTIONAL_COLUMNS if name in present)
     return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
 
@@ -225,21 +212,17 @@ def _note_partial(tables: Sequence[Table], settled: set[str]) -> None:
     Args:
         settled: columns that every file has, and those that the mapping names.
     """
-    have = {name: _files_with(tables, name) for name in OPTIONAL_COLUMNS if name not in settled}
-    every = sum(len(table.files) for table in tables)
-    for name, files in have.items():
+    count = sum(len(table.files) for table in tables)
+    for name in [name for name in OPTIONAL_COLUMNS if name not in settled]:
+        having = [t for t in tables if name in {column.casefold() for column in t.columns}]
+        files = [file for table in having for file in table.files]
         if files:
             warnings.warn(
-                f"{name} is excluded: only {len(files)} of {every} files have it ({files[0]}); add "
+                f"{name} is excluded: only {len(files)} of {count} files have it ({files[0]}); add "
                 f"it to the others, or drop it with --column {name}=",
                 InputNote,
                 stacklevel=4,
             )
-
-
-def _files_with(tables: Sequence[Table], name: str) -> list[Path]:
-    named = (t for t in tables if name in {column.casefold() for column in t.columns})
-    return [file for table in named for file in table.files]
 
 
 @dataclass(frozen=True)
@@ -259,76 +242,67 @@ def _select(
     columns: tuple[str, ...],
     reward: str,
 ) -> _Select:
-    given = {name: mapping.columns.get(name) or name for name in columns}
+    texts = {name: mapping.columns.get(name) or name for name in columns}
     bound = {
-        name: bind(connection, table, f"for {name}; map it with --column {name}=...", each)
-        for name, each in given.items()
+        name: bind(connection, table, f"for {name}; map it with --column {name}=...", expression)
+        for name, expression in texts.items()
     }
     # The text of a CSV file is what its identifiers and times are, not what DuckDB makes of it.
     raw = {
-        name: each.columns[0]
-        for name, each in bound.items()
-        if not table.columnar and each.is_column and each.columns[0] in dict(table.types)
+        name: value.columns[0]
+        for name, value in bound.items()
+        if not table.columnar and value.is_column and value.columns[0] in dict(table.types)
         if name in _IDS or (name == schema.TIMESTAMP and mapping.time_format)
     }
     for name, column in raw.items():
         bound[name] = Bound(quoted(raw_name(column)), "VARCHAR", (), False)
-    table, of_reward = _reward(connection, table, reward)
-    read = [*bound.values(), of_reward]
+    table, reward_value = _bind_reward(connection, table, reward)
+    if not (is_number(reward_value.kind) or reward_value.kind in ("BOOLEAN", NOTHING)):
+        remedy = "use a number or truth value, such as try_cast(COLUMN AS DOUBLE) or COLUMN = 'yes'"
+        raise wrong_type(table, "reward", reward, reward_value.kind, remedy)
+    # An error in one row (division by zero, a cast) makes only that row's reward undefined.
+    extra = {schema.REWARD: (f"TRY(CAST({reward_value.sql} AS DOUBLE))", "DOUBLE")}
+    sources = [*bound.values(), reward_value]
     if mapping.where is not None:
         condition = bind(connection, table, "for --where", mapping.where)
         if condition.kind != "BOOLEAN":
-            wanted = "write a condition, e.g. user_id <> 'bot'"
-            raise wrong_type(table, "--where", mapping.where, condition.kind, wanted)
-        read.append(condition)
-    used = (column for each in read for column in each.columns)
-    narrow = table.of(used, raw.values())
+            remedy = "write a condition, e.g. user_id <> 'bot'"
+            raise wrong_type(table, "--where", mapping.where, condition.kind, remedy)
+        extra[WANTED] = (f"coalesce(TRY({condition.sql}), false)", "BOOLEAN")
+        sources.append(condition)
+    narrow = table.of((column for value in sources for column in value.columns), raw.values())
     values = {
-        name: _typed(connection, narrow, name, given[name], each, mapping.time_format)
-        for name, each in bound.items()
+        name: _typed_value(connection, narrow, name, texts[name], value, mapping.time_format)
+        for name, value in bound.items()
     }
-    sql, kind, *_ = of_reward
-    if not (is_number(kind) or kind in ("BOOLEAN", NOTHING)):
-        wanted = "use a number or truth value, such as try_cast(COLUMN AS DOUBLE) or COLUMN = 'yes'"
-        raise wrong_type(table, "reward", reward, kind, wanted)
-    # An error in one row (division by zero, a cast) makes only that row's reward undefined.
-    values[schema.REWARD] = (f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE")
-    if mapping.where is not None:
-        values[WANTED] = (f"coalesce(TRY({condition.sql}), false)", "BOOLEAN")
-    return _Select(narrow, values)
+    return _Select(narrow, {**values, **extra})
 
 
-def _reward(
+def _bind_reward(
     connection: duckdb.DuckDBPyConnection, table: Table, reward: str
 ) -> tuple[Table, Bound]:
     """The reward, and the table in which a column of text without a value has no type."""
     try:
         return table, bind(connection, table, "for the reward", reward)
     except InputError:
-        empty = _empty_words(connection, table, reward)
+        try:
+            names = {name.casefold() for name in columns_of(connection, reward)}
+        except NotScalarError:
+            names = set()
+        texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in names]
+        if not texts:
+            raise
+        counts = ", ".join(f"count({quoted(name)})" for name in texts)
+        (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
+        empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
         if not empty:
             raise
-        kinds = ((name, NOTHING if name in empty else kind) for name, kind in table.types)
-        table = replace(table, types=tuple(kinds))
+        table = replace(table, types=tuple((dict(table.types) | empty).items()))
         return table, bind(connection, table, "for the reward", reward)
 
 
-def _empty_words(connection: duckdb.DuckDBPyConnection, table: Table, given: str) -> set[str]:
-    """Columns of text without a value that an expression reads."""
-    try:
-        read = {name.casefold() for name in columns_of(connection, given)}
-    except NotScalarError:
-        return set()
-    words = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in read]
-    if not words:
-        return set()
-    counts = ", ".join(f"count({quoted(name)})" for name in words)
-    (row,) = connection.sql(f"SELECT {counts} FROM {table.of(words).sql}").fetchall()
-    return {name for name, count in zip(words, row, strict=True) if not count}
-
-
-_NOT_AN_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS DISTINCT FROM x"
-"""SQL of whether a text `x` is not as the integer that it means is written."""
+_IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
+"""SQL of whether a text `x` is as the integer that it means is written."""
 _IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
 _TYPES: Final = {
     **dict.fromkeys(_IDS, "VARCHAR"),
@@ -340,11 +314,11 @@ _TYPES: Final = {
 }
 
 
-def _typed(
+def _typed_value(
     connection: duckdb.DuckDBPyConnection,
     table: Table,
     name: str,
-    given: str,
+    expression: str,
     bound: Bound,
     time_format: str | None,
 ) -> tuple[str, str]:
@@ -356,101 +330,80 @@ def _typed(
     if name in _IDS:
         if is_integer(kind) or kind in ("VARCHAR", "UUID"):
             return sql, kind
-        wanted = f"use integers or text, e.g. --column {name}='({given})::BIGINT'"
+        remedy = f"use integers or text, e.g. --column {name}='({expression})::BIGINT'"
         if is_number(kind):
-            wanted += ", if all are whole numbers of at most 15 digits: others would be rounded"
+            remedy += ", if all are whole numbers of at most 15 digits: others would be rounded"
     elif name == schema.TIMESTAMP:
         if is_number(kind) and time_format is None:
             return f"TRY_CAST(round({sql}) AS BIGINT)", "BIGINT"
         if is_number(kind):
-            digits = f"CAST(TRY_CAST({sql} AS BIGINT) AS VARCHAR)"
-            return text_time(connection, table, digits, given, time_format), "BIGINT"
+            sql, kind = f"CAST(TRY_CAST({sql} AS BIGINT) AS VARCHAR)", "VARCHAR"
+        if kind == "VARCHAR":
+            return text_time(connection, table, sql, expression, time_format), "BIGINT"
         if time := as_timestamp(sql, kind):
             return f"TRY(epoch_ms({time}))", "BIGINT"
-        if kind == "VARCHAR":
-            return text_time(connection, table, sql, given, time_format), "BIGINT"
-        wanted = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
+        remedy = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
     elif name in (schema.ACTION, schema.OBSERVATION):
         if is_vector(kind):
             return f"TRY_CAST({sql} AS FLOAT[])", "FLOAT[]"
-        wanted = f"use a list of numbers, e.g. --column {name}='{given}::FLOAT[]'"
+        remedy = f"use a list of numbers, e.g. --column {name}='{expression}::FLOAT[]'"
     elif name == schema.PROPENSITY:
         if is_number(kind):
             # Numbers that are not above 0 stay, to be counted and refused.
             valid = f"{sql} BETWEEN -{MAX_FLOAT} AND {MAX_FLOAT}"
             return f"TRY(CAST(CASE WHEN {valid} THEN {sql} END AS FLOAT))", "FLOAT"
-        wanted = "use a number above 0"
+        remedy = "use a number above 0"
     else:
         if is_number(kind) or kind == "BOOLEAN":
             return f"coalesce(TRY(CAST({sql} AS DOUBLE)) = 1, false)", "BOOLEAN"
-        wanted = "use a boolean or 0 and 1"
+        remedy = "use a boolean or 0 and 1"
     # A part without any value has whatever type its writer gave it.
     if not connection.sql(f"SELECT 1 FROM {table.sql} WHERE {sql} IS NOT NULL LIMIT 1").fetchall():
         return nothing, NOTHING
-    raise wrong_type(table, name, given, kind, wanted)
+    raise wrong_type(table, name, expression, kind, remedy)
 
 
 def _unify_ids(
-    connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str, as_text: bool
+    connection: duckdb.DuckDBPyConnection, selects: list[_Select], name: str, as_text: bool
 ) -> None:
     """Cast ids to BIGINT if every file has integers that fit, else or with `as_text` to text.
 
     Text of a CSV file is an integer only if it is written as the integer is: 007, 7.0 and 1e1 are
-    not.
+    not. Ids that are written as 7 and as 7.0 are two ids, with a note.
     """
-    whole = not as_text and all(
-        kind == NOTHING
-        or (is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT"))
-        or _are_integers(connection, each.table, sql)
-        for each in found
-        for sql, kind in [each.values[name]]
-    )
-    if not whole:
-        _note_decimals(connection, found, name)
-    for each in found:
-        sql, _ = each.values[name]
+    whole, some_whole, with_decimals = True, False, None
+    for select in selects:
+        sql, kind = select.values[name]
+        csv_type = _csv_type(select.table, sql)
+        all_integers = is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT")
+        if csv_type is not None:
+            with explained(connection, (select.table,), select.table.files[0].parent):
+                ((any_integer, all_integers),) = connection.sql(
+                    f"SELECT coalesce(bool_or({_IS_INTEGER}), false), "
+                    f"coalesce(bool_and({_IS_INTEGER}), true) "
+                    f"FROM (SELECT {sql} AS x FROM {select.table.sql}) WHERE x IS NOT NULL"
+                ).fetchall()
+            some_whole |= is_integer(csv_type) or (csv_type == "DOUBLE" and any_integer)
+        some_whole |= is_integer(kind)
+        if (csv_type or kind) == "DOUBLE":
+            with_decimals = with_decimals or select.table
+        whole &= kind == NOTHING or all_integers
+    whole &= not as_text
+    if not whole and some_whole and with_decimals is not None:
+        warnings.warn(
+            f"{name} is written as whole numbers and, in {with_decimals.files[0]}, with decimals: "
+            f"7 and 7.0 are two ids; to make them one, say --column {name}='COLUMN::BIGINT'",
+            InputNote,
+            stacklevel=5,
+        )
+    for select in selects:
+        sql, _ = select.values[name]
         # Text without a character is missing, as in a CSV file.
         typed = f"CAST({sql} AS BIGINT)" if whole else f"nullif(CAST({sql} AS VARCHAR), '')"
-        each.values[name] = (typed, "")
-
-
-def _are_integers(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> bool:
-    """Whether a column is text of a CSV file, and all of it is written as integers are."""
-    if _csv_type(table, sql) is None:
-        return False
-    with explained(connection, (table,), table.files[0].parent):
-        ((others,),) = connection.sql(
-            f"SELECT bool_or({_NOT_AN_INTEGER}) FROM (SELECT {sql} AS x FROM {table.sql}) "
-            "WHERE x IS NOT NULL"
-        ).fetchall()
-    return not others
+        select.values[name] = (typed, "")
 
 
 def _csv_type(table: Table, sql: str) -> str | None:
     """The type that DuckDB inferred for a column whose text is read; None for other columns."""
     kinds = dict(table.types)
     return next((kinds[name] for name in table.raw if quoted(raw_name(name)) == sql), None)
-
-
-def _note_decimals(connection: duckdb.DuckDBPyConnection, found: list[_Select], name: str) -> None:
-    """Warn of ids that are written as 7 and as 7.0, which are two ids."""
-    decimal: list[Table] = []
-    whole = False
-    for each in found:
-        sql, kind = each.values[name]
-        kind = _csv_type(each.table, sql) or kind
-        whole |= is_integer(kind)
-        if kind == "DOUBLE":
-            decimal.append(each.table)
-            ((some,),) = connection.sql(
-                f"SELECT coalesce(bool_or(NOT ({_NOT_AN_INTEGER})), false) "
-                f"FROM (SELECT {sql} AS x FROM {each.table.sql})"
-            ).fetchall()
-            whole |= some
-    if whole and decimal:
-        warnings.warn(
-            f"{name} is written as whole numbers and, in {decimal[0].files[0]}, with decimals: 7 "
-            f"and 7.0 are two ids; to make them one, say --column {name}='COLUMN::BIGINT'",
-            InputNote,
-            stacklevel=5,
-        )

@@ -13,10 +13,10 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import Sessions
 from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import mixed
 from ucfrec.recommending.histories import Histories
@@ -275,7 +275,7 @@ def sessions_of(
         seen = torch.from_numpy(np.delete(logged, trained.dropped, axis=1))
         observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
     rows = histories.owner, histories.item_ids, histories.rewards
-    return Sessions.of_rows(*rows, users, length, observations)
+    return Sessions.from_rows(*rows, users, length, observations)
 
 
 def left_out_of(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:

@@ -124,10 +124,9 @@ def pasted_history(text: str) -> pd.DataFrame:
 
 def _session(trained: TrainedPolicy, user: Histories) -> Sessions:
     """The user's latest session, before the step that is decided."""
-    numbered = replace(user, item_ids=trained.items.numbers(user.item_ids))
+    numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)
-    users = trained.users.numbers(user.users)
-    return sessions_of(trained, latest, users, trained.scorer().length)
+    return sessions_of(trained, latest, trained.scorer().length)
 
 
 def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:

@@ -11,8 +11,8 @@ from tests.support.served import FULL, histories, learn_tastes, trained_run
 from ucfrec.acting import item_index
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
-from ucfrec.acting.sessions import Sessions
 from ucfrec.commands.cli import main
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.histories import histories_of_frame
@@ -44,7 +44,7 @@ def sessions(trained: TrainedPolicy, rule: DecisionRule, count: int = 40) -> Ses
 
 def some_left_out(sessions: Sessions) -> tuple[Tensor, Tensor]:
     rows = torch.arange(len(sessions.users)).repeat_interleave(3)
-    return rows, sessions.items[:, -3:].flatten()
+    return rows, sessions.actions[:, -3:].flatten()
 
 
 @pytest.mark.parametrize("rule", RULES, ids=["plain", "full", "run"])

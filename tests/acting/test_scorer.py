@@ -12,18 +12,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, ITEMS, VECTORS, B, K, build, random_windows
+from tests.policies.test_ucf import (
+    CATALOG,
+    ITEMS,
+    VECTORS,
+    B,
+    K,
+    build,
+    random_windows,
+    sessions_of,
+)
 from tests.support.replay import replayed
 from tests.support.served import boredom, learn_tastes
 from tests.support.tagged import ITEMS as MANY
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
-from ucfrec.acting.sessions import History, seen_before
+from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
 from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.sessions import seen_before
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -92,13 +100,6 @@ def trained(folder: Path, request: pytest.FixtureRequest) -> TrainedPolicy:
 # Against a naive computation, session by session and item by item.
 
 
-def history_of(windows: Windows, **parts: Any) -> History:
-    """What is known of sessions whose windows show all of it."""
-    shown = Shown.before_last(windows)
-    collected = torch.tensor([0.0, 1.0, 2.5]).double()
-    return replace(History(windows, collected, torch.tensor([2, 0, -1]), shown), **parts)
-
-
 def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
     """A policy of random weights with a reward model of random effects."""
     torch.manual_seed(4)
@@ -124,19 +125,20 @@ def scorer_of(name: str, tagged: bool, rule: DecisionRule) -> Scorer:
     return Scorer(policy.eval(), rule, states, ReturnToGo(), model, boredom(model.likeness))
 
 
-def naive_scores(scorer: Scorer, history: History, excluded: Tensor) -> Tensor:
+def naive_scores(scorer: Scorer, windows: Windows, excluded: Tensor) -> Tensor:
     """What `Scorer.scores` should be, without a product over all items."""
-    rule, windows, shown = scorer.rule, history.windows, history.shown
+    rule, sessions = scorer.rule, sessions_of(windows)
+    shown = sessions.shown
     assert scorer.reward_model is not None
     assert rule.target is not None
-    targets = (rule.target - history.collected).clamp(min=rule.minimum_target)
+    targets = (rule.target - sessions.collected).clamp(min=rule.minimum_target)
     returns_to_go = ReturnToGo().before(targets, windows.rewards).masked_fill(~windows.mask, 0.0)
     with torch.no_grad():
         outputs = scorer.policy.act(replace(windows, returns_to_go=returns_to_go))
         scores = rule.policy_weight * outputs
         for item in range(ITEMS):
             every = torch.full((B,), item)
-            score = scorer.reward_model.score(windows.states[:, -1], shown, history.users, every)
+            score = scorer.reward_model.score(windows.states[:, -1], shown, sessions.users, every)
             if rule.lookahead:
                 assert scorer.session_end is not None
                 score = scorer.reward_model.expected(score)
@@ -188,68 +190,52 @@ def test_scores_are_those_of_a_naive_computation(name: str, tagged: bool, rule: 
             scorer_of(name, tagged, NAIVE[rule])
         return
     scorer, windows = scorer_of(name, tagged, NAIVE[rule]), random_windows(CATALOG)
-    history = history_of(windows)
     # The first session was shown and liked one tag only, and may only be shown this one.
-    shown = Shown(history.shown.items.clone(), history.shown.rewards.clone())
-    shown.items[0, :2], shown.rewards[0, :2] = 4, 1.0
     excluded = torch.zeros(B, ITEMS, dtype=torch.bool)
     excluded[2, 3], excluded[0] = True, TAGS[:, 0] != TAGS[4, 0]
     windows = replace(windows, actions=windows.actions.clone(), rewards=windows.rewards.clone())
     windows.actions[0, -3:-1], windows.rewards[0, -3:-1] = 4, 1.0
-    history = history_of(windows, shown=shown)
+    sessions = sessions_of(windows)
     before = {key: value.clone() for key, value in scorer.policy.state_dict().items()}
-    found = scorer.scores(history, excluded=excluded)
-    expected = naive_scores(scorer, history, excluded)
+    found = scorer.scores(sessions, excluded=excluded)
+    expected = naive_scores(scorer, windows, excluded)
     assert torch.equal(found.isneginf(), expected.isneginf())
     torch.testing.assert_close(
         found.log_softmax(-1), expected.log_softmax(-1), rtol=1e-4, atol=1e-4
     )
     # One session alone, and some items alone, have the same scores.
-    alone = scorer.scores(history.at(slice(1, 2)), excluded=excluded[1:2])
+    alone = scorer.scores(sessions.at(slice(1, 2)), excluded=excluded[1:2])
     torch.testing.assert_close(alone[0], found[1], rtol=1e-4, atol=1e-4)
     for key, value in scorer.policy.state_dict().items():
         assert torch.equal(value, before[key])
 
 
-@pytest.mark.parametrize("name", ["ucf", "dt", "dc", "lsdt"])
-def test_the_steps_own_action_and_reward_are_not_read(name: str) -> None:
-    scorer = scorer_of(name, True, DecisionRule(3.0, reward_weight=1.0, tag_window=2, tag_run=1))
-    windows = random_windows(CATALOG)
-    actions, rewards = windows.actions.clone(), windows.rewards.clone()
-    actions[:, -1], rewards[:, -1] = (actions[:, -1] + 1) % ITEMS, torch.nan
-    logged = torch.rand(windows.mask.shape)
-    changed = replace(windows, actions=actions, rewards=rewards, returns_to_go=logged)
-    before, after = (scorer.scores(history_of(each)) for each in (windows, changed))
-    assert torch.equal(before, after)
-    earlier = windows.actions.clone()
-    earlier[:, -2] = (earlier[:, -2] + 1) % ITEMS
-    assert not torch.equal(before, scorer.scores(history_of(replace(windows, actions=earlier))))
-
-
 def test_all_may_be_left_out_where_it_is_said_and_no_score_may_be_nan() -> None:
-    scorer, history = scorer_of("dt", True, DecisionRule(3.0)), history_of(random_windows(CATALOG))
+    scorer, sessions = (
+        scorer_of("dt", True, DecisionRule(3.0)),
+        sessions_of(random_windows(CATALOG)),
+    )
     excluded = torch.zeros(B, ITEMS, dtype=torch.bool)
     excluded[1] = True
     with pytest.raises(InputError, match="in 1 of 3 decisions every item is excluded"):
-        scorer.scores(history, excluded=excluded)
-    assert scorer.scores(history, excluded=excluded, empty=True)[1].isneginf().all()
+        scorer.scores(sessions, excluded=excluded)
+    assert scorer.scores(sessions, excluded=excluded, empty=True)[1].isneginf().all()
     excluded[1, 4] = False
-    assert scorer.scores(history, excluded=excluded)[1].argmax() == 4
+    assert scorer.scores(sessions, excluded=excluded)[1].argmax() == 4
     scorer.policy.head.bias.data[0] = torch.nan  # type: ignore[union-attr,index]
     with pytest.raises(InputError, match="in 3 of 3 decisions scores are not numbers"):
-        Scorer(scorer.policy, scorer.rule, scorer.states).scores(history)
+        Scorer(scorer.policy, scorer.rule, scorer.states).scores(sessions)
 
 
 def test_vectors_are_predicted_at_the_target() -> None:
     windows, policy = random_windows(VECTORS), build("dt", VECTORS)
-    nothing = Shown(torch.empty(B, 0, dtype=torch.int64), torch.empty(B, 0))
-    history = replace(history_of(random_windows(CATALOG)), windows=windows, shown=nothing)
-    found = Scorer(policy, DecisionRule(2.0)).act(history)
-    targets = ReturnToGo().before(2.0 - history.collected, windows.rewards) * windows.mask
+    sessions = sessions_of(windows)
+    found = Scorer(policy, DecisionRule(2.0)).act(sessions)
+    targets = ReturnToGo().before(2.0 - sessions.collected, windows.rewards) * windows.mask
     with torch.no_grad():
         torch.testing.assert_close(found, policy.act(replace(windows, returns_to_go=targets)))
         with pytest.raises(InputError, match=r"--set policy\.max_return=true"):
-            Scorer(policy, DecisionRule(None)).act(history)
+            Scorer(policy, DecisionRule(None)).act(sessions)
 
 
 def test_a_rule_needs_what_it_uses() -> None:
@@ -270,11 +256,11 @@ def test_a_rule_needs_what_it_uses() -> None:
 
 
 def test_what_is_kept_of_a_run_changes_with_its_weights(trained: TrainedPolicy) -> None:
-    history = logged_history(trained.scorer(), *some_steps(trained))[0]
-    before = trained.scorer().scores(history)
+    sessions = sessions_before(trained.scorer(), *some_steps(trained))
+    before = trained.scorer().scores(sessions)
     with torch.no_grad():
         trained.policy.head.bias[4] += 1.5  # type: ignore[index,operator]
-    after = trained.scorer().scores(history)
+    after = trained.scorer().scores(sessions)
     torch.testing.assert_close(after[:, 4] - before[:, 4], torch.full((3,), 1.5))
 
 
@@ -303,8 +289,8 @@ def test_logged_sessions_are_read_as_far_back_as_a_rule_looks(
         assert scorer.policy.config.context < 10
         logged = EpisodeStore.open(folder / "store")
         at = logged, np.array([0]), logged.lengths[:1] - 1
-        assert logged_history(scorer, *at)[0].shown.items.shape == (1, 10)
-        assert logged_history(trained.scorer(rule), *at)[0].shown.items.shape == (1, MEMORY)
+        assert sessions_before(scorer, *at).shown.items.shape == (1, 10)
+        assert sessions_before(trained.scorer(rule), *at).shown.items.shape == (1, MEMORY)
 
 
 @pytest.mark.parametrize(

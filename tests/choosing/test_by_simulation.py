@@ -16,7 +16,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.choosing.by_simulation import RuleSearch, _warning, choose_by_simulation
 from ucfrec.choosing.candidates import near
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
-from ucfrec.choosing.many_rules import Sessions
+from ucfrec.choosing.many_rules import Outcomes
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -163,13 +163,13 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
     nothing = np.zeros(0, dtype=np.int64)
     for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
-        search._sessions[each] = Sessions(returns, nothing, nothing)
+        search._sessions[each] = Outcomes(returns, nothing, nothing)
     low, high = (
         replace(each, value=float(search._sessions[each.rule].returns.mean()), error=3.2)
         for each in found
     )
     assert search.level([low, high]) == [high]
-    search._sessions[low.rule] = Sessions(np.roll(luck, 1), nothing, nothing)
+    search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
 
 

@@ -21,7 +21,8 @@ from tests.support.episodes import (
     state_before,
     write_store,
 )
-from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates, SessionStates
+from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
@@ -32,7 +33,7 @@ lengths_of_episodes = st.lists(st.integers(1, 12), min_size=1, max_size=7)
 def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]:
     """(T, S) states of each episode, played `rows` at a time as `rollout` plays them: row i plays
     episodes i, i + rows, …, and starts the next while the others are under way."""
-    sessions = SessionStates(states, rows)
+    sessions = Sessions.begun(rows, states.window)
     seen: list[list[Tensor]] = [[] for _ in episodes]
     playing, step = list(range(rows)), [0] * rows
     sessions.begin(np.arange(rows))
@@ -47,10 +48,10 @@ def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]
             sessions.users[row] = logged.user
             observations[row] = torch.from_numpy(logged.observations[step[row]])
             items[row], rewards[row] = logged.items[step[row]], logged.rewards[step[row]]
-        current = sessions.current(observations)
+        current = sessions.latest_states(states, observations)
         for row in live:
             seen[playing[row]].append(current[row])
-        sessions.record(torch.from_numpy(items), torch.from_numpy(rewards))
+        sessions = sessions.with_step(torch.from_numpy(items), torch.from_numpy(rewards))
         ended = []
         for row in live:
             step[row] += 1
@@ -96,11 +97,11 @@ def test_bits_do_not_depend_on_the_batch(batch: int) -> None:
     """Vectorised kernels end in a remainder; no row may notice where it stands."""
     generator = torch.Generator().manual_seed(0)
     states = some_states(users=2, window=4)
-    items = torch.randint(-1, N_ITEMS, (1000, 4), generator=generator)
-    rewards = torch.randn(1000, 4, generator=generator)
-    steps = torch.randint(5000, (1000,), generator=generator)
+    items = torch.randint(-1, N_ITEMS, (1000, 6), generator=generator)
+    rewards = torch.randn(1000, 6, generator=generator)
+    steps = torch.randint(5000, (1000, 3), generator=generator)
     users = torch.randint(-1, 5, (1000,), generator=generator)
-    seen = torch.randn(1000, 3, generator=generator)
+    seen = torch.randn(1000, 3, 3, generator=generator)
     whole = states.build(items, rewards, steps, users, seen)
     parts = [
         states.build(items[i], rewards[i], steps[i], users[i], seen[i])
@@ -141,17 +142,21 @@ def test_nothing_of_a_step_or_after_enters_its_state(
     assert torch.equal(played[0], seen[0][0, -1])
 
 
+def after(states: ItemStates, items: Tensor, rewards: Tensor) -> Tensor:
+    """(N, S) after one item each."""
+    sessions = Sessions.begun(len(items), states.window)
+    assert not sessions.latest_states(states, torch.zeros(len(items), 0)).any()
+    sessions = sessions.with_step(items, rewards)
+    return sessions.latest_states(states, torch.zeros(len(items), 0))
+
+
 def test_what_was_just_shown_and_earned_does_enter() -> None:
     states = some_states()
-    sessions = SessionStates(states, 3)
-    fresh = sessions.current(torch.zeros(3, 0))
-    assert not fresh.any()
-    sessions.record(torch.tensor([4, 4, 5]), torch.tensor([1.0, 2.0, 1.0]))
-    after = sessions.current(torch.zeros(3, 0))
-    assert torch.equal(after[:, :DIM], states.embeddings[[4, 4, 5]])
-    assert torch.equal(after[:, 2 * DIM : 3 * DIM], states.embeddings[[4, 4, 5]])
-    assert after[:, 3 * DIM].tolist() == [0.5, 0.75, 0.5]  # of rewards from −1 to 3
-    assert torch.equal(after[:, 3 * DIM + 1], torch.full((3,), 2.0).log())
+    seen = after(states, torch.tensor([4, 4, 5]), torch.tensor([1.0, 2.0, 1.0]))
+    assert torch.equal(seen[:, :DIM], states.embeddings[[4, 4, 5]])
+    assert torch.equal(seen[:, 2 * DIM : 3 * DIM], states.embeddings[[4, 4, 5]])
+    assert seen[:, 3 * DIM].tolist() == [0.5, 0.75, 0.5]  # of rewards from −1 to 3
+    assert torch.equal(seen[:, 3 * DIM + 1], torch.full((3,), 2.0).log())
 
 
 @given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 99))
@@ -167,9 +172,7 @@ def test_acting_follows_the_documented_formula(length: int, window: int, seed: i
 
 def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
     states = some_states(low=0.0, high=1.0)
-    sessions = SessionStates(states, 4)
-    sessions.record(torch.tensor([1, 1, 1, 1]), torch.tensor([-7.0, 0.0, 1.0, 99.0]))
-    seen = sessions.current(torch.zeros(4, 0))
+    seen = after(states, torch.tensor([1, 1, 1, 1]), torch.tensor([-7.0, 0.0, 1.0, 99.0]))
     assert torch.equal(seen[0], seen[1])
     assert torch.equal(seen[2], seen[3])
     assert not seen[0, DIM : 2 * DIM].any()
@@ -177,35 +180,30 @@ def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
 
 
 def test_an_unknown_user_has_zero_features() -> None:
-    states = some_states(users=2)
-    sessions = SessionStates(states, 3)
+    states, sessions = some_states(users=2), Sessions.begun(3, 10)
     assert sessions.users.tolist() == [-1, -1, -1]
     sessions.users[1] = 4
-    seen = sessions.current(torch.zeros(3, 0))
+    seen = sessions.latest_states(states, torch.zeros(3, 0))
     features = slice(states.size - 2, states.size)
     assert not seen[[0, 2], features].any()
     assert torch.equal(seen[1, features], states.user_features[4])
 
 
 def test_a_session_that_begins_afresh_forgets() -> None:
-    sessions = SessionStates(some_states(), 2)
+    states, sessions = some_states(), Sessions.begun(2, 10)
     for _ in range(3):
-        sessions.record(torch.tensor([1, 2]), torch.tensor([1.0, 1.0]))
-    before = sessions.current(torch.zeros(2, 0))
+        sessions = sessions.with_step(torch.tensor([1, 2]), torch.tensor([1.0, 1.0]))
+    before = sessions.latest_states(states, torch.zeros(2, 0))
     sessions.begin(np.array([1]))
-    after = sessions.current(torch.zeros(2, 0))
-    assert torch.equal(after[0], before[0])
-    assert not after[1].any()
+    seen = sessions.latest_states(states, torch.zeros(2, 0))
+    assert torch.equal(seen[0], before[0])
+    assert not seen[1].any()
+    assert sessions.collected.tolist() == [3.0, 0.0]
 
 
 def test_rewards_of_another_type_give_the_same_states() -> None:
-    states = some_states()
-    rewards = torch.rand(4, dtype=torch.float64)
-    seen = []
-    for given_rewards in (rewards, rewards.float()):
-        sessions = SessionStates(states, 4)
-        sessions.record(torch.arange(4), given_rewards)
-        seen.append(sessions.current(torch.zeros(4, 0)))
+    states, rewards = some_states(), torch.rand(4, dtype=torch.float64)
+    seen = [after(states, torch.arange(4), values) for values in (rewards, rewards.float())]
     assert seen[0].dtype == torch.float32
     assert torch.equal(seen[0], seen[1])
 
@@ -223,28 +221,32 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (2.0, 1.0), (float("nan"), 1.0)])
-def test_rewards_that_tell_nothing_apart_are_refused(low: float, high: float) -> None:
-    with pytest.raises(InputError, match="reward_low must be below reward_high"):
-        some_states(low=low, high=high)
-
-
 @pytest.mark.parametrize(
-    ("tags", "message"),
+    ("changed", "message"),
     [
-        (torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64), "at most 16"),
-        (torch.zeros(N_ITEMS, 2), "whole numbers"),
-        (torch.full((N_ITEMS, 1), N_ITEMS), "are not numbers from -1 to"),
-        (torch.full((N_ITEMS, 1), -2), "are not numbers from -1 to"),
-        (torch.zeros(N_ITEMS - 1, 1, dtype=torch.int64), "one row per item"),
-        (torch.zeros(N_ITEMS, dtype=torch.int64), "one row per item"),
+        ({"tags": torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64)}, "more than 16 tags"),
+        ({"tags": torch.zeros(N_ITEMS, 2)}, "integers"),
+        ({"tags": torch.full((N_ITEMS, 1), N_ITEMS)}, "are not numbers from -1 to"),
+        ({"tags": torch.full((N_ITEMS, 1), -2)}, "are not numbers from -1 to"),
+        ({"tags": torch.zeros(N_ITEMS - 1, 1, dtype=torch.int64)}, "one row per item"),
+        ({"tags": torch.zeros(N_ITEMS, dtype=torch.int64)}, "one row per item"),
+        ({"reward_low": 3.0}, "reward_low must be below reward_high"),
+        ({"reward_high": float("nan")}, "reward_low must be below reward_high"),
+        ({"window": 2.0}, "window of item states is"),
+        ({"window": 10**9}, "window of item states is"),
+        ({"decay": "x"}, "decay of item states is"),
+        ({"decay": float("nan")}, "decay of item states is"),
     ],
 )
-def test_tags_of_strangers_are_bounded(tmp_path: Path, tags: Tensor, message: str) -> None:
+def test_what_strangers_wrote_is_checked(
+    tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
     path = tmp_path / "states.safetensors"
     some_states().save(path)
     tensors, about = load_tensors(path)
-    save_tensors(path, {**tensors, "tags": tags}, about)
+    tags = {name: changed[name] for name in changed if name == "tags"}
+    numbers = {name: changed[name] for name in changed if name != "tags"}
+    save_tensors(path, {**tensors, **tags}, {**about, **numbers})
     with pytest.raises(InputError, match=message):
         ItemStates.load(path)
 
@@ -254,18 +256,6 @@ def test_a_catalogue_has_at_most_a_thousand_tags() -> None:
     replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS - 1))
     with pytest.raises(InputError, match="are not numbers from -1 to 999"):
         replace(plain, tags=torch.full((2000, 1), DISTINCT_TAGS))
-
-
-@pytest.mark.parametrize(
-    "numbers", [{"window": 2.0}, {"window": 10**9}, {"decay": "x"}, {"decay": float("nan")}]
-)
-def test_numbers_of_strangers_are_checked(tmp_path: Path, numbers: dict[str, Any]) -> None:
-    path = tmp_path / "states.safetensors"
-    some_states().save(path)
-    tensors, about = load_tensors(path)
-    save_tensors(path, tensors, {**about, **numbers})
-    with pytest.raises(InputError, match=f"{next(iter(numbers))} of item states is"):
-        ItemStates.load(path)
 
 
 def test_a_damaged_file_of_states_is_named(tmp_path: Path) -> None:

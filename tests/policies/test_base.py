@@ -8,11 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, ITEMS, SMALL, VECTORS, K, other, random_windows
+from tests.policies.test_ucf import (
+    CATALOG,
+    ITEMS,
+    SMALL,
+    VECTORS,
+    K,
+    other,
+    random_windows,
+    sessions_of,
+)
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import History
-from ucfrec.episodes.exposure import Exposed, Shown
+from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW, clip_gradients
@@ -68,11 +76,9 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
     assert {"action_loss", "value_loss"} <= scalars.keys()
     assert scalars["value_loss"] < before["value_loss"]
     assert torch.isfinite(policy.action_loss(windows))
-    nobody, collected = torch.full((3,), -1), torch.tensor([0.0, 1.0, 2.0]).double()
-    nothing = Shown(torch.empty(3, 0, dtype=torch.int64), torch.empty(3, 0))
-    history = History(windows, collected, nobody, nothing)
+    sessions = sessions_of(windows)
     for rule in (DecisionRule(None), DecisionRule(2.0)):
-        assert torch.isfinite(Scorer(policy, rule).act(history)).all()
+        assert torch.isfinite(Scorer(policy, rule).act(sessions)).all()
     if sizes["items"]:
         term = policy.head.exposure  # type: ignore[union-attr]
         moved = torch.cat([parameter.flatten() for parameter in term.parameters()])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy, interleave
@@ -47,6 +48,21 @@ def random_windows(sizes: dict[str, int], padding: tuple[int, ...] = (0, 2, 5)) 
         returns_to_go=torch.rand(B, K, generator=generator),
         timesteps=(torch.arange(K) - torch.tensor(padding).unsqueeze(1)).clamp(min=0),
         mask=mask,
+    )
+
+
+def sessions_of(windows: Windows, users: tuple[int, ...] = (2, 0, -1)) -> Sessions:
+    """Sessions of which windows show all."""
+    actions, mask = windows.actions[:, :-1], windows.mask[:, :-1]
+    if actions.ndim == 2:
+        actions = actions.masked_fill(~mask, -1)
+    return Sessions(
+        actions,
+        windows.rewards[:, :-1] * mask,
+        windows.timesteps[:, -1],
+        torch.tensor([0.0, 1.0, 2.5]).double(),
+        torch.tensor(users),
+        states=windows.states,
     )
 
 

@@ -231,7 +231,8 @@ def test_a_reward_that_is_computed_from_a_column_of_that_name_is_computed() -> N
 def test_an_observation_that_is_infinite_in_single_precision_is_refused() -> None:
     reader = HistoryReader("last", False, 2, RowRewards(Expression("reward", "run.json")))
     row = {"item_id": 1, "timestamp": 1.7e12, "reward": 0, "observation": [1, -2.5]}
-    assert reader.read([Row(**row)], 1).observation == [1.0, -2.5]  # type: ignore[typeddict-item]
+    (seen,) = reader.read([Row(**row)], 1).observations  # type: ignore[typeddict-item]
+    assert seen.tolist() == [1.0, -2.5]
     with pytest.raises(InputError, match="numbers beyond"):
         reader.read([Row(**{**row, "observation": [1, -1e39]})], 1)  # type: ignore[typeddict-item]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ucfrec.acting.item_product import multipliers
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import Sessions
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
 
 _FEWEST: Final = 1_000
@@ -99,7 +99,7 @@ class ItemIndex:
             of_row = torch.tensor([row])
             own = left_out[1][left_out[0] == row]
             exact = self._scorer.scores(
-                sessions.rows(of_row), (torch.zeros_like(own), own), excluded, empty=True
+                sessions.at(of_row), (torch.zeros_like(own), own), excluded, empty=True
             ).topk(k)
             if sampled[row]:
                 self._compare(items[row], scores[row], exact.indices[0], exact.values[0])
@@ -125,12 +125,13 @@ class ItemIndex:
         k: int,
     ) -> tuple[Tensor, Tensor]:
         """The best k of the candidates and their scores, (B, k) each."""
-        scorer, factors, n_items = self._scorer, self._scorer.factors(sessions), self._index.ntotal
-        many = min(n_items, 4 * k + _MORE)
-        products, found = self._index.search(multipliers(factors), many)
-        items, missing = torch.from_numpy(found), torch.from_numpy(found < 0)
+        scorer, n_items = self._scorer, self._index.ntotal
+        query = scorer.query(sessions)
+        part, many = scorer.weighted(query), min(n_items, 4 * k + _MORE)
+        products, numbers = self._index.search(multipliers(part), many)
+        items, missing = torch.from_numpy(numbers), torch.from_numpy(numbers < 0)
         items = items.clamp(min=0)
-        scores = scorer.of_items(sessions, factors, items, torch.from_numpy(products))
+        scores = scorer.scores_of_some(query, part, items, torch.from_numpy(products))
         if excluded is not None:
             missing |= excluded[items]
         # Pairs of a row and an item are single numbers.

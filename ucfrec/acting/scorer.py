@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.item_product import Factors, ItemProduct, Part
-from ucfrec.acting.sessions import History, Sessions, seen_before
+from ucfrec.acting.item_product import ItemProduct, Part
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.user_model.reward import ItemRewardModel
@@ -37,6 +38,9 @@ size."""
 class Query(NamedTuple):
     """What B sessions ask of all items; the rule's weights do not matter yet."""
 
+    sessions: Sessions
+    states: Tensor
+    """(B, S) before the steps to decide."""
     items: Tensor
     """(B, N) int64 items shown before, −1 for none."""
     policy: Part | None
@@ -50,13 +54,16 @@ class Query(NamedTuple):
 
     def at(self, rows: slice) -> "Query":
         """The sessions with the given numbers."""
-        items, policy, outputs, features, model = self
+        parts = (None if part is None else part.at(rows) for part in (self.policy, self.model))
+        policy, model = parts
         return Query(
-            items[rows],
-            None if policy is None else Part(*(each[rows] for each in policy)),
-            None if outputs is None else outputs[rows],
-            None if features is None else features[rows],
-            None if model is None else Part(*(each[rows] for each in model)),
+            self.sessions.at(rows),
+            self.states[rows],
+            self.items[rows],
+            policy,
+            None if self.outputs is None else self.outputs[rows],
+            None if self.features is None else self.features[rows],
+            model,
         )
 
 
@@ -174,56 +181,57 @@ class Scorer:
         return self._items.vectors(bool(self.rule.reward_weight))
 
     @torch.no_grad()
-    def with_target(self, history: History) -> History:
-        """The history with the returns-to-go that the rule sets as target."""
-        windows, best = history.windows, None
+    def windows(self, sessions: Sessions) -> Windows:
+        """What the policy reads of sessions, with the returns-to-go that the rule sets as target.
+
+        Args:
+            sessions: as of `scores`, or of vector actions with states.
+        """
+        best, windows = None, sessions.windows(self.states, self.policy.config.context)
         if self.rule.target is None:
             best = self.policy.max_return(windows.to(self.policy.state_mean.device)).cpu()
-        targets = self.rule.target_returns(self.returns, history.collected, best)
+        targets = self.rule.target_returns(self.returns, sessions.collected, best)
         returns_to_go = self.returns.before(targets, windows.rewards)
-        returns_to_go = returns_to_go.masked_fill(~windows.mask, 0.0)
-        return replace(history, windows=replace(windows, returns_to_go=returns_to_go))
+        return replace(windows, returns_to_go=returns_to_go.masked_fill(~windows.mask, 0.0))
 
     @torch.no_grad()
-    def act(self, history: History) -> Tensor:
+    def act(self, sessions: Sessions) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        windows = self.with_target(history).windows
-        return self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
+        return self.policy.act(self.windows(sessions).to(self.policy.state_mean.device)).cpu()
 
     @torch.no_grad()
-    def query(self, history: History, rewards: bool | None = None) -> Query:
+    def query(
+        self, sessions: Sessions, windows: Windows | None = None, rewards: bool | None = None
+    ) -> Query:
         """All of the scores that does not grow with the items, before it is weighted.
 
         Args:
-            history: of `with_target`.
+            windows: of `windows`; None to make them.
             rewards: whether it is also used under rules with a reward weight; None if this one
                 has one.
         """
+        windows = self.windows(sessions) if windows is None else windows
         rewards = bool(self.rule.reward_weight) if rewards is None else rewards
         outputs = features = policy = None
-        if self._items.own:
-            windows = history.windows.to(self.policy.state_mean.device)
-            outputs = self.policy.act(windows).cpu()
+        if self.has_factors:
+            features, policy = self._items.policy_part(windows, sessions.shown)
         else:
-            features, policy = self._items.of_policy(history)
-        model = self._items.of_model(history) if rewards else None
-        return Query(self._items.shown(history.shown), policy, outputs, features, model)
+            outputs = self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
+        # A view of several windows would keep all of their states.
+        states = windows.states[:, -1].contiguous()
+        model = self._items.model_part(sessions, states) if rewards else None
+        items = self._items.shown(sessions.shown)
+        return Query(sessions, states, items, policy, outputs, features, model)
 
-    def weighted(self, query: Query) -> Factors:
+    def weighted(self, query: Query) -> Part:
         """The parts of a query, weighted as the rule says."""
-        model = query.model if self.rule.reward_weight else None
-        return self._items.factors(query.items, query.policy, model, self.rule.reward_weight)
-
-    @torch.no_grad()
-    def factors(self, sessions: Sessions) -> Factors:
-        """What sessions multiply the items' vectors with; see `scores`."""
-        assert self.states is not None
-        history = sessions.history(self.states, self.policy.config.context)
-        return self.weighted(self.query(self.with_target(history)))
+        weight = self.rule.reward_weight
+        model = query.model if weight else None
+        return self._items.weighted(query.items, query.policy, model, weight)
 
     def scores(
         self,
-        given: History | Sessions,
+        sessions: Sessions,
         left_out: tuple[Tensor, Tensor] | None = None,
         excluded: Tensor | None = None,
         *,
@@ -233,7 +241,7 @@ class Scorer:
         out.
 
         Args:
-            given: B sessions, of at least `reach` items or `length` items each.
+            sessions: of at least `reach` items with their states, or of `length` items.
             left_out: rows (N,) and items (N,) of what may not be shown.
             excluded: (B, n_items) or (n_items,) bool, what may not be shown.
             empty: whether all items of a row may be excluded.
@@ -241,49 +249,42 @@ class Scorer:
         Raises:
             InputError: no item is left in some row, or the scores of some row are NaN.
         """
-        serving = isinstance(given, Sessions) and self.is_product
+        exporting = torch.compiler.is_exporting()
+        serving = sessions.states is None and self.is_product and not exporting
         # Policies and fits may keep tensors, which those of inference mode would spoil for them.
-        with (
-            torch.inference_mode()
-            if serving and not torch.compiler.is_exporting()
-            else torch.no_grad()
-        ):
-            if self._engine is not None and isinstance(given, Sessions) and len(given.users) == 1:
+        with torch.inference_mode() if serving else torch.no_grad():
+            if self._engine is not None and len(sessions.users) == 1:
                 without = torch.zeros(1, self._items.count, dtype=torch.bool)
                 if left_out is not None:
                     without[left_out] = True
                 if excluded is not None:
                     without |= excluded
-                return _require_scores(self._engine(given, without), empty)
-            if isinstance(given, Sessions):
-                assert self.states is not None
-                given = given.history(self.states, self.policy.config.context)
-            query = self.query(self.with_target(given))
-            return self.scores_of(query, given, left_out, excluded, empty=empty)
+                return _require_scores(self._engine(sessions, without), empty)
+            return self.scores_of(self.query(sessions), left_out, excluded, empty=empty)
 
     @torch.no_grad()
     def scores_of(
         self,
         query: Query,
-        history: History,
         left_out: tuple[Tensor, Tensor] | None = None,
         excluded: Tensor | None = None,
         *,
         empty: bool = False,
     ) -> Tensor:
-        """`scores` of a query of the history."""
+        """`scores` of the sessions of a query."""
         if self.rule.policy_weight == 1 and not self.rule.looks_ahead:
-            factors, weighted = self.weighted(query), bool(self.rule.reward_weight)
-            scores = self._items.scores(factors, query.outputs, self.has_factors, weighted)
+            part, rewards = self.weighted(query), bool(self.rule.reward_weight)
+            outputs = query.outputs
+            scores = self._items.scores(query.items, part, outputs, self.has_factors, rewards)
         else:
-            scores = self._composed(query, history)
+            scores = self._composed(query)
         if not torch.compiler.is_exporting():
             _require_scores(scores, empty=True)
         if left_out is not None:
             scores[left_out] = -torch.inf
         if excluded is not None:
             scores = scores.masked_fill_(excluded, -torch.inf)
-        for without in self._items.without_tags(self.rule, history.shown):
+        for without in self._items.without_tags(self.rule, query.sessions.shown):
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
             some = left.amax(1, keepdim=True) > -torch.inf
@@ -292,45 +293,47 @@ class Scorer:
         return scores if empty else _require_scores(scores, empty)
 
     @torch.no_grad()
-    def rewards(self, history: History) -> Tensor:
+    def rewards(self, sessions: Sessions) -> Tensor:
         """f̂_r (B, n_items), in the reward model's units, up to a constant per row."""
-        model, items = self._items.of_model(history), self._items.shown(history.shown)
-        factors = self._items.factors(items, None, model, 1.0)
-        return self._items.scores(factors, None, policy=False, rewards=True)
+        states = sessions.windows(self.states, 1).states[:, -1]
+        items, part = self._items.shown(sessions.shown), self._items.model_part(sessions, states)
+        part = self._items.weighted(items, None, part, 1.0)
+        return self._items.scores(items, part, None, policy=False, rewards=True)
 
     @torch.inference_mode()
-    def of_items(
-        self, sessions: Sessions, factors: Factors, items: Tensor, products: Tensor
+    def scores_of_some(
+        self, query: Query, part: Part, candidates: Tensor, products: Tensor
     ) -> Tensor:
         """Scores (B, C) of some items; −∞ for those that the rule's tags exclude, even if no
         others remain.
 
         Args:
-            sessions: as for `scores`.
-            items: (B, C) int64.
-            products: (B, C) of `multipliers` of the factors and the items' `vectors`.
+            part: of `weighted`.
+            candidates: (B, C) int64.
+            products: (B, C) of `multipliers` of the part and the candidates' `vectors`.
         """
-        scores = products + self._items.added(factors, items, bool(self.rule.reward_weight))
-        for without in self._items.without_tags(self.rule, sessions.shown, items):
+        rewards = bool(self.rule.reward_weight)
+        scores = products + self._items.added(query.items, part, candidates, rewards)
+        for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
-    def _composed(self, query: Query, history: History) -> Tensor:
+    def _composed(self, query: Query) -> Tensor:
         """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
-        rule, items, scores = self.rule, self._items, torch.zeros(())
+        rule, product, scores = self.rule, self._items, torch.zeros(())
         if rule.policy_weight:
-            factors = items.factors(query.items, query.policy, None, 0.0)
-            of_policy = items.scores(factors, query.outputs, self.has_factors, rewards=False)
+            part = product.weighted(query.items, query.policy, None, 0.0)
+            of_policy = product.scores(query.items, part, query.outputs, self.has_factors, False)
             scores = rule.policy_weight * of_policy
         if query.model is not None and rule.reward_weight:
-            factors = items.factors(query.items, None, query.model, 1.0)
-            odds = items.scores(factors, None, policy=False, rewards=True)
+            part = product.weighted(query.items, None, query.model, 1.0)
+            odds = product.scores(query.items, part, None, policy=False, rewards=True)
             if rule.looks_ahead:
-                return self._ahead(scores, odds, history)
+                return self._ahead(scores, odds, query)
             scores = scores + rule.reward_weight * odds
-        return scores.expand(history.shown.items.shape[0], self._items.count).clone()
+        return scores.expand(query.items.shape[0], product.count).clone()
 
-    def _ahead(self, scores: Tensor, odds: Tensor, history: History) -> Tensor:
+    def _ahead(self, scores: Tensor, odds: Tensor, query: Query) -> Tensor:
         """Scores of the policy plus expected reward and lookahead, (B, n_items).
 
         Only the best items by policy and reward are asked whether they end the session; others
@@ -339,15 +342,16 @@ class Scorer:
         model, end = self.reward_model, self.session_end
         assert model is not None
         assert end is not None
-        states, shown = history.windows.states[:, -1], history.shown.latest(model.reach)
-        odds = odds + model.level(states, history.users, model.tastes_after(shown)).unsqueeze(1)
+        users, shown = query.sessions.users, query.sessions.shown
+        tastes = model.tastes_after(shown.latest(model.reach))
+        odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span = model.reward_high - model.reward_low
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
         rewards = model.expected(odds)
         scores = scores + weight * rewards
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
-        steps = history.windows.timesteps[:, -1]
-        some, recent = rewards.gather(1, best), history.shown.latest(model.lags)
+        steps = query.sessions.steps
+        some, recent = rewards.gather(1, best), shown.latest(model.lags)
         if self._outcomes is not None and end.uses_rewards:
             rewarded = [torch.full_like(some, reward) for reward in self._outcomes]
             low, high = end.of_items(recent, best, rewarded, steps)
@@ -359,19 +363,11 @@ class Scorer:
         return (scores + worst).scatter_add(1, best, added - worst)
 
 
-def logged_history(
+def sessions_before(
     scorer: Scorer, store: EpisodeStore, episodes: IntArray, steps: IntArray
-) -> tuple[History, Tensor | None]:
-    """What was known before logged steps, and what the rule excludes because it was shown.
-
-    Args:
-        store: the logs, with the training's items.
-        episodes: (B,) sessions.
-        steps: (B,) steps of those sessions, from 0.
-    """
-    history = History.logged(store, episodes, steps, scorer.policy.config.context, scorer.reach)
-    seen = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
-    return history, seen
+) -> Sessions:
+    """What was known before steps (B,) of episodes (B,) of logs with the training's items."""
+    return Sessions.from_store(store, episodes, steps, scorer.policy.config.context, scorer.reach)
 
 
 def logged_scores(
@@ -385,8 +381,9 @@ def logged_scores(
 
     With `left_out`, rows and items of what may not be shown, all items of a row may be excluded.
     """
-    history, seen = logged_history(scorer, store, episodes, steps)
-    return scorer.scores(history, left_out, seen, empty=left_out is not None)
+    sessions = sessions_before(scorer, store, episodes, steps)
+    seen = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
+    return scorer.scores(sessions, left_out, seen, empty=left_out is not None)
 
 
 def _require_scores(scores: Tensor, empty: bool) -> Tensor:

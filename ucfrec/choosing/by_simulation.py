@@ -29,7 +29,7 @@ from ucfrec.choosing.choice import (
     doubts_of,
 )
 from ucfrec.choosing.logged import Evidence, LoggedEvidence
-from ucfrec.choosing.many_rules import Sessions, roll_out
+from ucfrec.choosing.many_rules import Outcomes, roll_out
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator, longest_session
@@ -76,7 +76,7 @@ class RuleSearch:
         wanted = self._config.evidence if self._many.has_propensities else 0
         self.least_users = float(wanted)
         """Effective users that a rule must leave; 0 without propensities."""
-        self._sessions: dict[DecisionRule, Sessions] = {}
+        self._sessions: dict[DecisionRule, Outcomes] = {}
 
     def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
         """Roll out each of the rules, side by side, all with the same draws.
@@ -147,7 +147,7 @@ class RuleSearch:
         n: int,
         seed: int,
         users: UserModel | None = None,
-    ) -> dict[DecisionRule, Sessions]:
+    ) -> dict[DecisionRule, Outcomes]:
         """Simulate `n` sessions of each rule that begin as those of a store."""
         users = users or self.users
         simulator = UserSimulator(users, store, n, self._longest, seed, times=len(rules))
@@ -156,7 +156,7 @@ class RuleSearch:
         found = roll_out(simulator, scorers, n, states, size, seed)
         return dict(zip(rules, found, strict=True))
 
-    def _simulated(self, rule: DecisionRule, sessions: Sessions) -> SimulatedRule:
+    def _simulated(self, rule: DecisionRule, sessions: Outcomes) -> SimulatedRule:
         shares = np.bincount(sessions.items) / len(sessions.items)
         shares = shares[shares > 0]
         return SimulatedRule(
@@ -281,7 +281,7 @@ class RuleSearch:
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
         return ValueEstimate(value, error, values, optimism, tuple(doubts))
 
-    def _of_half(self, rule: DecisionRule, number: int, part: int = 0) -> Sessions:
+    def _of_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
         """Sessions of one half of the users, with its own calibration; each part has others."""
         half, n = half_of(self._store), self._config.sessions
         own = np.flatnonzero(half == number)

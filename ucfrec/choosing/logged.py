@@ -1,8 +1,7 @@
 """What several decision rules of one policy would have done at logged steps."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,12 +9,11 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
-from ucfrec.acting.scorer import Query, Scorer, logged_history
-from ucfrec.acting.sessions import History, seen_before
+from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.item_counts import liked_rewards
+from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
 from ucfrec.progress import progress
 from ucfrec.results.statistics import effective_number
 
@@ -36,7 +34,7 @@ class LoggedScores:
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
     ) -> None:
         self._scorer, self._view, self._episodes, self._steps = scorer, view, episodes, steps
-        self._kept: dict[tuple[object, ...], _Outputs] = {}
+        self._kept: dict[tuple[object, ...], Query] = {}
 
     @torch.no_grad()
     def of(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
@@ -49,35 +47,21 @@ class LoggedScores:
                 part = slice(first, min(first + _AT_ONCE, len(self._steps)))
                 at = self._episodes[part], self._steps[part]
                 kept = self._kept if self._scorer.has_factors else {}
-                known: History | None = None
+                known: Sessions | None = None
                 scores = list[Tensor]()
                 for each in scorers:
                     rule = each.rule
                     key = first, rule.target, rule.minimum_target, widest.reach, weighted
                     if key not in kept:
-                        known = known or logged_history(widest, self._view, *at)[0]
-                        kept[key] = _Outputs.of(each, known, weighted)
-                    outputs = kept[key]
+                        known = known or sessions_before(widest, self._view, *at)
+                        query = each.query(known, rewards=weighted)
+                        # What has been read for the query is not kept.
+                        last = replace(known, states=None)
+                        kept[key] = query._replace(sessions=last)
                     seen = seen_before(self._view, *at) if rule.exclude_seen else None
-                    scores.append(each.scores_of(outputs.query, outputs.history, excluded=seen))
+                    scores.append(each.scores_of(kept[key], excluded=seen))
                 yield part, scores
                 bar.update(part.stop - part.start)
-
-
-class _Outputs(NamedTuple):
-    """What a batch of logged steps asks under one target, and what rules need besides."""
-
-    query: Query
-    history: History
-    """With windows of the step itself."""
-
-    @classmethod
-    def of(cls, scorer: Scorer, known: History, weighted: bool) -> "_Outputs":
-        aimed = scorer.with_target(known)
-        last = aimed.windows.last(1)
-        # A view would keep the whole windows.
-        copied = Windows(*(getattr(last, each.name).clone() for each in fields(last)))
-        return cls(scorer.query(aimed, rewards=weighted), replace(aimed, windows=copied))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Several decision rules of one policy, rolled out side by side."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import History
 from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.progress import progress
@@ -23,7 +23,7 @@ _ROWS_AT_ONCE: Final = 256
 
 
 @dataclass(frozen=True)
-class Sessions:
+class Outcomes:
     """What happened in n simulated sessions of one rule."""
 
     returns: Float64Array
@@ -33,10 +33,10 @@ class Sessions:
     items: IntArray
     """(M,), all that were shown."""
 
-    def followed_by(self, more: "Sessions") -> "Sessions":
+    def followed_by(self, more: "Outcomes") -> "Outcomes":
         """These sessions and more of the same rule."""
         pairs = zip(vars(self).values(), vars(more).values(), strict=True)
-        return Sessions(*(np.concatenate(pair) for pair in pairs))
+        return Outcomes(*(np.concatenate(pair) for pair in pairs))
 
 
 def roll_out(
@@ -46,7 +46,7 @@ def roll_out(
     states: ItemStates,
     observation_size: int,
     seed: int,
-) -> list[Sessions]:
+) -> list[Outcomes]:
     """Simulate sessions by each of C rules of the same policy of items.
 
     Args:
@@ -79,7 +79,7 @@ def roll_out(
     numbers, items = np.concatenate(shown).T
     of_rules = np.split(returns, len(scorers)), np.split(lengths, len(scorers))
     return [
-        Sessions(mine, steps, items[numbers // sessions == rule])
+        Outcomes(mine, steps, items[numbers // sessions == rule])
         for rule, (mine, steps) in enumerate(zip(*of_rules, strict=True))
     ]
 
@@ -108,24 +108,20 @@ class _ManyRules(PolicyActor):
         super().keep(rows)
         self._rule = self._rule[rows]
 
-    def _decided(
-        self, rows: Tensor, history: History, excluded: Tensor | None
+    def _decide(
+        self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         decided = []
         for batch in _batches(self._rule[rows.numpy()]):
-            parts = [history.at(part) for _, part in batch]
-            aimed = [
-                self._scorers[rule].with_target(known).windows
-                for (rule, _), known in zip(batch, parts, strict=True)
-            ]
+            windows = [self._scorers[rule].windows(sessions.at(part)) for rule, part in batch]
             begin, end = batch[0][1].start, batch[-1][1].stop
-            together = replace(history.at(slice(begin, end)), windows=Windows.joined(aimed))
             weighted = any(self._scorers[rule].rule.reward_weight for rule, _ in batch)
-            query = self._scorer.query(together, rewards=weighted)
-            for (rule, part), known in zip(batch, parts, strict=True):
+            together = sessions.at(slice(begin, end))
+            query = self._scorer.query(together, Windows.joined(windows), weighted)
+            for rule, part in batch:
                 scorer, own = self._scorers[rule], slice(part.start - begin, part.stop - begin)
                 of_rule = None if excluded is None else excluded[part]
-                scores = scorer.scores_of(query.at(own), known, excluded=of_rule)
+                scores = scorer.scores_of(query.at(own), excluded=of_rule)
                 decided.append(scorer.rule.choose(scores, self._generators[rule]))
         items, chances = zip(*decided, strict=True)
         return torch.cat(items), torch.cat(chances)

@@ -362,7 +362,7 @@ class Columns:
         items, rewards = self.step_values(history_index, schema.ITEM, schema.REWARD)
         items = np.where(valid, items, -1).astype(np.int64)
         rewards = np.where(valid, rewards, 0)
-        return self.item_states.of_sequences(
+        return self.item_states.build(
             torch.from_numpy(items),
             torch.from_numpy(rewards.astype(np.float32)),
             torch.from_numpy(np.maximum(steps, 0)),

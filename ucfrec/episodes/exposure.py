@@ -127,8 +127,13 @@ class Likeness(nn.Module):
         self.register_buffer("n_tags", torch.zeros((), dtype=torch.int64))
         size = 0 if tags_per_item else embedding_size
         self.register_buffer("directions", torch.zeros(n_items, size))
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what was computed from the tags."""
         self._matrix: Tensor | None = None
         self._n_tags: int | None = None
+        self._sets: tuple[Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, states: ItemStates) -> "Likeness":
@@ -145,11 +150,11 @@ class Likeness(nn.Module):
             self.n_tags.fill_(int(states.tags.max()) + 1)
         else:
             self.directions.copy_(nn.functional.normalize(states.embeddings, dim=1))
-        self._matrix = self._n_tags = None
+        self._forget()
 
     def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
         super()._load_from_state_dict(*arguments, **named)
-        self._matrix = self._n_tags = None
+        self._forget()
 
     def _count(self) -> int:
         """The number of tags, read once: a graph that is exported cannot read it."""
@@ -205,8 +210,7 @@ class Likeness(nn.Module):
         """Likeness (M,) to profiles (M, F) of one item each, (M, 1)."""
         if not self.tags.shape[1]:
             return (profile * self.directions[items[:, 0]]).sum(1)
-        # Index −1 reads the column of zeros.
-        return _read(nn.functional.pad(profile, (0, 1)), self.tags[items[:, 0]]).sum(1)
+        return self.to_candidates(profile, items)[:, 0]
 
     def to_candidates(self, profile: Tensor, items: Tensor) -> Tensor:
         """Likeness (M, C) to profiles (M, F) of items (M, C); to (M, L, F) it is (M, L, C)."""
@@ -221,6 +225,21 @@ class Likeness(nn.Module):
         places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
         read = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
         return read.view(*shape, tags.shape[2]).sum(3)
+
+    def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
+        """Likeness (M, D) by tags to the D different sets of tags, and the set of every item.
+
+        What `to_all` gives, faster where there are few profiles and many items of the same tags.
+        """
+        if self._sets is None:
+            # Padding reads a place of its own, which is 0.
+            places = np.where(self.tags.cpu().numpy() < 0, self._count(), self.tags.cpu().numpy())
+            distinct, sets = np.unique(places, axis=0, return_inverse=True)
+            numbers = torch.from_numpy(sets.reshape(-1).astype(np.int32))
+            self._sets = torch.from_numpy(distinct), numbers
+        padded = nn.functional.pad(profile, (0, 1))
+        columns = [padded.index_select(1, column) for column in self._sets[0].unbind(1)]
+        return torch.stack(columns).sum(0), self._sets[1]
 
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
@@ -242,11 +261,6 @@ class Likeness(nn.Module):
             small = shape[0] * shape[1] <= _DENSE
             self._matrix = matrix.to_dense() if small else matrix
         return self._matrix
-
-
-def _read(table: Tensor, columns: Tensor) -> Tensor:
-    """table[m, columns[m, j]], (M, J); column −1 is the last."""
-    return table.gather(1, torch.where(columns < 0, table.shape[1] - 1, columns))
 
 
 class ExposureTerm(nn.Module):

@@ -1,6 +1,6 @@
 """Item-embedding states: a vector that summarises a session just before step t.
 
-Training windows and acting both call `ItemStates.of_sequences`. It uses only element-wise
+Training windows and acting both call `ItemStates.build`. It uses only element-wise
 operations in a fixed order, so its results are bit-identical for every batch size.
 """
 
@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.arrays import IntArray
 from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
@@ -48,30 +47,26 @@ class ItemStates:
     none. States do not contain them: they show which items are alike."""
 
     def __post_init__(self) -> None:
-        if self.embeddings.dim() != 2 or self.user_features.dim() != 2:
-            raise InputError("embeddings and user features of item states must be matrices")
-        if not (self.embeddings.is_floating_point() and self.user_features.is_floating_point()):
-            raise InputError("embeddings and user features of item states must be real numbers")
-        tags = self.tags
-        if tags.dim() != 2 or (tags.shape[1] and len(tags) != len(self.embeddings)):
-            raise InputError("tags of item states must be a matrix with one row per item")
-        if tags.dtype != torch.int64 or tags.shape[1] > TAGS_PER_ITEM:
-            raise InputError(
-                f"tags of item states are {tags.shape[1]} of {tags.dtype} an item; give whole "
-                f"numbers, at most {TAGS_PER_ITEM}"
-            )
+        tables, tags = (self.embeddings, self.user_features), self.tags
+        if any(table.dim() != 2 or not table.is_floating_point() for table in tables):
+            raise InputError("embeddings and user features of item states must be real matrices")
+        fits = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
+        if tags.dtype != torch.int64 or not fits:
+            raise InputError("tags of item states must be a matrix of integers, one row per item")
         # Tags are numbered without gaps, so that no number exceeds their count.
         most = min(tags.numel(), DISTINCT_TAGS) - 1
         if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
             raise InputError(f"tags of item states are not numbers from -1 to {most}")
+        if tags.shape[1] > TAGS_PER_ITEM:
+            raise InputError(f"item states have more than {TAGS_PER_ITEM} tags an item")
         if type(self.window) is not int or not 1 <= self.window <= 10_000:
             raise InputError(f"window of item states is {self.window!r:.60}; give 1 to 10,000")
         if not _is_real(self.decay) or not 0 <= self.decay <= 1:
             raise InputError(f"decay of item states is {self.decay!r:.60}; give 0 to 1")
-        ends = self.reward_low, self.reward_high
-        if not all(map(_is_real, ends)) or not self.reward_low < self.reward_high:
+        low, high = self.reward_low, self.reward_high
+        if not (_is_real(low) and _is_real(high) and low < high):
             raise InputError(
-                f"rewards from {ends[0]!r:.60} to {ends[1]!r:.60} cannot be scaled to [0, 1]; "
+                f"rewards from {low!r:.60} to {high!r:.60} cannot be scaled to [0, 1]; "
                 "reward_low must be below reward_high"
             )
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
@@ -86,31 +81,6 @@ class ItemStates:
         return 3 * self.embeddings.shape[1] + 2 + self.user_features.shape[1]
 
     def build(
-        self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
-    ) -> Tensor:
-        """States just before the given steps.
-
-        Args:
-            items: (..., window) int64 items shown, most recent first; −1 before the session began.
-            rewards: (..., window) rewards of those items.
-            steps: (...) int64 number of each step in its session, from 0.
-            users: (...) int64 rows of `user_features`; −1 for an unknown user.
-            observations: (..., O) observations logged with the steps; O may be 0.
-
-        Returns:
-            (..., S) float32.
-        """
-        rows = math.prod(steps.shape)
-        states = self.of_sequences(
-            items.reshape(rows, self.window).flip(1),
-            rewards.reshape(rows, self.window).flip(1),
-            steps.reshape(rows, 1),
-            users.reshape(rows),
-            observations.reshape(rows, 1, observations.shape[-1]),
-        )
-        return states.view(*steps.shape, states.shape[-1])
-
-    def of_sequences(
         self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
     ) -> Tensor:
         """States just before K consecutive steps of each of B sessions.
@@ -183,49 +153,3 @@ def _is_real(value: object) -> bool:
 
 def _with_zero_row(table: Tensor) -> Tensor:
     return torch.cat([table.float(), torch.zeros(1, table.shape[1])])
-
-
-class SessionStates:
-    """States of N running sessions, updated after every step."""
-
-    def __init__(self, states: ItemStates, sessions: int, memory: int = 0) -> None:
-        """
-        Args:
-            sessions: N.
-            memory: items of a session that `shown` names at least.
-        """
-        self._states, length = states, max(states.window, memory)
-        self._items = torch.full((sessions, length), -1, dtype=torch.int64)
-        self._rewards = torch.zeros(sessions, length)
-        self._steps = torch.zeros(sessions, dtype=torch.int64)
-        self.users = torch.full((sessions,), -1, dtype=torch.int64)
-        """(N,) int64 rows of the user features; −1, the default, for an unknown user."""
-
-    def begin(self, rows: IntArray) -> None:
-        """Start new sessions at the positions `rows`."""
-        self._items[rows] = -1
-        self._rewards[rows] = 0.0
-        self._steps[rows] = 0
-
-    def keep(self, rows: IntArray) -> None:
-        """Forget all sessions but those at the positions `rows`, which become the only ones."""
-        for name in ("_items", "_rewards", "_steps", "users"):
-            setattr(self, name, getattr(self, name)[rows])
-
-    def current(self, observations: Tensor) -> Tensor:
-        """States (N, S) just before the next step, given its observations (N, O)."""
-        recent = self._items[:, : self._states.window], self._rewards[:, : self._states.window]
-        return self._states.build(*recent, self._steps, self.users, observations)
-
-    @property
-    def shown(self) -> tuple[Tensor, Tensor]:
-        """Items shown before the next step, (N, max(window, memory)), most recent first, and their
-        rewards."""
-        return self._items, self._rewards
-
-    def record(self, items: Tensor, rewards: Tensor) -> None:
-        """Add a step to every session: the items (N,) shown and their rewards (N,)."""
-        rewards = rewards.float()  # rounded like the store's, for bit-identical states
-        self._items = torch.cat([items.unsqueeze(1), self._items[:, :-1]], dim=1)
-        self._rewards = torch.cat([rewards.unsqueeze(1), self._rewards[:, :-1]], dim=1)
-        self._steps += 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import Scorer, logged_history, logged_scores
+from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.liked import Liked
@@ -66,8 +66,8 @@ class RewardRanker:
 
     def scores(self, steps: Steps) -> Tensor:
         """Predicted rewards (B, n_items), in the model's units, up to a constant per step."""
-        history, _ = logged_history(self.scorer, steps.store, steps.episodes, steps.steps)
-        return self.scorer.rewards(replace(history, users=torch.from_numpy(steps.users)))
+        sessions = sessions_before(self.scorer, steps.store, steps.episodes, steps.steps)
+        return self.scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import Sessions
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import RANK, recommend, sessions_of
@@ -124,10 +124,9 @@ def pasted_history(text: str) -> pd.DataFrame:
 
 def _session(trained: TrainedPolicy, user: Histories) -> Sessions:
     """The user's latest session, before the step that is decided."""
-    numbered = replace(user, item_ids=trained.items.numbers(user.item_ids))
+    numbered = user.with_numbers(trained.items, False)
     latest = numbered.latest_session(trained.record.session_gap_ms)
-    users = trained.users.numbers(user.users)
-    return sessions_of(trained, latest, users, trained.scorer().length)
+    return sessions_of(trained, latest, trained.scorer().length)
 
 
 def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:
@@ -138,8 +137,7 @@ def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:
 
 def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
     """(n_items,) of each of `PARTS`, less its mean over all items."""
-    rule, states = scorer.rule, scorer.states
-    assert states is not None
+    rule = scorer.rule
 
     def scores(**changes: Any) -> Tensor:
         return scorer.under(_plain(rule, **changes)).scores(sessions, empty=True)[0].double()
@@ -153,12 +151,11 @@ def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
         LOOKAHEAD: scores() - with_rewards,
     }
     alone = scorer.under(_plain(rule, reward_weight=0.0, lookahead=0.0))
-    history = alone.with_target(sessions.history(states, scorer.policy.config.context))
-    query = alone.query(history)
+    query = alone.query(sessions)
     if query.policy is not None:
         none = torch.zeros_like(query.policy.repeated)
         query = query._replace(policy=query.policy._replace(repeated=none, alike=none))
-        parts[POLICY] = alone.scores_of(query, history, empty=True)[0].double()
+        parts[POLICY] = alone.scores_of(query, empty=True)[0].double()
         parts[EXPOSURE] = of_policy - parts[POLICY]
     return {name: part - part.mean() for name, part in parts.items()}
 
@@ -182,7 +179,7 @@ def _excluded(
         seen = trained.items.numbers(user.seen_ids)
         exclude(seen[seen >= 0], "the user has seen it")
     if rule.exclude_seen:
-        shown = sessions.items[0]
+        shown = sessions.actions[0]
         exclude(shown[shown >= 0], "this session has shown it")
     for name, words in (
         ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),

@@ -18,7 +18,7 @@ from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
 from ucfrec.files.record import CARD
 from ucfrec.python_api.given_data import histories_given
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.recommend import some_of
+from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting import charts
 from ucfrec.reporting.charts import LineChart
 from ucfrec.reporting.forest import quoted
@@ -211,7 +211,7 @@ def _pasted(trained: TrainedPolicy, text: str) -> Histories:
     (history,) = histories_given(trained, pasted_history(text), None, ["pasted"])
     known = trained.items.numbers(history.item_ids) >= 0
     if not known.all():
-        unknown = some_of(list(dict.fromkeys(history.item_ids[~known].tolist())))
+        unknown = name_some(list(dict.fromkeys(history.item_ids[~known].tolist())))
         raise InputError(
             f"the run {trained.folder.name} does not know the items {unknown:.200}; take their "
             "lines out of the history"

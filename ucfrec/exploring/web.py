@@ -7,7 +7,7 @@ from typing import Final
 from fastapi import FastAPI, Request, Response
 
 from ucfrec.exploring.page import Explorer
-from ucfrec.recommending.hosts import AllowedHosts
+from ucfrec.recommending.server import AllowedHosts
 
 _HEADERS: Final = {
     "Content-Security-Policy": (

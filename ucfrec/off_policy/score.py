@@ -16,9 +16,10 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import logged_history
+from ucfrec.acting.scorer import sessions_before
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.earlier import UserRows
+from ucfrec.episodes.sessions import seen_before
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
@@ -213,20 +214,21 @@ def scored_steps(
         for begin in range(0, total, at_once):
             numbers = np.arange(begin, min(begin + at_once, total))
             episodes, steps = store.locate(numbers)
-            logged, shown_items = logged_history(scorer, store, episodes, steps)
-            history = scorer.with_target(logged)
-            query = scorer.query(history)
+            sessions = sessions_before(scorer, store, episodes, steps)
+            shown = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
+            windows = scorer.windows(sessions)
+            query = scorer.query(sessions, windows)
             excluded = None if seen is None else _find_seen_items(seen, numbers, n_items)
-            scores = scorer.scores_of(query, history, excluded, shown_items)
+            scores = scorer.scores_of(query, excluded, shown)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
                 episodes,
                 steps,
                 torch.from_numpy(items),
-                history.windows.states[:, -1],
+                query.states,
                 scores,
                 scorer.rule.log_probabilities(scores),
-                history.windows.returns_to_go[:, -1],
+                windows.returns_to_go[:, -1],
                 query.features,
             )
             bar.update(len(steps))

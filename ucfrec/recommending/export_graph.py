@@ -15,13 +15,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import Sessions
 from ucfrec.arrays import Array
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError, one_line
 
 GRAPH: Final = "model.onnx"
 INPUTS: Final = ("items", "rewards", "steps", "collected", "users", "observations")
-"""Inputs that are fields of `Sessions`; without the last where a policy has no observations."""
+"""Inputs: the first fields of `Sessions`, of which `items` are the actions; without the last where
+a policy has no observations."""
 EXCLUDED: Final = "excluded"
 OUTPUTS: Final = ("scores", "top_items", "top_scores")
 TOLERANCE: Final = 1e-5
@@ -138,7 +139,7 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
         size = (sessions, scorer.policy.config.context, observed)
         observations = torch.from_numpy(rng.normal(size=size).astype(np.float32))
     return Sessions(
-        items=torch.from_numpy(items),
+        actions=torch.from_numpy(items),
         rewards=torch.from_numpy(rewards),
         steps=torch.from_numpy(steps),
         collected=torch.from_numpy(rewards.sum(1, dtype=np.float64)),
@@ -149,7 +150,7 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
 
 def inputs_of(sessions: Sessions) -> dict[str, Tensor]:
     """The inputs of a graph, by name."""
-    values = {name: getattr(sessions, name) for name in INPUTS}
+    values = {"items": sessions.actions} | {name: getattr(sessions, name) for name in INPUTS[1:]}
     return {name: value for name, value in values.items() if value is not None}
 
 

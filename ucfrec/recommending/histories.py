@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
 
@@ -116,6 +116,26 @@ class Histories:
             observations=None,
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence["Histories"]) -> "Histories":
+        """The users of all parts, one part after the other; all have sessions, or none."""
+        if len(parts) == 1:
+            return parts[0]
+        firsts = np.cumsum([0, *(len(part.users) for part in parts[:-1])])
+        columns: dict[str, Array | None] = {}
+        for column in fields(cls):
+            values = [getattr(part, column.name) for part in parts]
+            if column.name in ("owner", "seen_owner"):
+                values = [owners + first for owners, first in zip(values, firsts, strict=True)]
+            columns[column.name] = None if values[0] is None else np.concatenate(values)
+        return Histories(**columns)  # type: ignore[arg-type]
+
+    def with_numbers(self, ids: IdLookup, filter_seen: bool) -> "Histories":
+        """The same with the numbers of the items in `ids`, −1 for unknown ones, and without
+        `filter_seen` for all that were seen."""
+        seen = ids.numbers(self.seen_ids) if filter_seen else np.full(len(self.seen_ids), -1)
+        return replace(self, item_ids=ids.numbers(self.item_ids), seen_ids=seen)
+
     def latest_session(self, gap_ms: float | None, new: BoolArray | None = None) -> "Histories":
         """The same users with only the rows of each user's latest session.
 
@@ -127,19 +147,19 @@ class Histories:
             new: (U,) users who begin a new session, which has no rows yet; None for no one.
         """
         if new is not None and new.any():
-            return self.rows(~new[self.owner]).latest_session(gap_ms)
+            return self.with_rows(~new[self.owner]).latest_session(gap_ms)
         row = np.arange(len(self.owner))
         latest = np.zeros(len(self.users), dtype=np.int64)
         if self.session_ids is not None:
             # Of repeated indices, the last assignment remains: each user's last row.
             latest[self.owner] = row
-            return self.rows(self.session_ids == self.session_ids[latest[self.owner]])
+            return self.with_rows(self.session_ids == self.session_ids[latest[self.owner]])
         if gap_ms is None:
             return self
         begins = np.zeros(len(self.owner), dtype=np.int64)
         begins[1:] = (np.diff(self.owner) > 0) | (np.diff(self.timestamps) > gap_ms)
         np.maximum.at(latest, self.owner, row * begins)
-        return self.rows(row >= latest[self.owner])
+        return self.with_rows(row >= latest[self.owner])
 
     def of_users(self, numbers: IntArray) -> "Histories":
         """The users with the given numbers (M,), in that order."""
@@ -158,14 +178,13 @@ class Histories:
             observations=None if observations is None else observations[numbers],
         )
 
-    def rows(self, keep: BoolArray) -> "Histories":
+    def with_rows(self, keep: BoolArray) -> "Histories":
         """The same users with only the rows where `keep` (N,) is true."""
-        kept = {
-            name: getattr(self, name)[keep]
-            for name in ("owner", "item_ids", "rewards", "timestamps", "session_ids")
-            if getattr(self, name) is not None
-        }
-        return replace(self, **kept)
+        names = ("owner", "item_ids", "rewards", "timestamps", "session_ids")
+        columns = {name: getattr(self, name) for name in names}
+        return replace(
+            self, **{name: values[keep] for name, values in columns.items() if values is not None}
+        )
 
 
 def histories_of_files(

@@ -1,7 +1,7 @@
 """Recommend next items to the users of a log, also to users who are not in the training logs."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,10 +13,10 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.sessions import Sessions
 from ucfrec.arguments import require_ids, require_whole
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import mixed
 from ucfrec.recommending.histories import Histories
@@ -27,7 +27,6 @@ _USERS_AT_ONCE = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
 _SCORES = 2**24
 """Most scores of a forward pass of several users, users × items: 64 MiB."""
-
 _NEGLIGIBLE: Final = 80.0
 """Nats below the best score from which on an item counts nothing, in float32."""
 
@@ -79,106 +78,126 @@ def recommend(
             or of the candidates is not in the training data. Items of the logs are checked when
             their batch is read.
     """
-    scorer = trained.item_scorer(rule)
-    k = require_whole("k", k)
-    known_ids = trained.items
-    excluded = None if candidates is None else _all_but(known_ids, candidates, skip_unknown)
+    chooser = Chooser(trained, trained.item_scorer(rule), seed, index)
+    k, excluded = require_whole("k", k), None
+    if candidates is not None:
+        ids = require_ids("candidates", candidates, schema.ITEM_ID)
+        allowed = candidate_numbers(trained.items, ids, skip_unknown)
+        excluded = torch.ones(len(trained.items), dtype=torch.bool)
+        excluded[torch.from_numpy(allowed)] = False
 
-    choice = _Choice(trained, scorer, k, excluded, new_session, seed, index)
-    return map(choice.frame, _numbered(known_ids, batches, filter_seen, skip_unknown))
+    def to_frame(histories: Histories) -> pd.DataFrame:
+        requests = _request_ids(histories, seed)
+        new = np.full(len(histories.users), new_session)
+        items, scores, propensities = chooser.choose(histories, requests, k, new, excluded)
+        left = np.isfinite(scores)
+        return pd.DataFrame(
+            {
+                schema.USER_ID: np.repeat(histories.users, left.sum(1)),
+                RANK: np.cumsum(left, axis=1)[left],
+                schema.ITEM_ID: trained.items.ids[items[left]],
+                SCORE: scores[left],
+                schema.PROPENSITY: propensities[left],
+                schema.REQUEST_ID: np.repeat(requests, left.sum(1)),
+            }
+        )
+
+    return map(to_frame, _number_items(trained.items, batches, filter_seen, skip_unknown))
 
 
-def _numbered(
+def _number_items(
     known_ids: IdLookup, batches: Iterable[Histories], filter_seen: bool, skip_unknown: bool
 ) -> Iterator[Histories]:
     """Histories with the numbers of their items, −1 for unknown ones."""
     remaining = iter(batches)
     for batch in remaining:
-        known = known_ids.numbers(batch.item_ids)
-        if not ((known >= 0).all() or skip_unknown):
-            raise _unknown(known_ids, [batch, *remaining])
-        seen = np.full(len(batch.seen_ids), -1)
-        if filter_seen:
-            seen = known_ids.numbers(batch.seen_ids)
-        yield replace(batch, item_ids=known, seen_ids=seen)
+        numbered = batch.with_numbers(known_ids, filter_seen)
+        if not ((numbered.item_ids >= 0).all() or skip_unknown):
+            raise _unknown_items(known_ids, [batch, *remaining])
+        yield numbered
 
 
 @dataclass(frozen=True)
-class _Choice:
-    """How items are chosen."""
+class Chooser:
+    """Chooses items for the next step of users under a decision rule."""
 
     trained: TrainedPolicy
     scorer: Scorer
-    k: int
-    excluded: Tensor | None
-    """(n_items,) true for items that no user is recommended."""
-    new_session: bool
     seed: int
-    index: ItemIndex | None
+    index: ItemIndex | None = None
 
-    def frame(self, batch: Histories) -> pd.DataFrame:
-        """Items for the next step of U users whose rows have the policy's numbers of items, −1 for
-        unknown ones; those of `seen_ids` are not recommended."""
-        latest = batch.rows(batch.item_ids >= 0).latest_session(
-            self.trained.record.session_gap_ms, np.full(len(batch.users), self.new_session)
-        )
+    def choose(
+        self,
+        histories: Histories,
+        requests: Array,
+        k: int,
+        new: BoolArray,
+        excluded: Tensor | None = None,
+        candidates: Sequence[IntArray | None] = (),
+    ) -> tuple[Array, Array, Array]:
+        """Items (U, k) in the order shown, their log-probabilities at temperature 1, −∞ where no
+        more may be shown, and their propensities.
+
+        Args:
+            histories: of U users, of `with_numbers`; what they have seen is not recommended.
+            requests: (U,) text that tells a user's requests apart.
+            k: number of items; of a smaller catalogue, all.
+            new: (U,) users who begin a new session.
+            excluded: (n_items,) true for items that no user is recommended.
+            candidates: of every user the only items to recommend, None for all; empty for all.
+        """
+        known = histories.item_ids >= 0
+        histories = histories if known.all() else histories.with_rows(known)
+        latest = histories.latest_session(self.trained.record.session_gap_ms, new)
+        at_once, count = _USERS_AT_ONCE, len(self.trained.items)
+        if self.index is None:
+            at_once = max(1, min(_USERS_AT_ONCE, _SCORES // count))
         # Sessions of about the same length share a pass, which costs as much as the longest.
-        lengths = np.bincount(latest.owner, minlength=len(latest.users))
-        order = np.argsort(lengths, kind="stable")
-        requests = request_ids(batch, self.seed)
-        parts = self._parts(latest, order, requests)
-        back = np.argsort(order, kind="stable")
-        items, values, propensities = (
-            np.concatenate(each)[back] for each in zip(*parts, strict=True)
-        )
-        kept = np.isfinite(values)
-        return pd.DataFrame(
-            {
-                schema.USER_ID: np.repeat(batch.users, kept.sum(1)),
-                RANK: np.cumsum(kept, axis=1)[kept],
-                schema.ITEM_ID: self.trained.items.ids[items[kept]],
-                SCORE: values[kept],
-                schema.PROPENSITY: propensities[kept],
-                schema.REQUEST_ID: np.repeat(requests, kept.sum(1)),
-            }
-        )
-
-    def _parts(
-        self, latest: Histories, order: IntArray, requests: Array
-    ) -> Iterator[tuple[Array, Array, Array]]:
-        """Items, their log-probabilities and propensities, (M, k) each, of some users after the
-        other."""
-        rule = self.scorer.rule
-        at_once = users_at_once(len(self.trained.items))
-        if self.index is not None:
-            at_once = _USERS_AT_ONCE
+        order = np.argsort(np.bincount(latest.owner, minlength=len(new)), kind="stable")
+        parts = []
         for first in range(0, len(order), at_once):
-            numbers = order[first : first + at_once]
-            part = latest.of_users(numbers)
-            users = self.trained.users.numbers(part.users)
-            sessions = sessions_of(self.trained, part, users, self.scorer.length)
-            left_out = left_out_of(rule, part)
-            if self.index is not None:
-                k = min(self.k, len(self.trained.items))
-                found = self.index.best(sessions, left_out, self.excluded, k)
-                yield found[0].numpy(), found[1].numpy(), np.ones(found[0].shape)
-                continue
-            scores = self.scorer.scores(sessions, left_out, self.excluded, empty=True)
-            n_items = scores.shape[1]
-            drawn = None
-            if rule.draws:
-                drawn = uniforms(part.users, requests[numbers], n_items + 1, self.seed)
-            items, values, chances = best_of(rule, scores, min(self.k, n_items), drawn)
-            yield items.numpy(), values.numpy(), chances.numpy()
+            users = order[first : first + at_once]
+            part = latest if len(order) == 1 else latest.of_users(users)
+            without = excluded
+            if any(allowed is not None for allowed in candidates):
+                without = _exclude_all_but([candidates[user] for user in users], count)
+            parts.append(self._choose_together(part, requests[users], min(k, count), without))
+        back = np.argsort(order, kind="stable")
+        items, scores, propensities = (
+            np.concatenate(arrays)[back] for arrays in zip(*parts, strict=True)
+        )
+        return items, scores, propensities
+
+    def _choose_together(
+        self, latest: Histories, requests: Array, k: int, excluded: Tensor | None
+    ) -> tuple[Array, Array, Array]:
+        """`choose` with one forward pass, of latest sessions."""
+        rule = self.scorer.rule
+        sessions = sessions_of(self.trained, latest, self.scorer.length)
+        left_out = _left_out(rule, latest)
+        if self.index is not None:
+            items, values = self.index.best(sessions, left_out, excluded, k)
+            return items.numpy(), values.numpy(), np.ones(items.shape)
+        scores = self.scorer.scores(sessions, left_out, excluded, empty=True)
+        drawn = None
+        if rule.draws:
+            drawn = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
+        items, values, propensities = _choose_best(rule, scores, k, drawn)
+        return items.numpy(), values.numpy(), propensities.numpy()
 
 
-def users_at_once(n_items: int) -> int:
-    """Users of a forward pass that scores `n_items` items."""
-    return max(1, min(_USERS_AT_ONCE, _SCORES // n_items))
+def _exclude_all_but(candidates: Sequence[IntArray | None], n_items: int) -> Tensor:
+    """(B, n_items) true for items that are not among a user's candidates; none for None."""
+    excluded = torch.zeros(len(candidates), n_items, dtype=torch.bool)
+    for row, allowed in enumerate(candidates):
+        if allowed is not None:
+            excluded[row] = True
+            excluded[row, allowed] = False
+    return excluded
 
 
 @torch.inference_mode()
-def best_of(
+def _choose_best(
     rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`k` items (B, k), their log-probabilities (B, k) at temperature 1 among those left, −∞ for
@@ -200,14 +219,6 @@ def best_of(
     return items, values.masked_fill(none, -torch.inf), propensities
 
 
-def _all_but(index: IdLookup, candidates: Iterable[Any], skip_unknown: bool) -> Tensor:
-    """(n_items,) true for the items that are not among the candidates."""
-    ids = require_ids("candidates", candidates, schema.ITEM_ID)
-    excluded = torch.ones(len(index), dtype=torch.bool)
-    excluded[torch.from_numpy(candidate_numbers(index, ids, skip_unknown))] = False
-    return excluded
-
-
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
     """Numbers (N,) of the items that may be recommended.
 
@@ -224,12 +235,12 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
         remedy = "name items of its catalogue" if skip_unknown else "leave them out"
         raise InputError(
             f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
-            f"({some_of(unknown)}); {remedy}"
+            f"({name_some(unknown)}); {remedy}"
         )
     return numbers[known]
 
 
-def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
+def _unknown_items(index: IdLookup, batches: Iterable[Histories]) -> InputError:
     rows, items = 0, set[Any]()
     for batch in batches:
         unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
@@ -239,25 +250,21 @@ def _unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
     count = "1 item" if len(items) == 1 else f"{len(items)} items"
     return InputError(
         f"{rows} {have} an item_id that the policy does not know ({count}: "
-        f"{some_of(sorted(items))}); prepare and train on logs with them, or leave those rows out "
-        "with --skip-unknown (skip_unknown=True in Python)"
+        f"{name_some(sorted(items))}); prepare and train on logs with them, or leave those rows "
+        "out with --skip-unknown (skip_unknown=True in Python)"
     )
 
 
-def some_of(values: Sequence[Any]) -> str:
+def name_some(values: Sequence[Any]) -> str:
     """The first of the values, for a message."""
     return ", ".join(map(str, values[:3])) + (", …" if len(values) > 3 else "")
 
 
-def sessions_of(
-    trained: TrainedPolicy, histories: Histories, users: IntArray, length: int
-) -> Sessions:
+def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Sessions:
     """The sessions of users, each before the step for which items are scored.
 
     Args:
-        histories: U users with the N rows of their latest sessions, whose `item_ids` are the
-            policy's numbers of items.
-        users: (U,) index of each user in the training store, −1 for others.
+        histories: U users with the N rows of their latest sessions, of `with_numbers`.
         length: items of a session that are read.
 
     Raises:
@@ -274,17 +281,14 @@ def sessions_of(
             )
         seen = torch.from_numpy(np.delete(logged, trained.dropped, axis=1))
         observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
-    rows = histories.owner, histories.item_ids, histories.rewards
-    return Sessions.of_rows(*rows, users, length, observations)
+    users = trained.users.numbers(histories.users)
+    rows, rewards = histories.item_ids, histories.rewards
+    return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)
 
 
-def left_out_of(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:
+def _left_out(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:
     """Rows (N,) and items (N,) of what is not recommended: the known ones of `seen_ids`, and what
-    the latest sessions have shown, if the rule excludes it.
-
-    Args:
-        histories: see `sessions_of`; `seen_ids` are numbers of items, −1 for unknown ones.
-    """
+    the latest sessions have shown, if the rule excludes it."""
     known = histories.seen_ids >= 0
     rows, items = [histories.seen_owner[known]], [histories.seen_ids[known]]
     if rule.exclude_seen:
@@ -293,7 +297,7 @@ def left_out_of(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tenso
     return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(items))
 
 
-def request_ids(batch: Histories, seed: int) -> Array:
+def _request_ids(batch: Histories, seed: int) -> Array:
     """(U,) text that tells the requests of each user apart: the seed and the time (ms) of the
     user's last row, so that a replay draws the same and later rows draw anew."""
     last = np.zeros(len(batch.users), dtype=np.int64)

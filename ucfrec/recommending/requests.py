@@ -3,10 +3,10 @@
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Final, NamedTuple, NotRequired
+from typing import Annotated, Any, Final, NotRequired
 
 import numpy as np
 import pandas as pd
@@ -24,10 +24,11 @@ from pydantic import (
 from typing_extensions import TypedDict
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Array
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.kept import DAY_MS, kept_in_order
+from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.later_logs import reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -46,16 +47,16 @@ _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
 
 
-def _milliseconds(given: float | str) -> float:
+def _milliseconds(value: float | str) -> float:
     """A time of a request in milliseconds since 1970.
 
     Raises:
         ValueError: it is text, but not of ISO 8601.
     """
-    if not isinstance(given, str):
-        return given
+    if not isinstance(value, str):
+        return value
     try:
-        time = datetime.fromisoformat(given.strip())
+        time = datetime.fromisoformat(value.strip())
         return (time.replace(tzinfo=time.tzinfo or UTC) - _EPOCH) // timedelta(milliseconds=1)
     except (ValueError, OverflowError):
         raise ValueError(
@@ -152,24 +153,7 @@ class StreamRequest(Request):
     user."""
 
 
-class UserHistory(NamedTuple):
-    """What a request says about its user: n rows in the order of time."""
-
-    item_ids: Array
-    """(n,) integers or text."""
-    rewards: Float32Array
-    """(n,) in reward units."""
-    timestamps: IntArray
-    """(n,) milliseconds."""
-    session_ids: Array | None
-    """(n,) integers or text; None if sessions are not split by them."""
-    seen: Array
-    """(m,) all items of the request's rows, also of those before the n."""
-    observation: list[float] | None
-    """(O,) of the last row; None if the policy has none."""
-
-
-def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
+def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
     """Read a request.
 
     Args:
@@ -187,43 +171,40 @@ def parsed(kind: type[Request], text: bytes, limits: Limits) -> Any:
             raise InputError(
                 f"the request has {faults:,} faults; most are entries that requests do not have"
             ) from None
-        raise InputError(fault_of(error.errors(include_url=False))) from None
-    require_within(request, limits)
+        raise InputError(_describe(error.errors(include_url=False))) from None
+    _require_within(request, limits)
     return request
 
 
-def fault_of(errors: Sequence[Any]) -> str:
+def _describe(errors: Sequence[Any]) -> str:
     """The first of pydantic's errors in one line, and how many there are: one a place."""
-    first, faults = errors[0], len({_place(error) for error in errors})
+    first, places = errors[0], [_place(error) for error in errors]
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_lower(first['msg'])})"
-    where = ".".join(map(str, _place(first))) or "the request"
-    given = first.get("input")
-    shown = "" if isinstance(given, (dict, list)) else f", not {_short(given)}"
-    more = f"; {faults - 1} more fault{'s' * (faults > 2)}" if faults > 1 else ""
-    return f"{where}: {_wanted(errors)}{shown}{more}"
-
-
-def _wanted(errors: Sequence[Any]) -> str:
-    """What the place of the first error takes."""
-    first = errors[0]
-    same = [error for error in errors if _place(error) == _place(first)]
-    if len(same) == 1:
-        return _lower(first["msg"])
-    for error in same:
-        if error["type"] == "string_too_long":
-            return _lower(error["msg"])
-    kinds = {error["loc"][-1] for error in same}
-    if "float" in kinds:
-        kinds.discard("constrained-int")
-    return f"give {' or '.join(words for kind, words in _KINDS.items() if kind in kinds)}"
+    where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
+    wanted = dict.fromkeys(
+        _lower(error["msg"])
+        for error, place in zip(errors, places, strict=True)
+        if place == places[0]
+    )
+    value = json.dumps(first.get("input"), default=str)
+    value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
+    shown = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
+    return (
+        f"{where}: {' or '.join(wanted)}{shown}"
+        f"{f'; {more} more fault' + 's' * (more > 1) if more else ''}"
+    )
 
 
 def _place(error: Any) -> tuple[str | int, ...]:
     """Where an error is, whichever of the types that the place takes it is about."""
     place: tuple[str | int, ...] = error["loc"]
-    named = error["type"] == "extra_forbidden" or place[-1:] == () or place[-1] not in _KINDS
+    named = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
     return place if named else place[:-1]
+
+
+_TYPES: Final = ("constrained-str", "float", "constrained-int")
+"""Last part of pydantic's place of an error in one of several types."""
 
 
 def _lower(message: str) -> str:
@@ -231,20 +212,7 @@ def _lower(message: str) -> str:
     return message[:1].lower() + message[1:]
 
 
-_KINDS: Final = {
-    "constrained-str": "text",
-    "float": "a finite number",
-    "constrained-int": "an integer of 64 bits",
-}
-"""Last part of pydantic's place of an error in one of several types, and what that type takes."""
-
-
-def _short(value: object) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
-
-
-def require_within(request: Request, limits: Limits) -> None:
+def _require_within(request: Request, limits: Limits) -> None:
     """Check the limits of a request, but for its bytes.
 
     Raises:
@@ -257,9 +225,9 @@ def require_within(request: Request, limits: Limits) -> None:
     }
     if isinstance(request, StreamRequest):
         counts["interactions"] = (len(request.interactions), limits.history)
-    for name, (given, most) in counts.items():
-        if given > most:
-            raise InputError(f"{given:,} {name}: the limit is {most:,}; request less")
+    for name, (count, most) in counts.items():
+        if count > most:
+            raise InputError(f"{count:,} {name}: the limit is {most:,}; request less")
 
 
 @dataclass(frozen=True)
@@ -283,7 +251,7 @@ class HistoryReader:
             RowRewards(reward_of(trained)),
         )
 
-    def read(self, rows: Sequence[Row], user_id: int | str) -> UserHistory:
+    def read(self, rows: Sequence[Row], user_id: int | str) -> Histories:
         """The history of the rows of one user.
 
         Raises:
@@ -294,49 +262,52 @@ class HistoryReader:
         items = id_array([row["item_id"] for row in rows])
         columns = {
             "user": np.zeros(len(rows), dtype=np.int64),
-            schema.TIMESTAMP: np.asarray(_times(rows), dtype=np.int64),
+            schema.TIMESTAMP: np.asarray(_read_times(rows), dtype=np.int64),
             schema.ITEM: items,
             "row": np.arange(len(rows)),
         }
         sessions = None
         if self.by_session_id:
-            _require(rows, schema.SESSION_ID)
-            sessions = id_array([row["session_id"] for row in rows])
+            sessions = id_array([_session_id(n, row) for n, row in enumerate(rows)])
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
-            given = [row.get("observation") or () for row in rows]
-            if {*map(len, given)} == {self.observation_size}:
-                columns[schema.OBSERVATION] = np.asarray(given, dtype=np.float64)
+            observed = [row.get("observation") or () for row in rows]
+            if {*map(len, observed)} == {self.observation_size}:
+                columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
         order = kept_in_order(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
-        observation = None
+        observations = None
         if self.observation_size:
-            observation = self._observation(rows, int(order[-1]))
-        return UserHistory(
-            items[order],
-            columns[schema.REWARD][order].astype(np.float32),
-            columns[schema.TIMESTAMP][order],
-            None if sessions is None else sessions[order],
-            pd.unique(items),
-            observation,
+            last = self._observation(rows, int(order[-1]))
+            observations = np.asarray([last], dtype=np.float32)
+        seen = pd.unique(items)
+        return Histories(
+            users=id_array([user_id]),
+            owner=np.zeros(len(order), dtype=np.int64),
+            item_ids=items[order],
+            rewards=columns[schema.REWARD][order].astype(np.float32),
+            timestamps=columns[schema.TIMESTAMP][order],
+            session_ids=None if sessions is None else sessions[order],
+            seen_owner=np.zeros(len(seen), dtype=np.int64),
+            seen_ids=seen,
+            observations=observations,
         )
 
     def _observation(self, rows: Sequence[Row], last: int) -> list[float]:
-        given = rows[last].get("observation")
-        if given is None or len(given) != self.observation_size:
-            size = "none" if given is None else f"{len(given)} numbers"
+        values = rows[last].get("observation") or []
+        if len(values) != self.observation_size:
             raise InputError(
-                f"history.{last}: the observation has {size}; the policy needs "
+                f"history.{last}: the observation has {len(values)} numbers; the policy needs "
                 f"{self.observation_size}"
             )
-        if max(map(abs, given)) > _LARGEST_FLOAT:
+        if max(map(abs, values)) > _LARGEST_FLOAT:
             raise InputError(
                 f"history.{last}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
             )
-        return [float(value) for value in given]
+        return [float(value) for value in values]
 
 
-def _times(rows: Sequence[Row]) -> list[int]:
+def _read_times(rows: Sequence[Row]) -> list[int]:
     latest = time.time() * 1000 + DAY_MS
     times = []
     for n, row in enumerate(rows):
@@ -353,12 +324,13 @@ def _times(rows: Sequence[Row]) -> list[int]:
 
 def id_array(ids: Sequence[int | str]) -> Array:
     """Identifiers as int64 if all are integers, otherwise as text."""
-    if all(isinstance(each, int) for each in ids):
+    if all(isinstance(value, int) for value in ids):
         return np.asarray(ids, dtype=np.int64)
     return np.asarray(list(map(str, ids)), dtype=object)
 
 
-def _require(rows: Sequence[Mapping[str, Any]], name: str) -> None:
-    for n, row in enumerate(rows):
-        if row.get(name) is None:
-            raise InputError(f"history.{n} has no {name}, by which the run splits sessions")
+def _session_id(n: int, row: Row) -> int | str:
+    session = row.get("session_id")
+    if session is None:
+        raise InputError(f"history.{n} has no session_id, by which the run splits sessions")
+    return session

@@ -1,14 +1,23 @@
-"""The web server's process: how and where it listens, and saying that it is ready."""
+"""Web servers: how and where they listen, which hosts they answer for, and when they are ready."""
 
+import re
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 import uvicorn
-from starlette.types import ASGIApp
+from fastapi import Response
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ucfrec.errors import InputError, explain_os_error
+from ucfrec.files.atomic import json_text
+
+_HOST_HEADER: Final = re.compile(r"(\[[0-9a-f:.]+\]|[^:\[\]]*)(:\d*)?")
+"""A host, in brackets if it is an address of IP version 6, and perhaps a port."""
+_SHOWN: Final = 100
+"""Most characters of a refused host in a message."""
 
 
 def server_config(application: ASGIApp, **more: Any) -> uvicorn.Config:
@@ -79,3 +88,34 @@ class PrintingServer(Server):
 
     def __init__(self, config: uvicorn.Config, what: str, page: str = "/docs") -> None:
         super().__init__(config, lambda at: print(ready_line(what, at, page), flush=True))
+
+
+class AllowedHosts:
+    """ASGI middleware that answers 400, with an error as JSON, to requests for other hosts."""
+
+    def __init__(self, app: ASGIApp, allowed: Sequence[str], remedy: str) -> None:
+        """
+        Args:
+            allowed: hosts without a port, *.example.org for all names below, or * for any.
+            remedy: what to do about a refusal.
+        """
+        hosts = [host.lower() for host in allowed]
+        self._app, self._remedy, self._any = app, remedy, "*" in hosts
+        self._names = frozenset(hosts)
+        self._endings = tuple(host[1:] for host in hosts if host.startswith("*."))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it."""
+        answer = self._app
+        if scope["type"] == "http" and not self._any:
+            host_header = Headers(scope=scope).get("host", "")
+            if not self._is_allowed(host_header):
+                message = f"requests for the host {host_header[:_SHOWN]!r} are not answered; "
+                error = json_text({"error": message + self._remedy})
+                answer = Response(error, 400, media_type="application/json")
+        await answer(scope, receive, send)
+
+    def _is_allowed(self, host_header: str) -> bool:
+        match = _HOST_HEADER.fullmatch(host_header.lower())
+        host = match.group(1) if match else ""
+        return host in self._names or host.endswith(self._endings)

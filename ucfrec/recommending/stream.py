@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.exposures import ExposureLog
-from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parsed
+from ucfrec.recommending.requests import Limits, Request, Row, StreamRequest, parse
 from ucfrec.recommending.responder import Responder, exact_id
 
 REMEMBERED: Final = 1_000_000
@@ -100,7 +100,7 @@ def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
         raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
     if not line.strip():
         raise InputError("the line is blank; send a request on each line")
-    request: StreamRequest = parsed(StreamRequest, line, limits)
+    request: StreamRequest = parse(StreamRequest, line, limits)
     return request
 
 

@@ -24,11 +24,11 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
 from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.exposures import ExposureLog
-from ucfrec.recommending.hosts import AllowedHosts
 from ucfrec.recommending.metrics import ServingMetrics
-from ucfrec.recommending.requests import Request, parsed
+from ucfrec.recommending.requests import Request, parse
 from ucfrec.recommending.responder import Answer, Responder
 from ucfrec.recommending.served import Served
+from ucfrec.recommending.server import AllowedHosts
 from ucfrec.settings import settings_table
 
 _HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
@@ -216,7 +216,7 @@ async def _answered(
         async with asyncio.timeout(limits.timeout):
             body = await _body(http, responder.limits.bytes)
             arrived = True
-            request: Request = parsed(Request, body, responder.limits)
+            request: Request = parse(Request, body, responder.limits)
             outcome = await batcher.answer(request)
     except _TooLargeError as error:
         return 413, {"error": str(error)}

@@ -1,6 +1,6 @@
 """Sessions simulated in a user model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -8,8 +8,7 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.states import SessionStates
+from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
 
@@ -100,26 +99,24 @@ class UserSimulator:
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
         self._logged = LoggedRewards.of(store)
-        n, lags = sessions * times, model.rewarding.lags
-        self._numbers, self._steps = np.arange(n) % sessions, np.zeros(n, dtype=np.int64)
+        n, self._lags = sessions * times, model.rewarding.lags
+        self._numbers = np.arange(n) % sessions
         self._episodes = self._numbers % store.n_episodes
-        self._shown = Shown(torch.full((n, lags), -1), torch.zeros(n, lags))
-        self._states = SessionStates(store.item_states, n)
-        self._states.users = torch.full((n,), -1)
+        self._sessions = Sessions.begun(n, max(self._lags, store.item_states.window))
         if store.has_users:
-            users = store.episode_values(schema.USER).astype(np.int64)
-            self._states.users = torch.from_numpy(users[self._episodes])
+            users = store.episode_values(schema.USER).astype(np.int64)[self._episodes]
+            self._sessions = replace(self._sessions, users=torch.from_numpy(users))
 
     @property
     def users(self) -> IntArray:
         """(M,) rows of the store's users, −1 where it does not name them."""
-        return self._states.users.numpy()
+        return self._sessions.users.numpy()
 
     def observations(self) -> Float32Array:
         """(M, O) observations before the next step."""
         if not self._store.observation_size:
-            return np.zeros((len(self._steps), 0), dtype=np.float32)
-        steps = np.minimum(self._steps, self._store.lengths[self._episodes] - 1)
+            return np.zeros((len(self._numbers), 0), dtype=np.float32)
+        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
         values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
         return np.asarray(values, dtype=np.float32)
 
@@ -134,31 +131,24 @@ class UserSimulator:
             then on.
         """
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
-        states = self._states.current(torch.from_numpy(self.observations()))
-        expected = self._model.expected(states, self._shown, self._states.users, items)
+        observations = torch.from_numpy(self.observations())
+        states = self._sessions.latest_states(self._store.item_states, observations)
+        shown, users = self._sessions.shown.latest(self._lags), self._sessions.users
+        before = self._sessions.steps.numpy()
+        expected = self._model.expected(states, shown, users, items)
         rewards = self._logged.drawn(expected, self._draws())
-        ends = self._model.session_end.probabilities(self._shown, items, rewards, self._steps)
-        paid = torch.from_numpy(rewards)
-        self._states.record(items, paid)
-        latest = Shown(items.unsqueeze(1), paid.float().unsqueeze(1))
-        pairs = zip(latest, self._shown, strict=True)
-        self._shown = Shown(*(torch.cat([new, old[:, :-1]], 1) for new, old in pairs))
-        self._steps += 1
-        ended: BoolArray = (self._draws() < ends) | (self._steps >= self._longest)
+        ends = self._model.session_end.probabilities(shown, items, rewards, before)
+        self._sessions = self._sessions.with_step(items, torch.from_numpy(rewards))
+        ended: BoolArray = (self._draws() < ends) | (before + 1 >= self._longest)
         going = np.flatnonzero(~ended)
         if len(going) < len(ended):
-            self._keep(going)
+            self._sessions = self._sessions.at(going)
+            self._episodes, self._numbers = self._episodes[going], self._numbers[going]
         return rewards.astype(np.float32), going
 
     def _draws(self) -> Float64Array:
         """(M,) from [0, 1)."""
         return self._rng.random(self._different)[self._numbers]
-
-    def _keep(self, rows: IntArray) -> None:
-        self._states.keep(rows)
-        self._shown = self._shown.at(torch.from_numpy(rows))
-        for name in ("_steps", "_episodes", "_numbers"):
-            setattr(self, name, getattr(self, name)[rows])
 
 
 def longest_session(lengths: IntArray) -> int:

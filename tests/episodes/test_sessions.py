@@ -1,15 +1,15 @@
 """Windows of running sessions are those of a store with the same rows, to the last bit."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 import torch
 
 from tests.support.episodes import N_ITEMS, some_states
 from ucfrec import schema
-from ucfrec.acting.sessions import Sessions
+from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
 
 USERS = 3
 
@@ -31,12 +31,22 @@ def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
     store = EpisodeStore.from_arrays(columns, counts + 1, {schema.USER: users}, states)
     expected = store.windows(np.arange(len(counts)), counts, context)
     observations = torch.from_numpy(seen).unsqueeze(1).expand(-1, 25, -1) if observation else None
+    at = store, np.arange(len(counts)), counts
     for length in (context - 1 + states.window, 60):
-        sessions = Sessions.of_rows(owner, items, rewards, users, length, observations)
-        found = sessions.history(states, context).windows
-        for field in fields(expected):
-            if field.name != "returns_to_go":
-                assert torch.equal(getattr(found, field.name), getattr(expected, field.name))
-        collected = np.bincount(owner, rewards, minlength=len(counts))
-        np.testing.assert_allclose(sessions.collected.numpy(), collected)
-        assert sessions.shown.items[2, :3].tolist() == items[30:27:-1].tolist()
+        requested = Sessions.from_rows(owner, items, rewards, users, length, observations)
+        logged = Sessions.from_store(*at, context, length)
+        for sessions in (requested, logged):
+            _compare(sessions, states, context, expected)
+            collected = np.bincount(owner, rewards, minlength=len(counts))
+            np.testing.assert_allclose(sessions.collected.numpy(), collected)
+            assert sessions.shown.items[2, :3].tolist() == items[30:27:-1].tolist()
+
+
+def _compare(sessions: Sessions, states: ItemStates, context: int, expected: Windows) -> None:
+    """The windows are the expected ones but for the step to decide."""
+    windows = sessions.windows(states, context)
+    for name in ("states", "timesteps", "mask"):
+        assert torch.equal(getattr(windows, name), getattr(expected, name))
+    for name in ("actions", "rewards"):
+        assert torch.equal(getattr(windows, name)[:, :-1], getattr(expected, name)[:, :-1])
+        assert not getattr(windows, name)[:, -1].any()

@@ -140,7 +140,7 @@ class ItemProduct:
     def of_policy(self, history: History) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from a history with its target."""
         device, shown = self._policy.state_mean.device, history.shown
-        normalized = self._policy.normalized(history.windows.to(device))
+        normalized = self._policy.normalize(history.windows.to(device))
         features = self._features(normalized)
         nothing = features.new_zeros(features.shape[0], self._columns)
         part = Part(features / features.shape[-1] ** 0.5, nothing, nothing)

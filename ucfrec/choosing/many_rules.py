@@ -62,7 +62,7 @@ def roll_out(
     actor = _ManyRules(scorers, sessions, states, observation_size, seed)
     live = np.arange(len(scorers) * sessions)
     returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
-    shown = list[IntArray]()
+    decisions = list[IntArray]()
     with progress(len(live), "choose the rule", "sessions") as bar:
         while len(live):
             actor.inform({USER_IDS: simulator.users})
@@ -71,16 +71,16 @@ def roll_out(
             actor.observe(items, rewards)
             returns[live] += rewards
             lengths[live] += 1
-            shown.append(np.stack([live, items], axis=1))
+            decisions.append(np.stack([live, items], axis=1))
             bar.update(len(live) - len(going))
             if len(going) < len(live):
                 live = live[going]
                 actor.keep(going)
-    numbers, items = np.concatenate(shown).T
-    of_rules = np.split(returns, len(scorers)), np.split(lengths, len(scorers))
+    numbers, items = np.concatenate(decisions).T
+    parts = (slice(n * sessions, (n + 1) * sessions) for n in range(len(scorers)))
     return [
-        Sessions(mine, steps, items[numbers // sessions == rule])
-        for rule, (mine, steps) in enumerate(zip(*of_rules, strict=True))
+        Sessions(returns[part], lengths[part], items[numbers // sessions == rule])
+        for rule, part in enumerate(parts)
     ]
 
 
@@ -111,23 +111,25 @@ class _ManyRules(PolicyActor):
     def _decided(
         self, rows: Tensor, history: History, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        decided = []
+        decisions = []
         for batch in _batches(self._rule[rows.numpy()]):
-            parts = [history.at(part) for _, part in batch]
-            aimed = [
-                self._scorers[rule].with_target(known).windows
-                for (rule, _), known in zip(batch, parts, strict=True)
+            histories = [history.at(part) for _, part in batch]
+            windows = [
+                self._scorers[rule].with_target(own).windows
+                for (rule, _), own in zip(batch, histories, strict=True)
             ]
             begin, end = batch[0][1].start, batch[-1][1].stop
-            together = replace(history.at(slice(begin, end)), windows=Windows.joined(aimed))
+            together = replace(history.at(slice(begin, end)), windows=Windows.joined(windows))
             weighted = any(self._scorers[rule].rule.reward_weight for rule, _ in batch)
             query = self._scorer.query(together, rewards=weighted)
-            for (rule, part), known in zip(batch, parts, strict=True):
-                scorer, own = self._scorers[rule], slice(part.start - begin, part.stop - begin)
-                of_rule = None if excluded is None else excluded[part]
-                scores = scorer.scores_of(query.at(own), known, excluded=of_rule)
-                decided.append(scorer.rule.choose(scores, self._generators[rule]))
-        items, chances = zip(*decided, strict=True)
+            for (rule, part), own in zip(batch, histories, strict=True):
+                scorer = self._scorers[rule]
+                of_rule = query.at(slice(part.start - begin, part.stop - begin))
+                scores = scorer.scores_of(
+                    of_rule, own, excluded=None if excluded is None else excluded[part]
+                )
+                decisions.append(scorer.rule.choose(scores, self._generators[rule]))
+        items, chances = zip(*decisions, strict=True)
         return torch.cat(items), torch.cat(chances)
 
 

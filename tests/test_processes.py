@@ -20,9 +20,9 @@ from tests.support.signals import wait_until_handled
 from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
 from ucfrec.runs.config import resolve_config
@@ -290,7 +290,7 @@ def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: st
 def test_collecting_and_evaluating(environment: str, tmp_path: Path) -> None:
     at = Environment(environment)
     with unnoticed():
-        simulated_store(at, tmp_path, 60, 0)
+        collect_store(at, tmp_path, 60, 0)
     config = resolve_config("bc", None, {"train.steps": 2, "policy.dim": 8})
     train_run(EpisodeStore.open(tmp_path / "store"), tmp_path / "run", config)
     trained = TrainedPolicy.load(tmp_path / "run")

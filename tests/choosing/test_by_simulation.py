@@ -138,9 +138,9 @@ def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: Train
 def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained)
     (simulated,) = search.simulate([DecisionRule(2.0, temperature=1.0)])
-    assert search.allowed(simulated)
-    assert not search.allowed(replace(simulated, support=0.5))
-    assert not search.allowed(replace(simulated, items=1.0))
+    assert search.is_allowed(simulated)
+    assert not search.is_allowed(replace(simulated, support=0.5))
+    assert not search.is_allowed(replace(simulated, items=1.0))
     worse = replace(simulated, value=simulated.value - 10)
     better = replace(simulated, value=simulated.value + 10, items=1.0)
     assert search.best([better, worse, simulated]) == simulated
@@ -283,7 +283,7 @@ def test_rules_of_the_highest_value_are_simulated_in_more_sessions(
             for reward_weight in reward_weights
         ]
     )
-    allowed = [each for each in simulated if search.allowed(each)]
+    allowed = [each for each in simulated if search.is_allowed(each)]
     worst = min(allowed, key=lambda each: each.value)
     again = search.finalists(simulated, worst)
     assert again[0].rule == worst.rule

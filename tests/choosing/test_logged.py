@@ -94,8 +94,8 @@ def test_only_rules_that_the_log_can_evaluate_are_chosen(folder: Path) -> None:
     assert best.effective_users < 12
     search = RuleSearch(problem(folder, 10**6))
     tried = search.simulate([each.rule for each in bound.candidates])
-    assert not any(search.allowed(each) for each in tried)
-    assert set(search.level(tried)) <= {*filter(search.supported, tried)}
+    assert not any(search.is_allowed(each) for each in tried)
+    assert set(search.level(tried)) <= {*filter(search.is_supported, tried)}
     assert chosen.evidence is not None
     known = replace(chosen, evidence=replace(chosen.evidence, effective_users=1e6))
     assert search.level([*tried, known]) == [known]

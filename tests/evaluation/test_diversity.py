@@ -17,6 +17,7 @@ from ucfrec.acting.rollout import Step, rollout
 from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.diversity import (
     COLUMNS,
     Recommended,
@@ -29,9 +30,8 @@ from ucfrec.evaluation.diversity import (
     tag_jaccard,
     variety_columns,
 )
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views
@@ -173,7 +173,7 @@ def test_what_is_unknown_is_null() -> None:
 
 def test_a_run_knows_its_training_log(tmp_path: Path) -> None:
     environment = Environment("synthetic-catalog")
-    store = EpisodeStore.open(simulated_store(environment, tmp_path, 60, 0))
+    store = EpisodeStore.open(collect_store(environment, tmp_path, 60, 0))
     settings = ("train.steps=2", "train.validate_every=2", "policy.dim=8")
     train_run(store, tmp_path / "run", resolve_config("popular", None, settings))
     trained = TrainedPolicy.load(tmp_path / "run")

@@ -138,7 +138,7 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     assert head.exposure is not None
     for parameter in head.exposure.parameters():
         parameter.data += 0.1
-    normalized = policy.normalized(windows)
+    normalized = policy.normalize(windows)
     with torch.no_grad():
         plain = head.predict(policy.features(normalized)[:, -1])
         last = torch.arange(1, len(plain) + 1) * K - 1
@@ -158,7 +158,7 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
 
 def reference_loss(policy: SequencePolicy, windows: Any) -> Tensor:
     """The action loss as it was without shared components."""
-    features = policy.features(policy.normalized(windows))
+    features = policy.features(policy.normalize(windows))
     return policy.head.loss(features[windows.mask], windows.actions[windows.mask])
 
 
@@ -185,7 +185,7 @@ def test_without_additions_the_action_loss_is_that_of_the_head(
 @kinds
 def test_the_loss_is_weighted_by_the_advantage(sizes: dict[str, int]) -> None:
     policy, windows = build("dt", sizes, **ADDITIONS).eval(), random_windows(sizes)
-    normalized = policy.normalized(windows)
+    normalized = policy.normalize(windows)
     assert policy.values is not None
     mask = windows.mask
     values = policy.values(normalized, policy.head.embed(windows.actions))[mask]

@@ -16,9 +16,16 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.cdt4rec import CDT4RecPolicy
-from ucfrec.policies.cql import ConservativeQ, CQLConfig, optimistic_returns, relabelled
 from ucfrec.policies.dt4rec import DT4RecPolicy
-from ucfrec.policies.edt4rec import EDT4RecPolicy, _consistent, _entropy
+from ucfrec.policies.edt4rec import (
+    ConservativeQ,
+    CQLConfig,
+    EDT4RecPolicy,
+    _consistent,
+    _entropy,
+    optimistic_returns,
+    relabelled,
+)
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
@@ -80,10 +87,10 @@ def test_the_reward_estimator_learns_the_reward_of_the_action_taken(sizes: dict[
     first = policy.loss(windows)[1]["reward_loss"]
     trained(policy, windows)
     assert policy.loss(windows)[1]["reward_loss"] < 0.1 * first
-    hidden = policy.transform(policy.normalized(windows))
+    hidden = policy.transform(policy.normalize(windows))
     estimate = policy.estimated_rewards(hidden, windows.mask)
     later = changed_at(windows, (slice(None), 6), ("actions",))
-    hidden = policy.transform(policy.normalized(later))
+    hidden = policy.transform(policy.normalize(later))
     moved = policy.estimated_rewards(hidden, windows.mask)
     torch.testing.assert_close(moved[:, :6], estimate[:, :6])
     assert not torch.allclose(moved[:, 6], estimate[:, 6])
@@ -112,7 +119,7 @@ def test_the_contrast_teaches_to_answer_what_was_asked(sizes: dict[str, int]) ->
         assert isinstance(policy, DT4RecPolicy)
         trained(policy, windows, 60)
         torch.manual_seed(0)
-        normalized = policy.normalized(windows)
+        normalized = policy.normalize(windows)
         encoded = policy.tokens(normalized)[1:]
         features = policy.features(normalized)
         return policy.contrastive_loss(normalized, encoded, features).item()
@@ -131,7 +138,7 @@ def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str
         assert isinstance(policy, EDT4RecPolicy)
         before = policy.log_multiplier.item()
         trained(policy, windows, 250)
-        features = policy.features(policy.normalized(_consistent(windows)))[windows.mask]
+        features = policy.features(policy.normalize(_consistent(windows)))[windows.mask]
         entropies[beta] = _entropy(policy.head, features, None).item()
         if beta < 0:
             assert policy.log_multiplier.item() < before

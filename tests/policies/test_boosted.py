@@ -20,7 +20,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[BoostedPolicy, Epi
     settings = {"policy.context": 6, "policy.boosted": 5}
     policy = new_policy(store, resolve_config("boosted", None, settings)).eval()
     assert isinstance(policy, BoostedPolicy)
-    policy.closed_form(store, None, Path(), 0)()
+    policy.make_solver(store, None, Path(), 0)()
     return policy, store
 
 

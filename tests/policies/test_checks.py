@@ -150,9 +150,9 @@ def test_state_outside_parameters_and_buffers_is_refused(store: EpisodeStore) ->
 
 def test_reserved_names_may_not_be_defined(store: EpisodeStore) -> None:
     class Other(Net):
-        def normalized(self, windows: Windows) -> Windows:
+        def normalize(self, windows: Windows) -> Windows:
             return windows
 
     sizes = policy_sizes(store)
-    with pytest.raises(InputError, match="defines normalized"):
+    with pytest.raises(InputError, match="defines normalize"):
         check_policy(Other(PolicyConfig(), sizes), store, sizes)

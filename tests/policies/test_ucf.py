@@ -1,20 +1,31 @@
 """Invariants of the architectures: what must never move a prediction, and what must."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy, interleave
-from ucfrec.policies.losses import parent_targets
 from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
 from ucfrec.policies.registry import policy_class
-from ucfrec.policies.ucf import _FEW, StackedStreams, UCFConfig, UCFPolicy
+from ucfrec.policies.ucf import (
+    _FEW,
+    EPSILON,
+    StackedStreams,
+    UCFConfig,
+    UCFPolicy,
+    mask_loss,
+    parent_targets,
+)
 
 B, K, S, A, ITEMS = 3, 7, 5, 2, 11
 VECTORS = {"state": S, "action": A, "items": 0}
@@ -73,7 +84,7 @@ def other(values: Tensor) -> Tensor:
 
 def predictions(policy: SequencePolicy, windows: Windows) -> Tensor:
     with torch.no_grad():
-        return policy.head.predict(policy.features(policy.normalized(windows)))
+        return policy.head.predict(policy.features(policy.normalize(windows)))
 
 
 both_heads = pytest.mark.parametrize("sizes", [VECTORS, CATALOG], ids=["vectors", "items"])
@@ -96,7 +107,7 @@ def changed_at(windows: Windows, where: Any, fields: tuple[str, ...]) -> Windows
 def test_the_last_features_are_the_last_row_of_all(name: str, sizes: dict[str, int]) -> None:
     policy, windows = build(name, sizes), random_windows(sizes)
     with torch.no_grad():
-        normalized = policy.normalized(windows)
+        normalized = policy.normalize(windows)
         expected = policy.features(normalized)[:, -1]
         torch.testing.assert_close(policy.last_features(normalized), expected)
 
@@ -237,7 +248,7 @@ def trained_attention(lambda_mask: float) -> tuple[Tensor, Tensor]:
     targets = parent_targets(
         windows.mask, config.parent_window, config.parent_decay, config.parent_action
     )
-    _, attention = policy.attend(policy.normalized(windows))
+    _, attention = policy.attend(policy.normalize(windows))
     return attention.detach().mean(1)[windows.mask], targets[windows.mask]
 
 
@@ -310,7 +321,7 @@ def test_stacked_streams_are_the_streams(
 ) -> None:
     policy = build("ucf", sizes)
     assert isinstance(policy, UCFPolicy)
-    windows = policy.normalized(random_windows(sizes, padding))
+    windows = policy.normalize(random_windows(sizes, padding))
     with torch.no_grad():
         expected = policy.last_features(windows)
         found = policy.acting_features()(windows)
@@ -323,7 +334,7 @@ def test_stacked_streams_are_the_streams(
 
 def test_many_windows_take_the_way_of_training() -> None:
     policy = build("ucf", CATALOG)
-    windows = policy.normalized(random_windows(CATALOG))
+    windows = policy.normalize(random_windows(CATALOG))
     many = Windows(*(getattr(windows, name).repeat_interleave(_FEW, 0) for name in vars(windows)))
     with torch.no_grad():
         assert torch.equal(policy.acting_features()(many), policy.last_features(many))
@@ -338,3 +349,59 @@ def test_a_learner_with_its_own_last_step_keeps_it() -> None:
     assert isinstance(policy.acting_features(), StackedStreams)  # type: ignore[unreachable]
     policy.__class__ = Own
     assert not isinstance(policy.acting_features(), StackedStreams)
+
+
+masks = st.integers(1, 6).flatmap(
+    lambda length: st.lists(st.integers(0, length - 1), min_size=1, max_size=4).map(
+        lambda padding: torch.arange(length) >= torch.tensor(padding).unsqueeze(1)
+    )
+)
+"""(B, K), padded on the left, with one step at least."""
+weights = st.sampled_from([0.0, 0.3, 0.6, 1.0])
+
+
+def naive_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> np.ndarray:
+    batch, length = mask.shape
+    targets = np.zeros((batch, length, 3 * length))
+    for b in range(batch):
+        for t in range(length):
+            if not mask[b, t]:
+                continue
+            parents = {3 * t: 1.0, 3 * t + 1: 1.0}  # Ĝ_t and s_t
+            for k in range(1, window + 1):
+                if t - k >= 0 and mask[b, t - k]:
+                    parents[3 * (t - k) + 1] = decay**k
+            if t >= 1 and mask[b, t - 1]:
+                parents[3 * (t - 1) + 2] = previous_action
+            for token, weight in parents.items():
+                targets[b, t, token] = weight / sum(parents.values())
+    return targets
+
+
+@given(masks, st.integers(0, 4), weights, weights)
+def test_targets_equal_a_plain_loop(
+    mask: Tensor, window: int, decay: float, previous_action: float
+) -> None:
+    got = parent_targets(mask, window, decay, previous_action)
+    np.testing.assert_allclose(
+        got, naive_targets(mask, window, decay, previous_action), rtol=1e-6, atol=1e-7
+    )
+
+
+@given(masks, st.integers(1, 4), st.integers(0, 99))
+def test_mask_loss_equals_a_plain_loop(mask: Tensor, heads: int, seed: int) -> None:
+    targets = parent_targets(mask, 2, 0.6, 0.2)
+    batch, length = mask.shape
+    generator = torch.Generator().manual_seed(seed)
+    attention = torch.randn(batch, heads, length, 3 * length, generator=generator).softmax(-1)
+    rows = [
+        -math.fsum(
+            float(targets[b, t, i]) * math.log(float(attention[b, h, t, i]) + EPSILON)
+            for i in range(3 * length)
+        )
+        for b in range(batch)
+        for h in range(heads)
+        for t in range(length)
+        if mask[b, t]
+    ]
+    assert float(mask_loss(attention, targets, mask)) == pytest.approx(np.mean(rows), rel=1e-5)

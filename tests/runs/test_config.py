@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.policies.cql import CQLConfig
+from ucfrec.policies.edt4rec import CQLConfig
 from ucfrec.policies.registry import BUILT_IN, policy_class
 from ucfrec.runs.config import TABLES, config_from_dict, resolve_config
 from ucfrec.settings import describe

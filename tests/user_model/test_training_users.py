@@ -23,9 +23,9 @@ from ucfrec.user_model.reward_report import RewardRows
 from ucfrec.user_model.training_users import (
     TrainingUsers,
     UserCalibration,
+    draw_sessions,
     fit_training_users,
     propensity_weights,
-    sessions_of,
 )
 
 USERS, LENGTH, ITEMS, KINDS = 250, 40, 20, 5
@@ -188,7 +188,7 @@ def test_logs_without_all_propensities_have_no_weights(told: dict[str, Float64Ar
 
 def test_sessions_are_drawn_by_the_seed() -> None:
     train, _ = log_of_tastes()
-    users = [sessions_of(train, seed).episode_values("user") for seed in (0, 0, 1)]
+    users = [draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1)]
     assert np.array_equal(users[0], users[1])
     assert not np.array_equal(users[0], users[2])
     assert sorted(users[0]) == sorted(train.episode_values("user"))

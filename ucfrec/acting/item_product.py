@@ -131,7 +131,7 @@ class ItemProduct:
     def policy_part(self, windows: Windows, shown: Shown) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from windows with their target returns."""
         device = self._policy.state_mean.device
-        normalized = self._policy.normalized(windows.to(device))
+        normalized = self._policy.normalize(windows.to(device))
         features = self._features(normalized)
         nothing = features.new_zeros(features.shape[0], self._columns)
         part = Part(features / features.shape[-1] ** 0.5, nothing, nothing)

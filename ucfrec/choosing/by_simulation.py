@@ -25,15 +25,15 @@ from ucfrec.choosing.choice import (
     RuleChoice,
     SimulatedRule,
     ValueEstimate,
-    chosen_by,
-    doubts_of,
+    describe_choice,
+    list_doubts,
 )
-from ucfrec.choosing.logged import Evidence, LoggedEvidence
+from ucfrec.choosing.logged import LoggedEvidence
 from ucfrec.choosing.many_rules import Outcomes, roll_out
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.model import UserModel
 from ucfrec.user_model.simulator import UserSimulator, longest_session
-from ucfrec.user_model.training_users import half_of, sessions_of
+from ucfrec.user_model.training_users import draw_sessions, halve_users
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
@@ -67,14 +67,13 @@ class RuleSearch:
         self.problem, self.users, self._config = problem, problem.users, problem.config
         train, seed = problem.train, problem.seed
         new = self.users.reward_report.new_users
-        self._store = sessions_of(train, seed) if new else problem.validation
+        self._store = draw_sessions(train, seed) if new else problem.validation
         self._longest = longest_session(train.lengths)
         self._supported = train.item_counts() >= self._config.least_impressions
         self.least_items = float(min(self._config.least_items, self._supported.sum() / 4))
         logged = problem.scorer, problem.validation
         self._many, self._few = (LoggedEvidence(*logged, most, seed) for most in _LOGGED_STEPS)
-        wanted = self._config.evidence if self._many.has_propensities else 0
-        self.least_users = float(wanted)
+        self.least_users = float(self._config.evidence if self._many.has_propensities else 0)
         """Effective users that a rule must leave; 0 without propensities."""
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
@@ -91,53 +90,55 @@ class RuleSearch:
             return []
         n = times * self._config.sessions
         first = n // _FIRST_PART if n >= _FIRST_PART * _FEWEST else n
-        begun = self._roll(rules, self._store, first, self.problem.seed)
-        self._sessions |= begun
-        found = [self._simulated(*each) for each in begun.items()]
+        sessions = self._roll(rules, self._store, first, self.problem.seed)
+        self._sessions |= sessions
+        candidates = [self._summarise(rule, played) for rule, played in sessions.items()]
         if 0 < self.least_users < self._many.users:
-            found = [replace(one, evidence=each) for one, each in self._with_evidence(found)]
-        return found if first == n else self._continued(found, n - first)
+            candidates = self._add_evidence(candidates)
+        return candidates if first == n else self._simulate_rest(candidates, n - first)
 
-    def _continued(self, begun: Sequence[SimulatedRule], n: int) -> list[SimulatedRule]:
+    def _simulate_rest(self, candidates: Sequence[SimulatedRule], n: int) -> list[SimulatedRule]:
         """The rules in `n` more sessions, where they are not far behind the best one."""
-        allowed = [each for each in begun if self.allowed(each)]
-        allowed = allowed or [each for each in begun if self.supported(each)]
-        top = max(allowed or begun, key=_value)
-        going = [each.rule for each in begun if not (allowed and self._far_behind(top, each))]
+        allowed = self._select_allowed(candidates)
+        top = max(allowed or candidates, key=_value)
+        rules = [
+            candidate.rule
+            for candidate in candidates
+            if not (allowed and self._is_far_behind(top, candidate))
+        ]
         first = len(self._sessions[top.rule].returns)
         store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
-        rest = self._roll(going, store, n, self.problem.seed + _SEED_OF_REST)
+        rest = self._roll(rules, store, n, self.problem.seed + _SEED_OF_REST)
         whole = {rule: self._sessions[rule].followed_by(more) for rule, more in rest.items()}
         self._sessions |= whole
-        best = self._simulated(top.rule, whole[top.rule])
-        found = list[SimulatedRule]()
-        for each in begun:
-            behind, error = top.value - each.value, self._error(top, each)
-            found.append(
-                replace(self._simulated(each.rule, whole[each.rule]), evidence=each.evidence)
-                if each.rule in whole
-                else replace(each, value=best.value - behind, error=math.hypot(best.error, error))
-            )
-        return found
+        best = self._summarise(top.rule, whole[top.rule])
+        results = list[SimulatedRule]()
+        for candidate in candidates:
+            if candidate.rule in whole:
+                result = self._summarise(candidate.rule, whole[candidate.rule])
+                results.append(replace(result, evidence=candidate.evidence))
+                continue
+            error = math.hypot(best.error, self._error(top, candidate))
+            value = best.value - (top.value - candidate.value)
+            results.append(replace(candidate, value=value, error=error))
+        return results
 
-    def _far_behind(self, top: SimulatedRule, other: SimulatedRule) -> bool:
-        margin = max(
-            _ERRORS_BEHIND * self._error(top, other), self._config.tolerance * abs(top.value)
-        )
-        return top.value - other.value > margin
+    def _is_far_behind(self, top: SimulatedRule, candidate: SimulatedRule) -> bool:
+        error, least = self._error(top, candidate), self._config.tolerance * abs(top.value)
+        return top.value - candidate.value > max(_ERRORS_BEHIND * error, least)
 
-    def _with_evidence(
-        self, found: Sequence[SimulatedRule]
-    ) -> list[tuple[SimulatedRule, Evidence]]:
+    def _add_evidence(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The rules with their evidence: of many sessions, where it decides what is allowed and no
         lookahead makes it slow."""
-        slow = [each for each in found if each.rule.looks_ahead or not self.least_users]
-        fast = [each for each in found if each not in slow]
+        slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
+        fast = [item for item in candidates if item not in slow]
         return [
-            pair
-            for logged, some in ((self._many, fast), (self._few, slow))
-            if some
-            for pair in zip(some, logged.of([each.rule for each in some]), strict=True)
+            replace(candidate, evidence=evidence)
+            for logged, part in ((self._many, fast), (self._few, slow))
+            if part
+            for candidate, evidence in zip(
+                part, logged.of([item.rule for item in part]), strict=True
+            )
         ]
 
     def _roll(
@@ -149,14 +150,14 @@ class RuleSearch:
         users: UserModel | None = None,
     ) -> dict[DecisionRule, Outcomes]:
         """Simulate `n` sessions of each rule that begin as those of a store."""
-        users = users or self.users
-        simulator = UserSimulator(users, store, n, self._longest, seed, times=len(rules))
+        simulator = UserSimulator(
+            users or self.users, store, n, self._longest, seed, times=len(rules)
+        )
         scorers = [self.problem.scorer.under(rule) for rule in rules]
-        states, size = store.item_states, store.observation_size
-        found = roll_out(simulator, scorers, n, states, size, seed)
-        return dict(zip(rules, found, strict=True))
+        sessions = roll_out(simulator, scorers, n, store.item_states, store.observation_size, seed)
+        return dict(zip(rules, sessions, strict=True))
 
-    def _simulated(self, rule: DecisionRule, sessions: Outcomes) -> SimulatedRule:
+    def _summarise(self, rule: DecisionRule, sessions: Outcomes) -> SimulatedRule:
         shares = np.bincount(sessions.items) / len(sessions.items)
         shares = shares[shares > 0]
         return SimulatedRule(
@@ -168,28 +169,32 @@ class RuleSearch:
             items=float(np.exp(-(shares * np.log(shares)).sum())),
         )
 
-    def supported(self, candidate: SimulatedRule) -> bool:
+    def is_supported(self, candidate: SimulatedRule) -> bool:
         """Whether the log shows what the candidate did."""
         enough = candidate.items >= self.least_items
         return enough and candidate.support >= self._config.least_support
 
-    def allowed(self, candidate: SimulatedRule) -> bool:
+    def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
+        """The allowed candidates; all that the log supports if it can evaluate none."""
+        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
+        return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
+
+    def is_allowed(self, candidate: SimulatedRule) -> bool:
         """Whether the log supports what the candidate did, and can evaluate it."""
         evidence = candidate.evidence
         if not self.least_users or evidence is None:
-            return self.supported(candidate) and not self.least_users
+            return self.is_supported(candidate) and not self.least_users
         enough = candidate.effective_users >= self.least_users and evidence.spread <= _WIDEST
-        return self.supported(candidate) and enough
+        return self.is_supported(candidate) and enough
 
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
         """The best, the rule that the choice starts from, and those of the highest value among the
         allowed, in more sessions."""
-        allowed = [each for each in candidates if self.allowed(each)]
-        highest = sorted(allowed, key=_value, reverse=True)
-        first = (best, *self.started(candidates))
-        rules = dict.fromkeys(each.rule for each in (*first, *highest))
+        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
+        ranked = (best, *self.find_start(candidates), *sorted(allowed, key=_value, reverse=True))
+        rules = dict.fromkeys(candidate.rule for candidate in ranked)
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
@@ -199,27 +204,27 @@ class RuleSearch:
         If the log can evaluate none, all that it supports are allowed; if it supports none, the
         rule that the choice starts from, or the one with the most effective items.
         """
-        allowed = [each for each in candidates if self.allowed(each)]
-        allowed = allowed or [each for each in candidates if self.supported(each)]
+        allowed = self._select_allowed(candidates)
         if not allowed:
-            if start := self.started(candidates):
-                return start
-            return [max(candidates, key=lambda each: each.items)]
+            most_varied = max(candidates, key=lambda candidate: candidate.items)
+            return self.find_start(candidates) or [most_varied]
         top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
         return [
-            each for each in allowed if top.value - each.value <= max(least, self._error(top, each))
+            candidate
+            for candidate in allowed
+            if top.value - candidate.value <= max(least, self._error(top, candidate))
         ]
 
-    def started(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
+    def find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The rule that the choice starts from, if it is a candidate."""
-        return [each for each in candidates if each.rule == self.problem.start]
+        return [candidate for candidate in candidates if candidate.rule == self.problem.start]
 
-    def _error(self, one: SimulatedRule, other: SimulatedRule) -> float:
+    def _error(self, first: SimulatedRule, second: SimulatedRule) -> float:
         """Standard error of the difference of their values; sessions draw the same numbers."""
-        returns, others = (self._sessions[each.rule].returns for each in (one, other))
-        both = min(len(returns), len(others))
-        return _standard_error(returns[:both] - others[:both])
+        returns, other_returns = (self._sessions[x.rule].returns for x in (first, second))
+        n = min(len(returns), len(other_returns))
+        return _standard_error(returns[:n] - other_returns[:n])
 
     def best(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """The simplest of those that cannot be told apart from the best."""
@@ -230,31 +235,31 @@ class RuleSearch:
         or the one with the most support in the log: effective users, or without propensities the
         likelihood; then the most hits."""
         level = self.level(candidates)
-        level = self.started(level) or level
-        known = [each for each in level if each.evidence is not None]
-        lacking = [each for each in level if each.evidence is None]
-        known += [replace(one, evidence=each) for one, each in self._with_evidence(lacking)]
-        return min(known, key=_least_evident)
+        level = self.find_start(level) or level
+        complete = [candidate for candidate in level if candidate.evidence is not None]
+        lacking = [candidate for candidate in level if candidate.evidence is None]
+        return min([*complete, *self._add_evidence(lacking)], key=_least_evident)
 
     def halves_agree(
         self, chosen: SimulatedRule, candidates: Sequence[SimulatedRule]
     ) -> tuple[bool, bool]:
         """Whether the chosen rule cannot be told apart from the best allowed one in the sessions of
         either half of the users, as in `level`."""
-        own = self._sessions[chosen.rule].returns
-        half = half_of(self._store)[np.arange(len(own)) % len(self._store)]
-        allowed = {each.rule for each in candidates if self.allowed(each)} | {chosen.rule}
-        returns = [self._sessions[rule].returns[: len(own)] for rule in allowed]
-        returns = [each for each in returns if len(each) == len(own)]
+        own_returns = self._sessions[chosen.rule].returns
+        n = len(own_returns)
+        half = halve_users(self._store)[np.arange(n) % len(self._store)]
+        allowed = {item.rule for item in candidates if self.is_allowed(item)} | {chosen.rule}
+        returns = [self._sessions[rule].returns[:n] for rule in allowed]
+        returns = [values for values in returns if len(values) == n]
         agree = []
-        for mine in (half == 0, half == 1):
-            top = max((each[mine] for each in returns), key=_mean)
+        for rows in (half == 0, half == 1):
+            top = max((values[rows] for values in returns), key=_mean)
             if len(top) < _FEWEST:
                 agree.append(True)
                 continue
-            mean = float(top.mean())
-            margin = max(_standard_error(top - own[mine]), self._config.tolerance * abs(mean))
-            agree.append(bool(own[mine].mean() >= mean - margin))
+            mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
+            margin = max(error, self._config.tolerance * abs(mean))
+            agree.append(bool(own_returns[rows].mean() >= mean - margin))
         return agree[0], agree[1]
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
@@ -263,33 +268,35 @@ class RuleSearch:
         Either half of the users is simulated with the calibration of its own rows. More sessions
         follow where the standard error of the first ones is large.
         """
-        halves = [self._of_half(rule, number) for number in (0, 1)]
-        returns = np.concatenate([each.returns for each in halves])
+        halves = [self._roll_half(rule, number) for number in (0, 1)]
+        returns = np.concatenate([half.returns for half in halves])
         if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
-            more = (self._of_half(rule, number, part=1) for number in (0, 1))
-            halves = [one.followed_by(other) for one, other in zip(halves, more, strict=True)]
+            halves = [
+                half.followed_by(self._roll_half(rule, number, part=1))
+                for number, half in enumerate(halves)
+            ]
         values = _mean(halves[0].returns), _mean(halves[1].returns)
         value = sum(values) / 2
-        within = math.hypot(*(_standard_error(each.returns) for each in halves)) / 2
+        within = math.hypot(*(_standard_error(half.returns) for half in halves)) / 2
         error = max(within, abs(values[0] - values[1]) / 2)
-        checked = self.users.calibration_report
-        optimism = None if checked is None else (checked.optimism, checked.optimism_error)
-        some = schema.PROPENSITY in self.problem.train.record.columns
-        doubts = list(doubts_of(value, error, self.users, some))
-        length = max(float(each.lengths.mean()) for each in halves)
-        if length > (logged := self.problem.train.lengths.max()):
-            doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {logged}")
+        report = self.users.calibration_report
+        optimism = None if report is None else (report.optimism, report.optimism_error)
+        has_propensities = schema.PROPENSITY in self.problem.train.record.columns
+        doubts = list(list_doubts(value, error, self.users, has_propensities))
+        length = max(float(half.lengths.mean()) for half in halves)
+        if length > (longest := self.problem.train.lengths.max()):
+            doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")
         return ValueEstimate(value, error, values, optimism, tuple(doubts))
 
-    def _of_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
+    def _roll_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
         """Sessions of one half of the users, with its own calibration; each part has others."""
-        half, n = half_of(self._store), self._config.sessions
-        own = np.flatnonzero(half == number)
-        own = own if len(own) else np.arange(len(half))
-        store = self._store.select(np.roll(own, -(n // 2 + part * n)))
-        users, checked = self.users, self.users.calibration_report
-        if checked is not None:
-            users = replace(users, calibration=checked.halves[number])
+        half, n = halve_users(self._store), self._config.sessions
+        episodes = np.flatnonzero(half == number)
+        episodes = episodes if len(episodes) else np.arange(len(half))
+        store = self._store.select(np.roll(episodes, -(n // 2 + part * n)))
+        users, report = self.users, self.users.calibration_report
+        if report is not None:
+            users = replace(users, calibration=report.halves[number])
         seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
         return self._roll([rule], store, n, seed, users)[rule]
 
@@ -307,19 +314,23 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     unless one of them is better.
     """
     search = RuleSearch(problem)
-    tried = _all(search) if problem.start is None else _near(search, problem.start)
-    finalists = tried
+    if problem.start is None:
+        candidates = _search_all(search)
+    else:
+        more = NEAR_THE_LOG if search.least_users else ()
+        candidates = search.simulate([*dict.fromkeys(near(problem.start, problem, more))])
+    finalists = candidates
     if search.users.reward_report.new_users:
-        finalists = search.finalists(tried, search.best(tried))
-        again = {each.rule for each in finalists}
-        tried = [*(each for each in tried if each.rule not in again), *finalists]
+        finalists = search.finalists(candidates, search.best(candidates))
+        again = {finalist.rule for finalist in finalists}
+        candidates = [*(item for item in candidates if item.rule not in again), *finalists]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
     where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
-        chosen_by=chosen_by(search.users) + where,
-        candidates=[best if each.rule == best.rule else each for each in tried],
+        chosen_by=describe_choice(search.users) + where,
+        candidates=[best if item.rule == best.rule else item for item in candidates],
         warning=_warning(search, best, estimate),
         estimate=estimate,
         details={
@@ -331,86 +342,77 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     )
 
 
-def _near(search: RuleSearch, start: DecisionRule) -> list[SimulatedRule]:
-    """The rule `start` and its neighbours."""
-    more = NEAR_THE_LOG if search.least_users else ()
-    return search.simulate([*dict.fromkeys(near(start, search.problem, more))])
-
-
-def _all(search: RuleSearch) -> list[SimulatedRule]:
+def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """All candidates of the configuration that the best of the earlier ones leads to."""
-    problem = search.problem
-    tried = search.simulate([*unweighted(problem)])
-    first = search.best(tried).rule
-    tried += search.simulate([*variants(first, reward_weight=problem.config.reward_weights)])
-    second = search.best(tried).rule
-    tried += _with_lookahead(search, second)
+    problem, config = search.problem, search.problem.config
+    candidates = search.simulate([*unweighted(problem)])
+    first = search.best(candidates).rule
+    candidates += search.simulate([*variants(first, reward_weight=config.reward_weights)])
+    second = search.best(candidates).rule
+    if search.users.session_end_report.kept != "constant":
+        # More than randomness ends sessions.
+        grid = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
+        candidates += search.simulate([*variants(second, lookahead=lookaheads(problem), **grid)])
     if problem.validation.item_states.tags.shape[1]:
-        tried += _with_tag_window(search, second)
+        candidates += _search_tag_windows(search, second)
         # Without a tag window, which may only have served to cause no fatigue.
-        tried += _with_tag_run(search, second)
+        candidates += _search_tag_runs(search, second)
     if search.least_users:
-        done = {each.rule for each in tried}
-        others = (rule for grid in NEAR_THE_LOG for rule in variants(first, **grid))
-        tried += search.simulate([rule for rule in others if rule not in done])
-    return tried
+        done = {candidate.rule for candidate in candidates}
+        rules = (rule for grid in NEAR_THE_LOG for rule in variants(first, **grid))
+        candidates += search.simulate([rule for rule in rules if rule not in done])
+    return candidates
 
 
 def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -> str:
-    said, logged = [], float(search.problem.train.returns.mean())
-    if not search.supported(best):
+    warnings, mean_return = [], float(search.problem.train.returns.mean())
+    if not search.is_supported(best):
         why = "this one shows the most different items"
         if best.rule == search.problem.start:
             why = "so the rule of the earlier run stays"
-        said.append(f"the log supports no candidate, {why}")
-    elif not search.allowed(best):
-        said.append(
+        warnings.append(f"the log supports no candidate, {why}")
+    elif not search.is_allowed(best):
+        warnings.append(
             f"no candidate leaves {search.least_users:g} effective users of the log with weights "
             f"of little spread; this one leaves {best.effective_users:.0f}: the log is too small "
             "to evaluate it"
         )
-    if estimate.value + 2 * estimate.error < logged:
-        said.append(f"this is less than logged sessions have, {logged:.4g}; do not launch it")
-    return "".join(f"; WARNING: {each}" for each in said)
+    if estimate.value + 2 * estimate.error < mean_return:
+        warnings.append(
+            f"this is less than logged sessions have, {mean_return:.4g}; do not launch it"
+        )
+    return "".join(f"; WARNING: {warning}" for warning in warnings)
 
 
-def _with_lookahead(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
-    """The rule with a lookahead, if more than randomness ends sessions."""
-    config, values = search.problem.config, lookaheads(search.problem)
-    if search.users.session_end_report.kept == "constant":
-        return []
-    weights = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
-    return search.simulate([*variants(rule, lookahead=values, **weights)])
-
-
-def _with_tag_window(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
+def _search_tag_windows(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
     """The rule with a tag window of items that are `known`, then with other reward weights.
 
     At all temperatures: at a low one, the log may support what the policy shows only once some
     items are excluded.
     """
-    config, known = search.problem.config, search.problem.scorer.known
-    windows = [window for window in config.tag_windows if 0 < window <= known]
-    tried = search.simulate([*variants(rule, temperature=config.temperatures, tag_window=windows)])
-    if not tried:
+    config, longest = search.problem.config, search.problem.scorer.known
+    windows = [window for window in config.tag_windows if 0 < window <= longest]
+    rules = variants(rule, temperature=config.temperatures, tag_window=windows)
+    candidates = search.simulate([*rules])
+    if not candidates:
         return []
-    best = search.best(tried).rule
+    best = search.best(candidates).rule
     weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
-    others = variants(best, tag_window=sorted({*windows}), reward_weight=weights)
-    return [*tried, *search.simulate([*others])]
+    more = variants(best, tag_window=sorted({*windows}), reward_weight=weights)
+    return [*candidates, *search.simulate([*more])]
 
 
-def _with_tag_run(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
+def _search_tag_runs(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
     """The rule with a tag run, if users have fatigue, then at other temperatures and reward
     weights."""
     config = search.problem.config
     runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
-    tried = search.simulate([*variants(rule, tag_run=runs)])
-    if not tried:
+    candidates = search.simulate([*variants(rule, tag_run=runs)])
+    if not candidates:
         return []
-    best = search.best(tried).rule
+    best = search.best(candidates).rule
     weights = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
-    return [*tried, *search.simulate([*variants(best, **weights)])]
+    return [*candidates, *search.simulate([*variants(best, **weights)])]
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:

@@ -29,14 +29,16 @@ def unweighted(problem: Problem) -> Iterator[DecisionRule]:
 
 def variants(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
     """The rule with every combination of other values of its fields."""
-    others = (replace(rule, **parts) for parts in _grid(**values))
-    return (other for other in others if other != rule)
+    for combination in product(*values.values()):
+        variant = replace(rule, **dict(zip(values, combination, strict=True)))
+        if variant != rule:
+            yield variant
 
 
 def lookaheads(problem: Problem) -> list[float]:
     """Values of going on, in reward units; those that are not positive are left out."""
     mean = float(problem.train.returns.sum(dtype="float64")) / problem.train.n_steps
-    return [each * mean for each in problem.config.lookaheads if each * mean > 0]
+    return [value for factor in problem.config.lookaheads if (value := factor * mean) > 0]
 
 
 def near(
@@ -59,7 +61,7 @@ def near(
     if learned and problem.scorer.policy.config.max_return:
         yield replace(rule, target=None, minimum_target=None)
     grid: dict[str, Sequence[float]] = {
-        name: [*getattr(config, f"{name}s"), *(each for part in more for each in part[name])]
+        name: [*getattr(config, f"{name}s"), *(value for part in more for value in part[name])]
         for name in ("temperature", "reward_weight")
     }
     middle = _middle(config.policy_weights)
@@ -72,24 +74,16 @@ def near(
         for ahead, weight in product(lookaheads(problem), config.lookahead_weights):
             yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
     if problem.validation.item_states.tags.shape[1]:
-        known = problem.scorer.known
-        grid["tag_window"] = [0, *(each for each in config.tag_windows if each <= known)]
+        longest = problem.scorer.known
+        grid["tag_window"] = [0, *(steps for steps in config.tag_windows if steps <= longest)]
         grid["tag_run"] = [0, *config.tag_runs] if problem.users.fatigue else [0]
     for name, values in grid.items():
-        yield from (replace(rule, **{name: each}) for each in _beside(getattr(rule, name), values))
-
-
-def _beside(value: float, values: Sequence[float]) -> list[Any]:
-    """The next smaller and the next larger of the values."""
-    smaller = [each for each in values if each < value]
-    larger = [each for each in values if each > value]
-    return [*([max(smaller)] if smaller else []), *([min(larger)] if larger else [])]
+        value = getattr(rule, name)
+        smaller = [candidate for candidate in values if candidate < value]
+        larger = [candidate for candidate in values if candidate > value]
+        nearest: list[Any] = [*sorted(smaller)[-1:], *sorted(larger)[:1]]
+        yield from (replace(rule, **{name: neighbour}) for neighbour in nearest)
 
 
 def _middle(values: Sequence[float]) -> float:
     return sorted(values)[len(values) // 2]
-
-
-def _grid(**values: Sequence[Any]) -> Iterator[dict[str, Any]]:
-    """Every combination of the values."""
-    return (dict(zip(values, each, strict=True)) for each in product(*values.values()))

@@ -134,40 +134,41 @@ class ValueEstimate:
     """Why it cannot be trusted; empty if it can."""
 
 
-def doubts_of(value: float, error: float, users: UserModel, some: bool) -> tuple[str, ...]:
+def list_doubts(
+    value: float, error: float, users: UserModel, has_propensities: bool
+) -> tuple[str, ...]:
     """Why the estimated value may be off by more than a tenth.
 
     Args:
-        some: whether the log has propensities, at least of some rows.
+        has_propensities: whether the log has propensities, at least of some rows.
     """
-    said, checked, training = [], users.calibration_report, users.training_users
+    doubts, report, training = [], users.calibration_report, users.training_users
     if error > FAR_OFF * abs(value):
-        said.append(f"its error, {error:.2g}, is more than {FAR_OFF:.0%} of it")
-    if checked is not None and abs(checked.optimism) > max(FAR_OFF, checked.optimism_error):
-        said.append(f"the user model is off by {checked.optimism:+.0%} on held-out rows")
+        doubts.append(f"its error, {error:.2g}, is more than {FAR_OFF:.0%} of it")
+    if report is not None and abs(report.optimism) > max(FAR_OFF, report.optimism_error):
+        doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
     weighted = training is not None and training.report.weighted
-    if not (weighted if checked is None else checked.weighted):
-        lack = "some rows of the log have" if some else "the log has"
-        said.append(f"{lack} no propensities: its policy may have known more of the users")
-    return tuple(said)
+    if not (weighted if report is None else report.weighted):
+        lack = "some rows of the log have" if has_propensities else "the log has"
+        doubts.append(f"{lack} no propensities: its policy may have known more of the users")
+    return tuple(doubts)
 
 
-def chosen_by(users: UserModel) -> str:
+def describe_choice(users: UserModel) -> str:
     """What chooses a rule in simulated sessions, in words."""
     if users.training_users is None:
         return (
             "mean return of sessions in the run's reward model, calibrated on validation rows; no "
             "propensities are used"
         )
-    report = users.training_users.report
+    report, calibration = users.training_users.report, users.calibration_report
     whose = "new users" if users.reward_report.new_users else "validation users"
-    weighted = "weighted by their propensities" if report.weighted else "without weights"
-    checked = users.calibration_report
-    if checked is not None and checked.weighted:
-        weighted += ", and calibrated by propensities"
+    weights = "weighted by their propensities" if report.weighted else "without weights"
+    if calibration is not None and calibration.weighted:
+        weights += ", and calibrated by propensities"
     return (
         f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
-        f"are fitted to {report.steps:,} training rows {weighted}"
+        f"are fitted to {report.steps:,} training rows {weights}"
     )
 
 

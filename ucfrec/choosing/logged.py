@@ -34,32 +34,31 @@ class LoggedScores:
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
     ) -> None:
         self._scorer, self._view, self._episodes, self._steps = scorer, view, episodes, steps
-        self._kept: dict[tuple[object, ...], Query] = {}
+        self._queries: dict[tuple[object, ...], Query] = {}
 
     @torch.no_grad()
     def of(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
         """Scores (B, n_items) by each rule of batches of the steps, and which steps they are."""
         scorers = [self._scorer.under(rule) for rule in rules]
-        widest = max(scorers, key=lambda each: each.reach)
+        widest = max(scorers, key=lambda scorer: scorer.reach)
         weighted = any(rule.reward_weight for rule in rules)
         with progress(len(self._steps), "logged steps under each rule", "rows") as bar:
             for first in range(0, len(self._steps), _AT_ONCE):
                 part = slice(first, min(first + _AT_ONCE, len(self._steps)))
                 at = self._episodes[part], self._steps[part]
-                kept = self._kept if self._scorer.has_factors else {}
-                known: Sessions | None = None
+                queries = self._queries if self._scorer.has_factors else {}
+                sessions: Sessions | None = None
                 scores = list[Tensor]()
-                for each in scorers:
-                    rule = each.rule
+                for scorer in scorers:
+                    rule = scorer.rule
                     key = first, rule.target, rule.minimum_target, widest.reach, weighted
-                    if key not in kept:
-                        known = known or sessions_before(widest, self._view, *at)
-                        query = each.query(known, rewards=weighted)
-                        # What has been read for the query is not kept.
-                        last = replace(known, states=None)
-                        kept[key] = query._replace(sessions=last)
+                    if key not in queries:
+                        sessions = sessions or sessions_before(widest, self._view, *at)
+                        query = scorer.query(sessions, rewards=weighted)
+                        # What has been read for the query is not needed again.
+                        queries[key] = query._replace(sessions=replace(sessions, states=None))
                     seen = seen_before(self._view, *at) if rule.exclude_seen else None
-                    scores.append(each.scores_of(kept[key], excluded=seen))
+                    scores.append(scorer.scores_of(queries[key], excluded=seen))
                 yield part, scores
                 bar.update(part.stop - part.start)
 
@@ -111,8 +110,8 @@ class LoggedEvidence:
         self._liked = liked_rewards(self._view, self._view.column(schema.REWARD))
         self._propensities: Float64Array | None = None
         if schema.PROPENSITY in view.record.columns:
-            logged = self._view.step_values(schema.PROPENSITY, *at).astype(np.float64)
-            self._propensities = logged if (logged > 0).all() else None
+            propensities = self._view.step_values(schema.PROPENSITY, *at).astype(np.float64)
+            self._propensities = propensities if (propensities > 0).all() else None
         owners = np.arange(self._view.n_episodes)
         if view.has_users:
             owners = self._view.episode_values(schema.USER)
@@ -135,12 +134,12 @@ class LoggedEvidence:
         logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
         for part, scores in self._scores.of(rules):
             items = self._items[part].unsqueeze(1)
-            for n, (rule, each) in enumerate(zip(rules, scores, strict=True)):
-                chances = rule.log_probabilities(each)
+            for n, (rule, values) in enumerate(zip(rules, scores, strict=True)):
+                chances = rule.log_probabilities(values)
                 logs[n, part] = chances.gather(1, items)[:, 0].double().numpy()
-                top = best_items(each, min(SHOWN, each.shape[1]))
+                top = best_items(values, min(SHOWN, values.shape[1]))
                 hits[n, part] = (top == items).any(1).numpy()
-        return [self._evidence(one, hit) for one, hit in zip(logs, hits, strict=True)]
+        return [self._evidence(*pair) for pair in zip(logs, hits, strict=True)]
 
     def _evidence(self, logs: Float64Array, hits: BoolArray) -> Evidence:
         rate = float(hits[self._liked].mean()) if self._liked.any() else 0.0
@@ -151,14 +150,14 @@ class LoggedEvidence:
         weights = np.exp(np.minimum(sums, 100.0))
         returns = self._view.returns.astype(np.float64)
         above, below = (
-            np.bincount(self._users, each).astype(np.float64)
-            for each in (weights * returns, weights)
+            np.bincount(self._users, values).astype(np.float64)
+            for values in (weights * returns, weights)
         )
-        halves = [each for each in (below[::2], below[1::2]) if len(each)]
-        enough = 2 * min(effective_number(each) for each in halves)
+        halves = [half for half in (below[::2], below[1::2]) if len(half)]
+        effective_users = 2 * min(effective_number(half) for half in halves)
         if not below.any():
             return Evidence(rate, likelihood, 0.0)
         spread = float(sums[np.isfinite(sums)].var())
         value = above.sum() / below.sum()
         error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
-        return Evidence(rate, likelihood, enough, spread, float(value), float(error))
+        return Evidence(rate, likelihood, effective_users, spread, float(value), float(error))

@@ -62,7 +62,7 @@ def roll_out(
     actor = _ManyRules(scorers, sessions, states, observation_size, seed)
     live = np.arange(len(scorers) * sessions)
     returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
-    shown = list[IntArray]()
+    decisions = list[IntArray]()
     with progress(len(live), "choose the rule", "sessions") as bar:
         while len(live):
             actor.inform({USER_IDS: simulator.users})
@@ -71,16 +71,16 @@ def roll_out(
             actor.observe(items, rewards)
             returns[live] += rewards
             lengths[live] += 1
-            shown.append(np.stack([live, items], axis=1))
+            decisions.append(np.stack([live, items], axis=1))
             bar.update(len(live) - len(going))
             if len(going) < len(live):
                 live = live[going]
                 actor.keep(going)
-    numbers, items = np.concatenate(shown).T
-    of_rules = np.split(returns, len(scorers)), np.split(lengths, len(scorers))
+    numbers, items = np.concatenate(decisions).T
+    parts = (slice(n * sessions, (n + 1) * sessions) for n in range(len(scorers)))
     return [
-        Outcomes(mine, steps, items[numbers // sessions == rule])
-        for rule, (mine, steps) in enumerate(zip(*of_rules, strict=True))
+        Outcomes(returns[part], lengths[part], items[numbers // sessions == rule])
+        for rule, part in enumerate(parts)
     ]
 
 
@@ -111,7 +111,7 @@ class _ManyRules(PolicyActor):
     def _decide(
         self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        decided = []
+        decisions = []
         for batch in _batches(self._rule[rows.numpy()]):
             windows = [self._scorers[rule].windows(sessions.at(part)) for rule, part in batch]
             begin, end = batch[0][1].start, batch[-1][1].stop
@@ -119,11 +119,11 @@ class _ManyRules(PolicyActor):
             together = sessions.at(slice(begin, end))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
             for rule, part in batch:
-                scorer, own = self._scorers[rule], slice(part.start - begin, part.stop - begin)
+                scorer, rows_of_rule = self._scorers[rule], slice(part.start - begin, part.stop - begin)
                 of_rule = None if excluded is None else excluded[part]
-                scores = scorer.scores_of(query.at(own), excluded=of_rule)
-                decided.append(scorer.rule.choose(scores, self._generators[rule]))
-        items, chances = zip(*decided, strict=True)
+                scores = scorer.scores_of(query.at(rows_of_rule), excluded=of_rule)
+                decisions.append(scorer.rule.choose(scores, self._generators[rule]))
+        items, chances = zip(*decisions, strict=True)
         return torch.cat(items), torch.cat(chances)
 
 

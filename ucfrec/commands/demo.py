@@ -166,15 +166,15 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
         The rows of `out/results.json`: one per environment and policy, environments in the order
         of `ENVIRONMENTS`.
     """
-    from ucfrec.evaluation.environment import Environment
+    from ucfrec.evaluation.collect import collect_store
     from ucfrec.evaluation.evaluate import evaluate_behavior
-    from ucfrec.evaluation.simulated_store import simulated_store
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.reporting.page import write_report
     from ucfrec.results.rows_file import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
         _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
-        simulated_store(Environment(environment), out / environment, config.sessions, seed)
+        collect_store(Environment(environment), out / environment, config.sessions, seed)
     jobs = [
         (environment, name)
         for name in reversed(config.methods)
@@ -222,8 +222,8 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_policy
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
     from ucfrec.runs.shared_stages import SharedStages

@@ -14,8 +14,10 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Simulator
+from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.processes import random_state_kept
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
@@ -182,3 +184,31 @@ def _version(distribution: str) -> str:
         return version(distribution)
     except PackageNotFoundError:
         return "run from a source tree"
+
+
+def collect_store(
+    environment: Environment, folder: Path, sessions: int, seed: int, behavior: str | None = None
+) -> Path:
+    """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
+
+    Args:
+        seed: seed of the environments and of the behavior policy.
+        behavior: name of one of the simulator's built-in policies; None for its
+            `logging_behavior`.
+    """
+    logs, store = folder / "logs", folder / "store"
+    simulator = environment.simulator()
+    if not logs.exists():
+        env = simulator.started(256, environment.folder)
+        chosen = behavior or simulator.logging_behavior
+        actor = simulator.behaviors[chosen](env, seed)
+        collect(
+            simulator, env, actor, sessions, seed, logs, env_name=environment.title, behavior=chosen
+        )
+    if not store.exists():
+        items = logs / "items.parquet"
+        features = (FeatureTable((items,), ITEM_ID),) if items.exists() else ()
+        mapping = LogMapping(session_by=SESSION_ID, item_features=features)
+        options = PrepareOptions(reward=simulator.feedback)
+        prepare([logs / "sessions.parquet"], mapping, store, options)
+    return store

@@ -102,7 +102,7 @@ class SequencePolicy(nn.Module, ABC):
     augmented: ClassVar[bool] = False
     """Whether the default of `augment.copies` is above 0 for this policy."""
     chosen: ClassVar[tuple[str, ...]] = ()
-    """Buffers that `closed_form` chooses on held-out episodes; a refit keeps them."""
+    """Buffers that `make_solver` chooses on held-out episodes; a refit keeps them."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
@@ -151,7 +151,7 @@ class SequencePolicy(nn.Module, ABC):
     def start_from(self, train: EpisodeStore) -> None:
         """Set buffers from the training episodes, before the first update."""
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """What fits the policy without the training loop; None if gradients have to.
@@ -179,7 +179,7 @@ class SequencePolicy(nn.Module, ABC):
         may prepare what then costs less."""
         return self.last_features
 
-    def normalized(self, windows: Windows) -> Windows:
+    def normalize(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 
         Returns-to-go are first raised to the lowest value in the training data: after a session has
@@ -194,7 +194,7 @@ class SequencePolicy(nn.Module, ABC):
 
         In nats for items; for vectors, the squared error relative to the action's range.
         """
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         return self.imitation(self.features(normalized), normalized)
 
     def imitation(self, features: Tensor, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
@@ -226,7 +226,7 @@ class SequencePolicy(nn.Module, ABC):
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
         return self.head.loss(features, windows.actions[:, -1], exposed)  # type: ignore[arg-type]
 
@@ -236,7 +236,7 @@ class SequencePolicy(nn.Module, ABC):
 
     def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Predictions at the last step, and the features (B, d) that they are made from."""
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         features, exposed = self.last_features(normalized), self._exposed_last(normalized)
         return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
@@ -251,7 +251,7 @@ class SequencePolicy(nn.Module, ABC):
                 "the policy does not know its largest return; train it with "
                 "--set policy.max_return=true, or give a target return"
             )
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 

@@ -89,7 +89,7 @@ class BoostedPolicy(SequencePolicy):
         self.reward_low.fill_(float(rewards.min()))
         self.reward_high.fill_(float(rewards.max()))
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None]:
         """Fits the trees."""

@@ -64,7 +64,7 @@ class BPRPolicy(SequencePolicy):
         """Mean loss over the liked steps of the windows, and scalars to log."""
         head = self.head
         assert isinstance(head, ItemHead)
-        normalized, liked = self.normalized(windows), self._liked(windows) > 0
+        normalized, liked = self.normalize(windows), self._liked(windows) > 0
         features, shown = self.features(normalized)[liked], windows.actions[liked]
         exposed = self.exposed(normalized)
         exposed = None if exposed is None else exposed.select(liked.flatten())

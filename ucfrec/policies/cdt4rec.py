@@ -9,7 +9,6 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.policies.losses import masked_mean
 from ucfrec.settings import Weight, settings_table
 
 
@@ -73,11 +72,11 @@ class CDT4RecPolicy(DTPolicy):
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted reward loss over all steps, and scalars to log."""
         mask = windows.mask
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         hidden = self.transform(normalized)
         imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
         rewards = (windows.rewards - self.reward_mean) / self.reward_std
-        reward_loss = masked_mean((self.estimated_rewards(hidden, mask) - rewards).square(), mask)
+        reward_loss = (self.estimated_rewards(hidden, mask) - rewards).square()[mask].mean()
         return imitation + self.config.reward_weight * reward_loss, {
             **scalars,
             "reward_loss": reward_loss.detach(),

@@ -18,7 +18,7 @@ from ucfrec.processes import random_state_kept
 
 RESERVED: Final = frozenset(
     {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "values", "head"}
-    | {"normalized", "imitation", "act_and_features", "max_return", "exposed", "_exposed_last"}
+    | {"normalize", "imitation", "act_and_features", "max_return", "exposed", "_exposed_last"}
 )
 """Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
 by another with the same methods."""
@@ -59,7 +59,7 @@ def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str
         _check_answer(policy, train)
         _check_padding(policy, train)
         windows = _sample(train, policy.config.context)
-        if policy.closed_form(train, None, Path(), 0) is None:
+        if policy.make_solver(train, None, Path(), 0) is None:
             with torch.enable_grad():
                 pair = policy.loss(windows.at(slice(0, 2)))
             shaped = isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], dict)
@@ -146,7 +146,7 @@ def _changed(windows: Windows, cuts: Tensor, policy: SequencePolicy) -> Windows:
 
 def _outputs(policy: SequencePolicy, windows: Windows) -> tuple[Tensor, Tensor]:
     """Features (B, K, d) and predictions (B, A) or (B, n_items)."""
-    features = policy.features(policy.normalized(windows))
+    features = policy.features(policy.normalize(windows))
     shape = tuple(windows.mask.shape)
     if not isinstance(features, Tensor) or features.ndim != 3 or features.shape[:2] != shape:
         _refuse(policy, f"must give features of shape {(*shape, policy.config.dim)}")

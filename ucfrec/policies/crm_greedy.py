@@ -65,7 +65,7 @@ class CRMGreedyPolicy(SequencePolicy):
         actions = train.step_values(schema.ACTION, episodes[drawn], steps[drawn])
         self.candidates.copy_(torch.from_numpy(actions))
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """For items, fits the reward model; its effects are chosen on a tenth of the episodes if
@@ -92,7 +92,7 @@ class CRMGreedyPolicy(SequencePolicy):
 
     def _errors(self, windows: Windows) -> Tensor:
         """Squared errors (B, K) of the predicted standardised rewards of action vectors."""
-        inputs = torch.cat([self.normalized(windows).states, windows.actions], dim=-1)
+        inputs = torch.cat([self.normalize(windows).states, windows.actions], dim=-1)
         assert isinstance(self.model, nn.Sequential)
         predicted = self.model(inputs).squeeze(-1)
         standard = (windows.rewards - self.reward_mean) / self.reward_std
@@ -117,7 +117,7 @@ class CRMGreedyPolicy(SequencePolicy):
         users that are not known, or the best action vectors (B, A)."""
         if isinstance(self.model, ItemRewardModel):
             return self.model.scores(windows.states[:, -1], Shown.before_last(windows))
-        values = self._values(self.model, self.normalized(windows).states[:, -1])
+        values = self._values(self.model, self.normalize(windows).states[:, -1])
         return self.candidates[values.argmax(1)]
 
     def _values(self, model: nn.Sequential, states: Tensor) -> Tensor:

@@ -66,7 +66,7 @@ class DT4RecPolicy(DTPolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
-        config, normalized = self.config, self.normalized(windows)
+        config, normalized = self.config, self.normalize(windows)
         tokens = self.tokens(normalized)
         features = self.attended(tokens, normalized.mask)[:, 1::3]
         imitation, scalars = self.imitation(features, normalized)

@@ -6,18 +6,203 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional as F
 
+from ucfrec import schema
+from ucfrec.arrays import Float32Array, Float64Array, IntArray
+from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Transitions, Windows
+from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.policies.base import Context, PolicyConfig, Returns
-from ucfrec.policies.cql import CQLConfig, relabelled
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.policies.heads import ItemHead, VectorHead
-from ucfrec.settings import Count, Weight, require, settings_table
+from ucfrec.processes import random_state_kept
+from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, require, settings_table
+
+_AT_ONCE = 4096
+_LOGGED = 100_000
+"""Largest number of logged actions that candidates are drawn from."""
+
+
+@settings_table("cql")
+class CQLConfig:
+    """Settings of CQL, which estimates state values here; like returns-to-go, without discount."""
+
+    steps: Count = 2000
+    """Updates of the network."""
+    weight: Weight = 1.0
+    """α of the conservative term."""
+    hidden: Width = 128
+    """Width of the two hidden layers."""
+    candidates: Annotated[int, Field(ge=2, le=10_000)] = 20
+    """Actions sampled in place of all actions: half from the logs, half uniformly."""
+    learning_rate: LearningRate = 3e-4
+    """Learning rate."""
+    batch_size: BatchSize = 128
+    """Transitions per update."""
+    target_rate: Annotated[float, Field(gt=0, le=1)] = 0.01
+    """Rate at which the target network moves to the network at every update."""
+
+
+class ConservativeQ(nn.Module):
+    """Q(s, a) of states and action vectors (embeddings, for items), and its target network.
+
+    States are standardised; values are in units of the largest absolute training return.
+    """
+
+    state_mean: Tensor
+    state_std: Tensor
+    logged: Tensor
+    every: Tensor | None
+    low: Tensor
+    high: Tensor
+    unit: Tensor
+
+    def __init__(self, store: EpisodeStore, config: CQLConfig) -> None:
+        super().__init__()
+        self.config = config
+        mean, std = store.state_statistics
+        episodes, steps = store.all_steps()
+        kept = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
+        column = schema.ITEM if store.has_items else schema.ACTION
+        logged = torch.from_numpy(store.step_values(column, episodes[kept], steps[kept]))
+        vectors = store.action_vectors(logged.long() if store.has_items else logged)
+        every = store.item_states.embeddings if store.has_items else None
+        self.register_buffer("state_mean", mean)
+        self.register_buffer("state_std", torch.where(std > 1e-6, std, 1.0))
+        self.register_buffer("logged", vectors)
+        self.register_buffer("every", every)
+        self.register_buffer("low", vectors.min(0).values)
+        self.register_buffer("high", vectors.max(0).values)
+        self.register_buffer("unit", torch.tensor(float(np.abs(store.returns).max()) or 1.0))
+        inputs = len(mean) + vectors.shape[1]
+        self.network, self.target = (mlp(inputs, config.hidden, 2, 1) for _ in range(2))
+        self.target.load_state_dict(self.network.state_dict())
+        self.target.requires_grad_(False)
+
+    def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+        """Values (M,) of states (M, S) and actions (M, A), by `network` or the trained network."""
+        standard = ((states - self.state_mean) / self.state_std).clamp(-10, 10)
+        value: Tensor = (network or self.network)(torch.cat([standard, actions], dim=-1))
+        return value.squeeze(-1)
+
+    def candidates(self, count: int) -> Tensor:
+        """Random actions (count, C, A) for `count` states; see `CQLConfig.candidates`."""
+        shape = (count, self.config.candidates // 2)
+        logged = self.logged[torch.randint(len(self.logged), shape)]
+        if self.every is not None:
+            drawn = self.every[torch.randint(len(self.every), shape)]
+        else:
+            low, high = self.low, self.high
+            drawn = low + (high - low) * torch.rand(*shape, len(low))
+        return torch.cat([logged, drawn], dim=1)
+
+    def compared(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+        """Values (M, C) of candidate actions (M, C, A) in states (M, S)."""
+        repeated = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
+        flat = self.q(repeated.flatten(0, 1), actions.flatten(0, 1), network)
+        return flat.view(len(states), -1)
+
+    def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
+        """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over candidates."""
+        values = self.compared(states, self.candidates(len(states)), network)
+        return (values.softmax(-1) * values).sum(-1)
+
+    def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
+        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD², and scalars to log.
+
+        Also moves the target network.
+        """
+        with torch.no_grad():
+            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
+                slow.lerp_(fast, self.config.target_rate)
+            next_values = self.state_values(batch.next_states, self.target)
+            target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
+        value = self.q(batch.states, batch.actions)
+        others = self.compared(batch.states, self.candidates(len(value)))
+        soft_maximum = torch.cat([others, value.unsqueeze(1)], dim=1).logsumexp(-1)
+        conservative = (soft_maximum - value).mean()
+        error = 0.5 * F.mse_loss(value, target)
+        return self.config.weight * conservative + error, {"td": error.detach()}
+
+
+@random_state_kept()
+def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) -> EpisodeStore:
+    """The store with returns-to-go raised by CQL's state values (EDT4Rec).
+
+    Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
+
+    Args:
+        store: training episodes without augmented episodes.
+        folder: keeps the Q function; training resumes from it.
+    """
+    torch.manual_seed(seed)
+    network = ConservativeQ(store, config)
+    loop = LoopConfig(
+        steps=config.steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        clip_norm=1.0,
+        warmup_steps=0,
+        average=0.0,
+    )
+
+    def draw(generator: np.random.Generator) -> Transitions:
+        return store.transitions(*store.draw_steps(generator, config.batch_size))
+
+    fit(network, draw, network.loss, loop, folder, seed=seed, describe="cql")
+    torch.manual_seed(seed)
+    episodes, steps = store.all_steps()
+    values = np.empty(len(steps), dtype=np.float64)
+    with torch.no_grad():
+        for begin in range(0, len(steps), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            states = store.windows(episodes[part], steps[part], 1).states[:, 0]
+            values[part] = (network.state_values(states) * network.unit).numpy()
+    rewards = store.step_values(schema.REWARD, episodes, steps)
+    return store.with_returns_to_go(optimistic_returns(rewards, values, store.lengths))
+
+
+def optimistic_returns(
+    rewards: npt.NDArray[np.floating],
+    values: Float64Array,
+    lengths: IntArray,
+) -> Float32Array:
+    """R_t = r_t + max(R_{t+1}, V_{t+1}) within each episode, R = V = 0 after its end.
+
+    With C_t the sum of rewards before t, R_t + C_t is the maximum of V_k + C_k over k > t (V = 0
+    after the last step): a running maximum from the end, computed for all episodes at once.
+
+    Example: rewards [1, 0, 0] with values [9, 2, 5] of one episode give [6, 5, 0].
+
+    Args:
+        rewards: (N,) of all episodes, concatenated.
+        values: (N,) V of the state before each step, in reward units.
+        lengths: (E,) steps per episode.
+
+    Returns:
+        (N,) returns-to-go, in reward units.
+    """
+    ends = np.cumsum(lengths)
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    total = np.cumsum(rewards, dtype=np.float64)
+    before = total - rewards  # C_t plus the rewards of earlier episodes
+    first = before[ends - lengths][owner]
+    next_values = np.append(values[1:], 0.0)
+    next_values[ends - 1] = 0.0
+    attainable = next_values + (total - first)  # V_{t+1} + C_{t+1}
+    # An offset that grows with the episode index makes the running maximum restart per episode.
+    offset = float(np.ptp(attainable)) + 1.0
+    separated = attainable - owner * offset
+    highest = np.maximum.accumulate(separated[::-1])[::-1] + owner * offset
+    return np.asarray(highest - (before - first), dtype=np.float32)
 
 
 @settings_table("policy")
@@ -86,7 +271,7 @@ class EDT4RecPolicy(DTPolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Negative log-likelihood (nats) plus the entropy constraint's terms for λ and policy."""
-        normalized = self.normalized(_consistent(windows))
+        normalized = self.normalize(_consistent(windows))
         features = self.features(normalized)
         imitation, scalars = self.imitation(features, normalized)
         exposed = self.exposed(normalized)

@@ -74,7 +74,7 @@ class ItemKNNPolicy(SequencePolicy):
             cosines = torch.from_numpy((columns[:, rows].T @ columns).toarray()).float()
             self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None]:
         """Chooses the temperature; everything else is set by `start_from`."""

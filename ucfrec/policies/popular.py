@@ -41,7 +41,7 @@ class PopularPolicy(SequencePolicy):
     (exposure, values) are learned by gradient.
     """
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """Sets the biases, unless settings add something to learn."""
@@ -71,7 +71,7 @@ class ItemRatePolicy(PopularPolicy):
     by_rate: ClassVar[bool] = True
     """Whether scores are rates of likes, or else shares of all likes."""
 
-    def closed_form(
+    def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None]:
         """Sets the biases of the head.

@@ -28,7 +28,7 @@ BUILT_IN: Final = {
     "cdt4rec": "cdt4rec:CDT4RecPolicy",
     "edt4rec": "edt4rec:EDT4RecPolicy",
     "sasrec": "sasrec:SASRecPolicy",
-    "gsasrec": "gsasrec:GSASRecPolicy",
+    "gsasrec": "sasrec:GSASRecPolicy",
     "bc": "bc:BCPolicy",
     "popular": "popular:PopularPolicy",
     "item-rate": "popular:ItemRatePolicy",

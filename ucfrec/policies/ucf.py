@@ -21,11 +21,12 @@ from ucfrec.policies.base import (
 )
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.layers import ConvStream, Dropout, convolved, some_padding
-from ucfrec.policies.losses import mask_loss, masked_mean, parent_targets
 from ucfrec.settings import Share, Weight, settings_table
 
 _FEW: Final = 32
 """Windows up to which calling an operation costs more than its arithmetic."""
+EPSILON: Final = 1e-8
+"""Added inside the logarithm of Eq. 5 (Table 7)."""
 
 
 @settings_table("policy")
@@ -140,7 +141,7 @@ class UCFPolicy(SequencePolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
-        normalized = self.normalized(windows)
+        normalized = self.normalize(windows)
         features, attention = self.attend(normalized)
         imitation, scalars = self.imitation(features, normalized)
         if self.config.lambda_mask == 0:
@@ -160,8 +161,8 @@ class UCFPolicy(SequencePolicy):
         uniform = ((targets > 0) & visible).sum(-1) / visible.sum(-1)
         return supervision, {
             "mask_loss": supervision.detach(),
-            "attention_on_parents": masked_mean(on_parents, mask),
-            "uniform_on_parents": masked_mean(uniform, mask),
+            "attention_on_parents": on_parents[mask].mean(),
+            "uniform_on_parents": uniform[mask].mean(),
         }
 
 
@@ -221,6 +222,47 @@ class SupervisedAttention(nn.Module):
         shares = self.dropout(attention).unbind(1)
         mixed = torch.cat([each @ value for each, value in zip(shares, values, strict=True)], -1)
         return self.out(mixed), attention
+
+
+def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:
+    """Target attention q of the row that predicts a_t, over tokens (R_0, s_0, a_0, R_1, …).
+
+    Its parents are Ĝ_t and s_t with weight 1, s_{t−k} with weight decay^k for 1 ≤ k ≤ window, and
+    a_{t−1} with weight `previous_action` (Table 7). Padded parents are dropped and the rest is
+    normalised to sum to one.
+
+    Args:
+        mask: (B, K) bool, true at steps of the episode, false at padding.
+        window: number of earlier states that are parents.
+        decay: weight of the state k steps earlier is decay^k.
+        previous_action: weight of a_{t−1}.
+
+    Returns:
+        (B, K, 3K); rows of padded steps are zero.
+    """
+    batch, length = mask.shape
+    back = torch.arange(length).unsqueeze(1) - torch.arange(length)  # (K, K) t − j
+    weights = torch.zeros(length, length, 3)
+    weights[..., 0] = (back == 0).float()
+    weights[..., 1] = torch.where((back >= 0) & (back <= window), decay ** back.clamp(min=0), 0.0)
+    weights[..., 2] = previous_action * (back == 1).float()
+    weights = (
+        weights.to(mask.device) * mask.view(batch, 1, length, 1) * mask.view(batch, length, 1, 1)
+    )
+    targets = weights.reshape(batch, length, 3 * length)
+    return targets / targets.sum(-1, keepdim=True).clamp(min=EPSILON)
+
+
+def mask_loss(attention: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
+    """Mean cross-entropy (nats) of attention against the causal parents (Eq. 5).
+
+    Args:
+        attention: (B, H, K, 3K) probabilities after the softmax, before dropout.
+        targets: (B, K, 3K) from `parent_targets`.
+        mask: (B, K) bool.
+    """
+    entropy = -(targets.unsqueeze(1) * torch.log(attention + EPSILON)).sum(-1)  # (B, H, K)
+    return entropy.mean(1)[mask].mean()
 
 
 def _visible(mask: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ def fit_policy(
     """
     k, device = policy.config.context, policy.state_mean.device
     base = train.without_augmentation()
-    solve = policy.closed_form(base, validation, out / "policy", config.seed)
+    solve = policy.make_solver(base, validation, out / "policy", config.seed)
     if start is not None:
         weights = load_tensors(start)[0]
         kept = policy.state_dict().keys() if solve is None else policy.chosen

@@ -91,7 +91,7 @@ def default_space(policy: str, by_value: bool) -> Space:
     """
     policy_type = policy_class(policy)
     space: Space = {} if by_value else REWARD_WEIGHTS
-    if policy_type.closed_form is SequencePolicy.closed_form:
+    if policy_type.make_solver is SequencePolicy.make_solver:
         reads = policy_type.Config().context > 1
         space = {**NETWORK, **(HISTORY if reads else {}), **space}
     if hasattr(policy_type.Config(), "neighbors"):

@@ -91,7 +91,7 @@ def fit_training_users(
 
     Args:
         train: view of a store of items whose episodes name their users.
-        seed: of the sessions drawn by `sessions_of`.
+        seed: of the sessions drawn by `draw_sessions`.
         weighted: whether rows are weighted by propensities, if there are any.
         first: folder of the fit to an earlier state of the store, near whose spreads the search
             begins and ends; of known users, on fewer rows.
@@ -105,7 +105,7 @@ def fit_training_users(
         load_weights(path, model, tensors)
         with damage_explained(path, REMEDY):
             return TrainingUsers(model.eval(), TrainingUsersReport(**about))
-    sessions = sessions_of(train, seed)
+    sessions = draw_sessions(train, seed)
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
     set_statistics(model, rows, rows, train.item_states)
@@ -137,7 +137,7 @@ def fit_training_users(
     return TrainingUsers(model.eval(), report)
 
 
-def sessions_of(train: EpisodeStore, seed: int) -> EpisodeStore:
+def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:
     """The training sessions, in an order drawn by `seed`; of many, the first 100,000 steps."""
     order = np.random.default_rng([seed, 5]).permutation(train.n_episodes)
     last = int(np.searchsorted(np.cumsum(train.lengths[order]), _MAX_STEPS))
@@ -186,7 +186,7 @@ class UserCalibration:
     ) -> "UserCalibration":
         """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
         episodes, steps = drawn_steps(view, limit, seed)
-        rows, half = RewardRows.at(view, episodes, steps, model.reach), half_of(view)[episodes]
+        rows, half = RewardRows.at(view, episodes, steps, model.reach), halve_users(view)[episodes]
         weights = propensity_weights(view, episodes, steps, len(model.item))
         counts = torch.ones(len(rows)) if weights is None else weights
         scores, target = scores_of(model, rows)[0], model.target(rows.rewards)
@@ -210,7 +210,7 @@ class UserCalibration:
         return cls(line, (halves[0], halves[1]), float(off), error, weights is not None)
 
 
-def half_of(view: EpisodeStore) -> IntArray:
+def halve_users(view: EpisodeStore) -> IntArray:
     """Half (E,) of the users, 0 or 1, to which the episodes of a view belong; of the episodes,
     where users are not named."""
     if not view.has_users:

@@ -175,7 +175,7 @@ def attention(run: Path, seed: int = 0) -> Float64Array:
     rows = np.random.default_rng(seed).choice(full, min(len(full), _WINDOWS), replace=False)
     windows = view.windows(episodes[rows], ends[rows], k)
     with torch.no_grad():
-        weights = trained.policy.attend(trained.policy.normalized(windows))[1]
+        weights = trained.policy.attend(trained.policy.normalize(windows))[1]
     # (B, H, K, 3K), tokens in the order R_0, s_0, a_0, R_1, …
     mean = weights.double().mean(dim=(0, 1)).view(k, k, 3).transpose(1, 2)
     return np.asarray(mean)

@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from ucfrec.benchmark.cells import Task
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.evaluation.collect import collect_store
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
@@ -51,14 +51,14 @@ class Log:
 def virtual_taobao(folder: Path, log: Log) -> Task:
     """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
     environment = Environment("virtual-taobao")
-    store = simulated_store(environment, folder, log.sessions, log.seed)
+    store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), ("random", "mixture", "best-constant"))
 
 
 def synthetic_taobao(folder: Path, log: Log) -> Task:
     """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
     environment = Environment("synthetic-taobao")
-    store = simulated_store(environment, folder, log.sessions, log.seed)
+    store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(
         environment.title, store, (environment,), ("random", "mixture", "best-constant", "optimal")
     )
@@ -67,7 +67,7 @@ def synthetic_taobao(folder: Path, log: Log) -> Task:
 def synthetic_catalog(folder: Path, log: Log) -> Task:
     """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
     environment = Environment("synthetic-catalog")
-    store = simulated_store(environment, folder, log.sessions, log.seed)
+    store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), ("random", "mixture", "optimal"))
 
 
@@ -93,7 +93,7 @@ def simulated(environment: Environment, folder: Path, log: Log) -> Task:
         InputError: the environment cannot be made.
     """
     behaviors = tuple(environment.simulator().behaviors)
-    store = simulated_store(environment, folder, log.sessions, log.seed)
+    store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), behaviors)
 
 

@@ -9,7 +9,7 @@ import torch
 from tests.support.episodes import random_episodes, write_store
 from tests.support.tagged import tagged_store
 from ucfrec.errors import InputError
-from ucfrec.policies.gsasrec import GSASRecConfig, GSASRecPolicy
+from ucfrec.policies.sasrec import GSASRecConfig, GSASRecPolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
 
@@ -27,7 +27,7 @@ def test_the_loss_is_that_of_the_paper(
     monkeypatch.setattr(policy, "_drawn", lambda _: drawn)
     windows = store.windows(*store.locate(torch.arange(20).numpy()), 6)
     found = policy.loss(windows)[0].detach()
-    normalized = policy.normalized(windows)
+    normalized = policy.normalize(windows)
     with torch.no_grad():
         scores = policy.head.predict(policy.features(normalized)[windows.mask])
     rate = (len(drawn) - 1) / (n_items - 1)

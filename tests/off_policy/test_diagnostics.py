@@ -114,10 +114,3 @@ def test_a_group_that_the_logs_lack_is_named() -> None:
     behavior, target = np.array([0.5, 0.49, 0.01, 0.0]), np.array([0.4, 0.4, 0.01, 0.19])
     failed = [test for test in diagnose(grouped(behavior, target)).tests if not test.passed]
     assert {"item group 1", "step 1"} <= {test.name for test in failed}
-
-
-def test_groups_go_with_their_steps() -> None:
-    steps = grouped(np.full(4, 0.25), np.full(4, 0.25), sessions=50)
-    kept = steps.select(np.arange(50) < 10)
-    assert kept.groups is not None
-    assert len(kept.groups.target) == 10

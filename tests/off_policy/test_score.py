@@ -77,17 +77,6 @@ def test_rows_are_those_of_the_log_in_its_sessions(
     assert ((frame["rank"] == 1) == (frame.greedy_item_id == frame.item_id)).all()
 
 
-def test_probabilities_over_all_items_sum_to_one(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
-    seen = 0
-    for batch in scored_steps(trained, logged.store, RULE):
-        total = batch.log_probabilities.double().exp().sum(1)
-        np.testing.assert_allclose(total, 1, atol=1e-5)
-        seen += len(total)
-    assert seen == logged.store.n_steps
-
-
 def test_nothing_of_the_step_or_after_it_is_looked_at(
     folder: Path, trained: TrainedPolicy, tmp_path: Path
 ) -> None:

@@ -289,9 +289,6 @@ def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> di
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     """The test split of the store that policies were trained on, whose rows none of them has seen.
 
-    Args:
-        trained: at least one; all of the same store.
-
     Raises:
         InputError: the actions are vectors, the store is gone or has no test split, or a policy is
             a refit, trained on all rows.
@@ -315,11 +312,7 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
 
 
 def require_items(trained: TrainedPolicy) -> None:
-    """Check that a policy chooses items.
-
-    Raises:
-        InputError: its actions are vectors.
-    """
+    """Refuse a policy whose actions are vectors."""
     if trained.item_states is None:
         raise InputError(
             f"{trained.folder}: the actions of this policy are vectors; it chooses one for "

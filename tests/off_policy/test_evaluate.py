@@ -11,7 +11,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
-from ucfrec.off_policy.score import logged_sessions
+from ucfrec.off_policy.score import read_logged_sessions
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
@@ -37,7 +37,7 @@ def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
     lacking = int(share * len(log))
     log.loc[log.index[:lacking], "reward"] = np.nan
     log.to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0)
     text = f"{lacking:,} of {len(log):,} rows have no finite reward"
     assert any(text in warning for warning in report.warnings) == (lacking > 0)
@@ -50,7 +50,7 @@ def test_an_item_twice_on_a_page_is_said(
     log = pd.read_parquet(folder / "rest.parquet").drop_duplicates("user_id")
     pd.concat([log, log.iloc[:3]]).to_parquet(tmp_path / "log.parquet")
     pages = EstimateOptions(pages=True)
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
     assert any("3 rows repeat the user, item and time" in each for each in report.warnings)
 

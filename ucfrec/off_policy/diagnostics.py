@@ -180,7 +180,9 @@ def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> Weigh
     return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 
 
-def implied_items(steps: LoggedSteps, in_catalogue: BoolArray, items: int) -> WeightTest | None:
+def check_catalogue_size(
+    steps: LoggedSteps, in_catalogue: BoolArray, items: int
+) -> WeightTest | None:
     """Test that the propensities of a catalogue can add up to 1.
 
     The mean of 1 / propensity over the logged choices among `items` items is the number of these

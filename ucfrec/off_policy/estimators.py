@@ -131,22 +131,22 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
         user: (S,) whose they are; None where each is of another user.
         seed: draws the bootstrap's resamples.
     """
-    above = np.stack([one.above for one in terms.values()], axis=1)
-    below = np.stack([one.below for one in terms.values()], axis=1)
+    above = np.stack([term.above for term in terms.values()], axis=1)
+    below = np.stack([term.below for term in terms.values()], axis=1)
     estimates = {}
     intervals = cluster_intervals(above, below, user, seed)
-    for (name, one), interval in zip(terms.items(), intervals, strict=True):
-        if one.biased:
+    for (name, term), interval in zip(terms.items(), intervals, strict=True):
+        if term.biased:
             interval = None
-        weights = one.weights
+        weights = term.weights
         estimates[name] = Estimate(
-            value=float(one.above.sum() / one.below.sum()),
+            value=float(term.above.sum() / term.below.sum()),
             low=None if interval is None else interval.low,
             high=None if interval is None else interval.high,
             error=None if interval is None else interval.error,
             effective_sessions=effective_number(weights),
             largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
-            parameter=one.parameter,
+            parameter=term.parameter,
         )
     return estimates
 
@@ -304,11 +304,11 @@ def normalise_by_step(
     slopes = rewarded / totals
     value, start = float(rewarded.sum()), 0.0
     if v is not None:
-        before = np.append(float(sessions), totals[:-1])
+        totals_before = np.append(float(sessions), totals[:-1])
         earlier = steps.shift(weights)
-        valued = by_step * np.bincount(step, earlier * v) / before
-        mine = mine + steps.discounts * earlier * v / before[step]
-        slopes[:-1] += (valued / before)[1:]
+        valued = by_step * np.bincount(step, earlier * v) / totals_before
+        mine = mine + steps.discounts * earlier * v / totals_before[step]
+        slopes[:-1] += (valued / totals_before)[1:]
         value, start = value + float(valued.sum()), float(valued[0]) / sessions
     # After its last step a session's weight stays and goes on to count in the denominators.
     tail = np.append(np.cumsum(slopes[::-1])[::-1], 0.0)

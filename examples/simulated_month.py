@@ -29,7 +29,7 @@ from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.intervals import cluster_intervals
-from ucfrec.off_policy.score import logged_sessions, scored_steps
+from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Limits, Request
 from ucfrec.recommending.responder import Answer, Responder
@@ -332,7 +332,7 @@ def _covered(world: World, run: Path, log: Path) -> Iterator[bool | None]:
     trained = TrainedPolicy.load(run)
     drawing = replace(trained.rule, temperature=1.0)
     rules = drawing, replace(trained.rule, explore=0.5), replace(drawing, explore=1.0)
-    with logged_sessions(trained, [log], LogMapping()) as logged:
+    with read_logged_sessions(trained, [log], LogMapping()) as logged:
         store = logged.store.select(np.arange(min(_ESTIMATED, logged.store.n_episodes)))
         places = store.all_steps()
         users, items = logged.users[places[0]], store.step_values("item", *places)
@@ -340,7 +340,7 @@ def _covered(world: World, run: Path, log: Path) -> Iterator[bool | None]:
         propensity = store.step_values("propensity", *places).astype(np.float64)
         assert trained.item_ids is not None
         chances = world.catalog.click_probabilities[users.astype(np.int64)][:, trained.item_ids]
-        scores = torch.cat([each.scores for each in scored_steps(trained, store)])
+        scores = torch.cat([each.scores for each in score_steps(trained, store)])
         for rule in rules:
             chosen = rule.log_probabilities(scores).double().exp().numpy()
             weight = chosen[np.arange(len(items)), items] / propensity

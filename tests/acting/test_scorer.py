@@ -38,7 +38,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
-from ucfrec.off_policy.score import logged_sessions, scored_steps
+from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.policies.item_knn import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
@@ -319,9 +319,9 @@ def test_played_scored_ranked_and_recommended_alike(
     latest = log.sort_values("timestamp").groupby("user_id").tail(1)
     more = latest.assign(timestamp=latest.timestamp + 1000, item_id=5, reward=1.0)
     pd.concat([log, more]).to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
         store, ranker = logged.store, PolicyRanker(trained, given)
-        batches = list(scored_steps(trained, store, given))
+        batches = list(score_steps(trained, store, given))
         (batch,) = batches
         later = Later(store, UserRows.of(store, np.array(logged.users), None))
         ends = np.flatnonzero(np.append(np.diff(batch.episodes) > 0, True))

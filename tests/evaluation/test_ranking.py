@@ -34,7 +34,7 @@ from ucfrec.evaluation.ranking import (
 from ucfrec.evaluation.ranking_baselines import PolicyRanker, baselines
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.off_policy.score import logged_sessions
+from ucfrec.off_policy.score import read_logged_sessions
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.results.rows_file import read_results
@@ -281,7 +281,7 @@ def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
     assert trained.item_ids is not None
     rule = replace(trained.rule, temperature=0.0)  # does not draw
     ranker = PolicyRanker(trained, rule)
-    with logged_sessions(trained, [tmp_path / "after.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [tmp_path / "after.parquet"], LogMapping()) as logged:
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)
         assert (logged.store.lengths.sum() > logged.store.n_steps) is np.True_

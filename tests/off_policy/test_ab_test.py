@@ -28,7 +28,7 @@ def log(users: int, lift: float, seed: int = 0, per_user: int = 10) -> pd.DataFr
 def test_a_planted_difference_is_found_with_its_size(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log(8000, 0.4).to_parquet(tmp_path / "log.parquet")
+    log(4000, 0.4).to_parquet(tmp_path / "log.parquet")
     arguments = ["compare", str(tmp_path / "log.parquet"), "--expected", "0.05"]
     assert main([*arguments, "--json", str(tmp_path / "out.json")]) == 0
     found = json.loads((tmp_path / "out.json").read_text())
@@ -105,15 +105,15 @@ def test_logs_without_two_arms_are_refused(
         compare_arms([tmp_path / "log.parquet"], "clicks")
 
 
-@pytest.mark.parametrize("missing", [None, np.nan])
 @pytest.mark.parametrize("where", ["rows", "all rows of some users"])
 def test_rows_without_a_value_are_left_out_and_said(
-    tmp_path: Path, missing: float | None, where: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frame = log(200, 0.5).assign(feedback=lambda rows: rows.feedback.astype(float))
     lacks = frame.index % 7 == 0 if where == "rows" else frame.user_id.str.endswith("1")
     kept = frame[~lacks].reset_index(drop=True)
-    values = [missing if lack else v for lack, v in zip(lacks, frame.feedback, strict=True)]
+    missing = [None, np.nan] * len(frame)
+    values = [m if lack else v for lack, v, m in zip(lacks, frame.feedback, missing, strict=False)]
     column = pa.array(values, pa.float64(), from_pandas=False)
     table = pa.Table.from_pandas(frame.drop(columns="feedback"), preserve_index=False)
     pq.write_table(table.append_column("feedback", column), tmp_path / "log.parquet")
@@ -150,7 +150,7 @@ def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) ->
     assert (found.arms, found.users, found.in_several) == (("1", "1.0"), (3, 3), 0)
 
 
-@pytest.mark.parametrize("kind", ["int64", "int8", "float64", "category", "bool"])
+@pytest.mark.parametrize("kind", ["int8", "float64", "category", "bool"])
 def test_arms_and_values_of_any_type_are_the_same(tmp_path: Path, kind: str) -> None:
     frame = log(100, 0.5)
     frame.to_parquet(tmp_path / "text.parquet")
@@ -165,7 +165,7 @@ def test_arms_and_values_of_any_type_are_the_same(tmp_path: Path, kind: str) -> 
 def test_looking_every_day_finds_a_difference_that_is_not_there_in_few_tests() -> None:
     """40 looks at tests without a difference; the interval of a planned end is wrong in many."""
     rng = np.random.default_rng(0)
-    tests, looks, users = 600, 40, 50
+    tests, looks, users = 400, 40, 50
     values = rng.exponential(size=(tests, 2, looks * users)) - 1
     wrong = {"always": np.zeros(tests, dtype=bool), "planned": np.zeros(tests, dtype=bool)}
     for look in range(1, looks + 1):

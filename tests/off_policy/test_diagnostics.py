@@ -8,9 +8,9 @@ import pytest
 from tests.support.logged_steps import random_steps
 from ucfrec.off_policy import LoggedSteps, conclude
 from ucfrec.off_policy.diagnostics import (
+    check_catalogue_size,
     diagnose,
     identification_bounds,
-    implied_items,
     pareto_tail,
 )
 from ucfrec.off_policy.logged_steps import ItemGroups
@@ -62,11 +62,11 @@ def test_propensities_imply_how_many_items_there_are(factor: float, items: float
     item = rng.choice(20, p=shares, size=20_000)
     steps = random_steps([1] * 20_000)
     steps = replace(steps, propensity=np.minimum(shares[item] * factor, 1))
-    found = implied_items(steps, np.ones(20_000, dtype=bool), 20)
+    found = check_catalogue_size(steps, np.ones(20_000, dtype=bool), 20)
     assert found is not None
     assert found.mean * 20 == pytest.approx(items, rel=0.05)
     assert found.passed is (factor >= 1)
-    half = implied_items(steps, item < 10, 10)
+    half = check_catalogue_size(steps, item < 10, 10)
     assert half is not None
     assert half.mean == pytest.approx(items / 20, rel=0.05)
 
@@ -74,8 +74,8 @@ def test_propensities_imply_how_many_items_there_are(factor: float, items: float
 def test_few_users_and_no_propensities_imply_nothing() -> None:
     steps = random_steps([1] * 50)
     listed = np.ones(50, dtype=bool)
-    assert implied_items(replace(steps, user=np.arange(50) % 20), listed, 5) is None
-    assert implied_items(replace(steps, propensity=np.full(50, np.nan)), listed, 5) is None
+    assert check_catalogue_size(replace(steps, user=np.arange(50) % 20), listed, 5) is None
+    assert check_catalogue_size(replace(steps, propensity=np.full(50, np.nan)), listed, 5) is None
 
 
 def grouped(behavior: np.ndarray, target: np.ndarray, sessions: int = 8000) -> LoggedSteps:
@@ -114,10 +114,3 @@ def test_a_group_that_the_logs_lack_is_named() -> None:
     behavior, target = np.array([0.5, 0.49, 0.01, 0.0]), np.array([0.4, 0.4, 0.01, 0.19])
     failed = [test for test in diagnose(grouped(behavior, target)).tests if not test.passed]
     assert {"item group 1", "step 1"} <= {test.name for test in failed}
-
-
-def test_groups_go_with_their_steps() -> None:
-    steps = grouped(np.full(4, 0.25), np.full(4, 0.25), sessions=50)
-    kept = steps.select(np.arange(50) < 10)
-    assert kept.groups is not None
-    assert len(kept.groups.target) == 10

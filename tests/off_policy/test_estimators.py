@@ -1,10 +1,8 @@
 """Off-policy estimates against slow loops, enumerated environments and what is known of them."""
 
 import itertools
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.logged_steps import fitted, random_steps, reference
-from tests.support.served import trained_run
-from tests.support.tagged import tagged_log
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
 from ucfrec.off_policy.estimators import (
     DR_KINDS,
     IPS_KINDS,
@@ -100,9 +94,18 @@ def test_the_estimators_are_those_of_a_slow_loop(
     assert found.keys() - kinds == expected.keys() - {"ess"}
     for name in found.keys() - kinds:
         assert found[name].value == pytest.approx(expected[name], rel=1e-9, abs=1e-9), name
-    for one in found.values():
+    for name, one in found.items():
         if one.low is not None and one.high is not None:
             assert one.low < one.high
+            # Models' errors are not those of the sessions that they are averaged over.
+            assert name not in ("DM", "FQE")
+        assert 1 - 1e-9 <= one.effective_sessions <= len(lengths) * (1 + 1e-9)
+        assert 1 / len(lengths) <= one.largest_weight * (1 + 1e-9) <= 1 + 2e-9
+    # Only the ratio of densities counts, so a change of the actions' unit changes nothing.
+    unit = {"propensity": steps.propensity * 1e6, "target": steps.target * 1e6}
+    dense = estimate(replace(steps, **unit, densities=True), 0)
+    for name, one in found.items():
+        assert dense[name].value == pytest.approx(one.value, rel=1e-6, abs=1e-9), name
     if "IPS" in found:
         assert found["IPS"].effective_sessions == pytest.approx(expected["ess"], rel=1e-9)
 
@@ -122,13 +125,13 @@ def test_estimates_agree_with_open_bandit_pipeline_and_scope_rl(name: str) -> No
 def test_influences_are_derivatives_of_the_estimate(lengths: list[int], seed: int) -> None:
     """A session counted twice moves the estimate by its influence, to first order."""
     steps = random_steps(lengths, seed, discount=0.9)
-    lengths = lengths * 2000
+    lengths = lengths * 500
     many = LoggedSteps(
         session=np.repeat(np.arange(len(lengths)), lengths),
-        reward=np.tile(steps.reward, 2000),
-        propensity=np.tile(steps.propensity, 2000),
-        target=np.tile(steps.target, 2000),
-        model=Modelled(*(np.tile(values, 2000) for values in values_of(steps.model))),
+        reward=np.tile(steps.reward, 500),
+        propensity=np.tile(steps.propensity, 500),
+        target=np.tile(steps.target, 500),
+        model=Modelled(*(np.tile(values, 500) for values in values_of(steps.model))),
         discount=0.9,
     )
     for name in ("SNPDIS", "SNDR"):
@@ -139,25 +142,6 @@ def test_influences_are_derivatives_of_the_estimate(lengths: list[int], seed: in
         without = session_terms(many.select(once))[name].above.mean()
         moved = (value - without) * once.sum()
         assert moved == pytest.approx(terms.above[0] - value, rel=0.01, abs=1e-3), name
-
-
-@given(st.integers(1, 5), st.integers(0, 1000), st.floats(0.05, 1.0))
-def test_snips_ignores_the_scale_of_propensities(length: int, seed: int, scale: float) -> None:
-    steps = random_steps([length] * 20, seed)
-    found = estimate(steps, 0)
-    scaled = estimate(replace(steps, propensity=steps.propensity * scale), 0)
-    assert scaled.keys() == found.keys()
-    if "SNIPS" in found:
-        assert scaled["SNIPS"].value == pytest.approx(found["SNIPS"].value, rel=1e-9)
-        assert scaled["IPS"].value == pytest.approx(found["IPS"].value / scale**length, rel=1e-9)
-
-
-@given(st.lists(st.integers(1, 40), min_size=1, max_size=30), st.integers(0, 1000))
-def test_effective_sessions_are_between_one_and_all(lengths: list[int], seed: int) -> None:
-    for one in estimate(random_steps(lengths, seed), 0).values():
-        assert 1 - 1e-9 <= one.effective_sessions <= len(lengths) * (1 + 1e-9)
-        assert 1 / len(lengths) <= one.largest_weight * (1 + 1e-9)
-        assert one.largest_weight <= 1 + 1e-9
 
 
 @dataclass(frozen=True)
@@ -269,32 +253,19 @@ def test_fitted_q_evaluation_finds_the_value_of_a_environment_of_tables() -> Non
         np.testing.assert_array_equal(mine, yours)
 
 
-def test_no_session_is_judged_by_a_model_that_saw_it() -> None:
-    rng = np.random.default_rng(0)
-    session = np.repeat(np.arange(40), 3)
-    features = np.column_stack([np.ones(120), rng.normal(size=(120, 3))]).astype(np.float32)
-    reward = rng.normal(size=120)
-    before = fitted(features, features, reward, session, seed=3)
-    mine = session == 7
-    after = fitted(features, features, np.where(mine, 50.0, reward), session, seed=3)
-    for found, expected in zip(values_of(after), values_of(before), strict=True):
-        np.testing.assert_array_equal(found[mine], expected[mine])
-    assert not np.allclose(after.reward[~mine], before.reward[~mine])
-
-
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     """Of a policy near the behavior. `WORLD`'s own target has weights with so heavy a tail that 95%
     intervals cover 78 to 90% (200 repetitions of 400 sessions, 60 of 4,000)."""
     near = replace(ENVIRONMENT, target=np.full((2, 2), 0.5))
     truth = float((near.target[0] * near.q(100)[100][0]).sum())
     covered = dict.fromkeys(("IPS", "SNIPS", "PDIS"), 0)
-    for seed in range(60):
+    for seed in range(40):
         found = estimate(near.logged(400, seed)[0], seed)
         for name in covered:
             covered[name] += found[name].low <= truth <= found[name].high
-    # In 200 repetitions, 92, 94.5 and 94%; 56 of 60 are expected, 50 three deviations below.
+    # In 200 repetitions, 92, 94.5 and 94%; 37 of 40 are expected, 32 three deviations below.
     for name, times in covered.items():
-        assert times >= 50, (name, times)
+        assert times >= 32, (name, times)
 
 
 def test_the_behavior_itself_is_its_own_mean() -> None:
@@ -311,14 +282,6 @@ def test_the_behavior_itself_is_its_own_mean() -> None:
         assert one.high is not None
         assert one.low == pytest.approx(returns.mean() - 1.98 * error, abs=0.3 * error)
         assert one.high == pytest.approx(returns.mean() + 1.98 * error, abs=0.3 * error)
-
-
-def test_models_alone_carry_no_interval() -> None:
-    """Their error is the model's: an interval over sessions would miss it."""
-    found = estimate(random_steps([2, 3] * 40), seed=0)
-    for name in ("DM", "FQE"):
-        assert (found[name].low, found[name].high, found[name].error) == (None, None, None)
-    assert found["DR"].low is not None
 
 
 def test_weights_without_a_reward_have_no_interval() -> None:
@@ -338,16 +301,16 @@ def test_weights_without_a_reward_have_no_interval() -> None:
 
 
 def test_a_few_missing_propensities_leave_their_sessions_out() -> None:
-    """One in 20,000 does not switch the rest off."""
-    steps = random_steps([2] * 10_000, modelled=False)
+    """One in 4,000 does not switch the rest off."""
+    steps = random_steps([2] * 2000, modelled=False)
     holed = steps.propensity.copy()
     holed[7] = np.nan
     found = estimate(replace(steps, propensity=holed), 0)
-    expected = estimate(steps.select(np.arange(10_000) != 3), 0)
+    expected = estimate(steps.select(np.arange(2000) != 3), 0)
     for name in expected.keys() - {LOGGED}:
         assert found[name] == expected[name], name
     assert found[LOGGED] == estimate(steps, 0)[LOGGED]
-    nothing = replace(steps, propensity=np.full(20_000, np.nan))
+    nothing = replace(steps, propensity=np.full(4000, np.nan))
     assert set(estimate(nothing, 0)) == {LOGGED}
 
 
@@ -358,22 +321,6 @@ def test_long_sessions_overflow_nothing() -> None:
         assert np.isfinite([one.value, one.effective_sessions]).all()
         ends = [end for end in (one.low, one.high) if end is not None]
         assert np.isfinite(ends).all()
-
-
-def test_densities_weigh_as_probabilities_do() -> None:
-    """Only their ratio counts, so a change of the actions' unit changes nothing."""
-    steps = random_steps([2, 3, 1] * 20)
-    larger = replace(
-        steps, propensity=steps.propensity * 1e6, target=steps.target * 1e6, densities=True
-    )
-    for name, one in estimate(steps, 0).items():
-        assert estimate(larger, 0)[name].value == pytest.approx(one.value), name
-
-
-def test_one_session_cannot_be_modelled() -> None:
-    one = np.ones((3, 1), dtype=np.float32)
-    with pytest.raises(InputError, match="sessions of users other than the one"):
-        fitted(one, one, np.ones(3), np.zeros(3, dtype=np.int64), seed=0)
 
 
 KINDS = {**IPS_KINDS, **DR_KINDS}
@@ -423,18 +370,6 @@ def test_shrinking_is_tuned_to_err_less_where_weights_are_heavy() -> None:
         np.testing.assert_allclose(shrink(weights, unshrunk), weights)
 
 
-def test_only_unshrunk_weights_have_an_interval() -> None:
-    """SWITCH-DR that switches everything off is DM, whose sampling error says nothing."""
-    rng = np.random.default_rng(0)
-    weights = rng.lognormal(-1.125, 1.5, 500)
-    earned = (rng.random(500) < 0.3).astype(float)
-    target, model = np.minimum(weights * 1e-3, 1), Modelled(*np.full((4, 500), 0.3))
-    steps = LoggedSteps(np.arange(500), earned, np.full(500, 1e-3), target, model)
-    assert estimate(steps, 0)["SWITCH-DR"].low is None
-    near = estimate(replace(steps, target=steps.propensity * 0.999), 0)
-    assert near["clipped IPS"].low is not None
-
-
 ITEMS = 6
 PAYS = np.linspace(0, 1, ITEMS)
 TARGET = np.array([0.05, 0.05, 0.1, 0.2, 0.2, 0.4])
@@ -465,7 +400,7 @@ def logs(seed: int, share: float = 0.2, sessions: int = 300, wrong: float = 1.0)
 def test_intervals_cover_the_value_of_the_policy_per_step() -> None:
     covered = dict.fromkeys(("IPS", "SNIPS", "DR"), 0)
     values = []
-    for seed in range(40):
+    for seed in range(25):
         found = step_value(logs(seed), 0).estimates
         values.append([found[name].value for name in covered])
         for name in covered:
@@ -473,7 +408,7 @@ def test_intervals_cover_the_value_of_the_policy_per_step() -> None:
             assert low is not None
             assert high is not None
             covered[name] += low <= TRUTH <= high
-    assert min(covered.values()) >= 34
+    assert min(covered.values()) >= 21
     np.testing.assert_allclose(np.mean(values, axis=0), TRUTH, atol=0.03)
 
 
@@ -503,22 +438,3 @@ def test_there_is_none_where_all_steps_or_none_have_propensities() -> None:
     assert step_value(replace(logs(3), model=None), 0) is None
     never = logs(3)
     assert step_value(replace(never, target=np.zeros_like(never.target)), 0) is None
-
-
-def test_ope_estimates_per_step_from_a_randomised_slice_and_refuses_sessions(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trained = trained_run(tmp_path, "dt")
-    log, rng = tagged_log(), np.random.default_rng(0)
-    log["propensity"] = np.where(rng.random(len(log)) < 0.3, 1 / 24, np.nan)
-    log.to_parquet(tmp_path / "log.parquet")
-    files = [str(tmp_path / "log.parquet"), "--json", str(tmp_path / "ope.json")]
-    assert main(["ope", str(trained.folder), *files, "--temperature", "1"]) == 0
-    printed = capsys.readouterr().out
-    assert "R_step" in printed
-    assert "steps with a propensity" in printed
-    assert "verdict: Do not rely on this estimate" in printed
-    rows = json.loads((tmp_path / "ope.json").read_text())
-    by_step = [row for row in rows if row["table"] == "per step"]
-    assert [row["method"] for row in by_step] == ["logged", "IPS", "SNIPS", "DR"]
-    assert all(row["metric"] == "R_step" and row["interval"] for row in by_step)

@@ -1,5 +1,6 @@
 """Options of an estimate, and logs that no estimate can be of."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,20 +9,12 @@ import pytest
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
-from ucfrec.off_policy.score import logged_sessions
+from ucfrec.off_policy.score import read_logged_sessions
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
-
-
-def test_values_out_of_range_are_refused() -> None:
-    with pytest.raises(InputError, match=r"discount is 1\.1; it must be a number above 0"):
-        EstimateOptions(discount=1.1)
-    with pytest.raises(InputError, match="name the least one first"):
-        EstimateOptions(reward_range=(2.0, 1.0))
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -44,7 +37,7 @@ def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
     lacking = int(share * len(log))
     log.loc[log.index[:lacking], "reward"] = np.nan
     log.to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0)
     text = f"{lacking:,} of {len(log):,} rows have no finite reward"
     assert any(text in warning for warning in report.warnings) == (lacking > 0)
@@ -57,9 +50,26 @@ def test_an_item_twice_on_a_page_is_said(
     log = pd.read_parquet(folder / "rest.parquet").drop_duplicates("user_id")
     pd.concat([log, log.iloc[:3]]).to_parquet(tmp_path / "log.parquet")
     pages = EstimateOptions(pages=True)
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
     assert any("3 rows repeat the user, item and time" in each for each in report.warnings)
+
+
+def test_steps_with_a_propensity_are_estimated_where_sessions_cannot_be(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = pd.read_parquet(folder / "rest.parquet")
+    random = np.random.default_rng(0).random(len(log)) < 0.3
+    log.assign(propensity=np.where(random, 1 / 30, np.nan)).to_parquet(tmp_path / "log.parquet")
+    files = [str(tmp_path / "log.parquet"), "--json", str(tmp_path / "ope.json")]
+    assert main(["ope", str(folder / "run"), *files, "--temperature", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "steps with a propensity" in printed
+    assert "verdict: Do not rely on this estimate" in printed
+    rows = json.loads((tmp_path / "ope.json").read_text())
+    by_step = [row for row in rows if row["table"] == "per step"]
+    assert [row["method"] for row in by_step] == ["logged", "IPS", "SNIPS", "DR"]
+    assert all(row["metric"] == "R_step" and row["interval"] for row in by_step)
 
 
 @pytest.mark.parametrize(

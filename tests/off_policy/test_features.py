@@ -12,13 +12,13 @@ import torch
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.features import ROWS_AT_ONCE, InputsFile, StepInputs, make_inputs
-from ucfrec.off_policy.score import LoggedSessions, logged_sessions, scored_steps
+from ucfrec.off_policy.score import LoggedSessions, read_logged_sessions, score_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
 @pytest.fixture
 def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
         yield logged
 
 
@@ -52,7 +52,7 @@ def test_context_is_the_state_the_return_left_and_the_window(
     seen = []
     for target in (3.0, 5.0):
         rule = DecisionRule(target, temperature=1.0)
-        batch = next(scored_steps(trained, logged.store, rule))
+        batch = next(score_steps(trained, logged.store, rule))
         seen.append(make_inputs(trained, batch)[2])
         earned = torch.zeros(len(batch.steps))
         for row, (episode, step) in enumerate(zip(batch.episodes, batch.steps, strict=True)):
@@ -70,7 +70,7 @@ def test_context_is_the_state_the_return_left_and_the_window(
 def test_features_are_those_that_the_scores_are_made_from(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
-    batch = next(scored_steps(trained, logged.store, DecisionRule(3.0)))
+    batch = next(score_steps(trained, logged.store, DecisionRule(3.0)))
     assert batch.features is not None
     if trained.policy.head.exposure is None:
         predicted = trained.policy.head.predict(batch.features)  # type: ignore[call-arg]
@@ -82,7 +82,7 @@ def test_scores_are_of_the_item_and_their_mean_over_what_is_shown(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     """Of an unknown item, the mean; what is all but impossible counts as e^−20."""
-    batch = next(scored_steps(trained, logged.store, DecisionRule(3.0, temperature=1.0)))
+    batch = next(score_steps(trained, logged.store, DecisionRule(3.0, temperature=1.0)))
     items = batch.items.clone()
     items[1] = -1
     batch = replace(batch, items=items, scores=batch.scores.clone())

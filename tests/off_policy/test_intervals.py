@@ -17,15 +17,15 @@ def covers(interval: object, truth: float) -> bool:
 def test_sessions_of_one_user_are_resampled_together() -> None:
     """Users of 20 sessions each, taste far more different between than within them."""
     together = apart = 0
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         taste = np.repeat(rng.normal(size=40), 20)
         values, ones = column(taste + 0.5 * rng.normal(size=800)), np.ones((800, 1))
         users = np.repeat(rng.permutation(40), 20)
         together += covers(cluster_intervals(values, ones, users, seed)[0], 0.0)
         apart += covers(cluster_intervals(values, ones, None, seed)[0], 0.0)
-    assert together >= 53
-    assert apart <= 30
+    assert together >= 26
+    assert apart <= 15
 
 
 def test_heavy_weights_are_covered_as_the_percentile_interval_does_not() -> None:

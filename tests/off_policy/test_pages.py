@@ -94,13 +94,13 @@ def test_normalised_weights_ignore_the_scale_of_a_position() -> None:
 
 def test_influences_of_uneven_pages_are_derivatives() -> None:
     lengths = np.array([3, 1, 2, 3, 2, 1, 3])
-    page = np.repeat(np.arange(7 * 2000), np.tile(lengths, 2000))
+    page = np.repeat(np.arange(7 * 500), np.tile(lengths, 500))
     few = rows(lengths.sum())
     many = LoggedSteps(
         np.arange(len(page)),
-        np.tile(few.reward, 2000),
-        np.tile(few.propensity, 2000),
-        np.tile(few.target, 2000),
+        np.tile(few.reward, 500),
+        np.tile(few.propensity, 500),
+        np.tile(few.target, 500),
     )
     pages = as_pages(many, page)
     above = session_terms(pages)["SNIIPS"].above

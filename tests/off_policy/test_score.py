@@ -20,7 +20,13 @@ from ucfrec.files.record import CARD
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, collect_steps, evaluate_off_policy
 from ucfrec.off_policy.features import make_inputs
-from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps, share_seen
+from ucfrec.off_policy.score import (
+    LoggedSessions,
+    read_logged_sessions,
+    score,
+    score_steps,
+    share_seen,
+)
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.record import store_of
@@ -31,7 +37,7 @@ RULE = DecisionRule(7.5, temperature=1.0)
 
 @pytest.fixture
 def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
         yield logged
 
 
@@ -77,17 +83,6 @@ def test_rows_are_those_of_the_log_in_its_sessions(
     assert ((frame["rank"] == 1) == (frame.greedy_item_id == frame.item_id)).all()
 
 
-def test_probabilities_over_all_items_sum_to_one(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
-    seen = 0
-    for batch in scored_steps(trained, logged.store, RULE):
-        total = batch.log_probabilities.double().exp().sum(1)
-        np.testing.assert_allclose(total, 1, atol=1e-5)
-        seen += len(total)
-    assert seen == logged.store.n_steps
-
-
 def test_nothing_of_the_step_or_after_it_is_looked_at(
     folder: Path, trained: TrainedPolicy, tmp_path: Path
 ) -> None:
@@ -103,9 +98,9 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
     changed.to_parquet(tmp_path / "changed.parquet")
     thought = []
     for file in (folder / "rest.parquet", tmp_path / "changed.parquet"):
-        with logged_sessions(trained, [file], LogMapping()) as logged:
+        with read_logged_sessions(trained, [file], LogMapping()) as logged:
             _, steps = logged.store.all_steps()
-            batches = scored_steps(trained, logged.store, RULE)
+            batches = score_steps(trained, logged.store, RULE)
             thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
     np.testing.assert_allclose(*thought, rtol=1e-4, atol=1e-5)
 
@@ -131,7 +126,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
 def test_features_at_the_policy_are_the_mean_over_its_items(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
-    batch = next(scored_steps(trained, logged.store, RULE))
+    batch = next(score_steps(trained, logged.store, RULE))
     at_policy = make_inputs(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
@@ -150,13 +145,13 @@ def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -
     pd.concat([log, strange]).to_parquet(tmp_path / "log.parquet")
     trained = TrainedPolicy.load(folder / "run")
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(trained, files, LogMapping()) as logged:
+    with read_logged_sessions(trained, files, LogMapping()) as logged:
         assert logged.report["dropped"]["unknown_item"] == 4
         assert sum(map(len, score(trained, logged, RULE))) == len(log)
     strange.to_parquet(tmp_path / "log.parquet")
     with (
         pytest.raises(InputError, match=r"no row is left \(4 rows: item is not in the store"),
-        logged_sessions(trained, files, LogMapping()),
+        read_logged_sessions(trained, files, LogMapping()),
     ):
         pass
 
@@ -171,7 +166,7 @@ def test_unknown_items_may_stay_with_no_probability(
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
     before = collect_steps(trained, logged, RULE, seed=0)[0]
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
+    with read_logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
@@ -193,7 +188,7 @@ def test_logs_of_another_catalogue_are_refused(
     log.assign(item_id=log.item_id + 1000).to_parquet(tmp_path / "log.parquet")
     with (
         pytest.raises(InputError, match=r"in all .* rows the item is not in the store"),
-        logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
+        read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
     ):
         pass
 
@@ -214,7 +209,9 @@ def test_logs_of_users_the_run_does_not_know_are_noted(
         each.to_parquet(tmp_path / "log.parquet")
         with (
             warnings.catch_warnings(record=True) as said,
-            logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
+            read_logged_sessions(
+                trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True
+            ),
         ):
             pass
         found = [str(note.message) for note in said if note.category is InputNote]
@@ -230,7 +227,7 @@ def test_ids_may_be_text_where_the_run_has_integers(
     text.loc[text.index[0], "user_id"] = "somebody"
     text.to_parquet(tmp_path / "log.parquet")
     files = [tmp_path / "log.parquet"]
-    with logged_sessions(trained, files, LogMapping()) as other:
+    with read_logged_sessions(trained, files, LogMapping()) as other:
         there = other.store.step_values("item", *other.store.all_steps())
         assert len(there) == len(log)
         assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))
@@ -250,7 +247,7 @@ def test_rows_that_repeat_count_as_in_the_training_log(
     twice.to_parquet(tmp_path / "twice.parquet")
     data = trained.record.data.model_copy(update={"duplicates": duplicates})
     alike = replace(trained, record=trained.record.copy_with(data=data))
-    with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
 
 
@@ -271,7 +268,7 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
         before = pd.concat([before, served[-1]])
     log = pd.concat(served).sort_values(["user_id", "timestamp"])
     log.to_parquet(tmp_path / "served.parquet")
-    with logged_sessions(trained, [tmp_path / "served.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [tmp_path / "served.parquet"], LogMapping()) as logged:
         whole, filtered = (
             pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
         )
@@ -296,13 +293,13 @@ def test_the_share_of_rows_seen_in_training(
     rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
     # The last tenth of the training log is its test split, which the run never saw.
     pd.concat([train.head(seen), rest]).to_parquet(tmp_path / "log.parquet")
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
         assert share_seen(trained, logged.store) == pytest.approx(expected, abs=0.01)
 
 
 def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
     log = folder / "train.parquet"
-    with logged_sessions(trained, [log], LogMapping(), keep_unknown=True) as logged:
+    with read_logged_sessions(trained, [log], LogMapping(), keep_unknown=True) as logged:
         rule = DecisionRule(5.0, temperature=1.0)
         evaluated = evaluate_off_policy(trained, logged, rule=rule, seed=0)
     assert not evaluated.verdict.reliable
@@ -318,7 +315,7 @@ def test_a_refit_has_seen_the_test_split_too(
     held_out = pd.read_parquet(log).sort_values("timestamp").tail(50)
     held_out.to_parquet(tmp_path / "held-out.parquet")
     files = [tmp_path / "held-out.parquet"]
-    with logged_sessions(trained, files, LogMapping()) as logged:
+    with read_logged_sessions(trained, files, LogMapping()) as logged:
         assert share_seen(trained, logged.store) == 0
         assert share_seen(TrainedPolicy.load(again), logged.store) == 1
     capsys.readouterr()
@@ -337,7 +334,7 @@ def test_without_the_training_store_nothing_is_known(
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
         moved = replace(trained, record=trained.record.copy_with(**places))
-        with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
+        with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
             assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
 
 

@@ -18,7 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy import scored
 from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
-from ucfrec.off_policy.score import about_scores, logged_sessions, score
+from ucfrec.off_policy.score import about_scores, read_logged_sessions, score
 from ucfrec.off_policy.scored import evaluate_scored
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -32,7 +32,7 @@ def scored_parts(folder: Path, trained: TrainedPolicy, out: Path, lacking: int) 
     log["propensity"] = np.random.default_rng(0).uniform(0.02, 0.06, len(log))
     log.loc[log.index[:lacking], "propensity"] = np.nan
     log.to_parquet(out / "log.parquet")
-    with logged_sessions(trained, [out / "log.parquet"], LogMapping()) as logged:
+    with read_logged_sessions(trained, [out / "log.parquet"], LogMapping()) as logged:
         frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
     (out / "scored").mkdir()
     for part, (begin, end) in enumerate(((0, 70), (70, 71), (71, len(frame)))):
@@ -56,7 +56,7 @@ def test_estimates_are_those_from_the_logs(
     monkeypatch.setattr(scored, "_BATCH_ROWS", rows)
     options = EstimateOptions(discount=discount)
     found = evaluate_scored(trained, [parts], rule=RULE, seed=3, options=options)
-    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
         expected = evaluate_off_policy(trained, logged, rule=RULE, seed=3, options=options)
     ours, theirs = ({row.method: row for row in each.rows} for each in (found, expected))
     assert {*WEIGHED} <= {*ours}

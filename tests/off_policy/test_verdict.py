@@ -180,24 +180,6 @@ def test_one_missing_propensity_leaves_the_verdict_standing_and_many_do_not() ->
     assert nothing.lift is None
 
 
-def test_sessions_of_one_user_count_together() -> None:
-    """Two hundred users of 20 sessions, each repeating what it did in the first."""
-    steps, _ = logs(200)
-    again = np.repeat(np.arange(200), 20)
-    repeated = LoggedSteps(
-        session=np.arange(4000),
-        reward=steps.reward[again],
-        propensity=steps.propensity[again],
-        target=steps.target[again],
-        user=again,
-    )
-    once, repeated_once = estimate(steps, 0)["IPS"], estimate(repeated, 0)
-    assert repeated_once["IPS"].error == pytest.approx(once.error)
-    apart = estimate(replace(repeated, user=None), 0)["IPS"].error
-    assert apart == pytest.approx(repeated_once["IPS"].error / 20**0.5, rel=0.01)
-    assert diagnose(repeated).effective_users == pytest.approx(diagnose(steps).effective_users)
-
-
 def test_users_are_never_judged_by_models_that_saw_them() -> None:
     rng = np.random.default_rng(0)
     user, session = np.repeat(np.arange(20), 5), np.arange(100)

@@ -11,9 +11,9 @@ from tests.support.tagged import ITEMS
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.append import append_logs
 from ucfrec.updating.drift import (
-    as_known,
     describe,
     popularity_index,
+    restrict_to_run,
     reward_index,
     stability_index,
 )
@@ -58,7 +58,7 @@ def test_unknown_items_and_users_have_no_number(tmp_path: Path) -> None:
     logs, mapping = [tmp_path / "later.parquet"], later_mapping(tmp_path)
     append_logs(tmp_path / "store", logs, tmp_path / "grown", mapping)
     newest = EpisodeStore.open(tmp_path / "grown").split("test")
-    known = as_known(newest, trained)
+    known = restrict_to_run(newest, trained)
     items = newest.step_values("item", *newest.all_steps())
     expected = np.where(items < ITEMS, items, -1)
     assert (expected < 0).any()

@@ -241,7 +241,7 @@ def _next_step(verdict: "Verdict") -> str:
 def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
     """What the policy is evaluated on: the logs, or else the test split of its store."""
     from ucfrec.logs.summary import format_summary
-    from ucfrec.off_policy.score import held_out_sessions, logged_sessions
+    from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
 
     if not options.logs:
         logged = held_out_sessions([trained])
@@ -251,7 +251,7 @@ def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[
         return
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
-    with logged_sessions(trained, files, mapping, True, limit) as logged:
+    with read_logged_sessions(trained, files, mapping, True, limit) as logged:
         print(format_summary(logged.report))
         yield logged
 

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import (
         held_out_sessions,
-        logged_sessions,
+        read_logged_sessions,
         seen_too_often,
         share_seen,
     )
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
     train, liked = trained[0].training_store(), _liked(options, trained[0])
     if options.logs:
         files, mapping = logs_given(options, trained[0])
-        with logged_sessions(trained[0], files, mapping) as logged:
+        with read_logged_sessions(trained[0], files, mapping) as logged:
             print(format_summary(logged.report), end="\n\n")
             warnings = [seen_too_often(share_seen(policy, logged.store)) for policy in trained]
             warnings[0] += [logged.history_lacking] if logged.history_lacking else []

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.files.parquet import write_frames
     from ucfrec.logs.summary import format_report
-    from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, logged_sessions, score
+    from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, read_logged_sessions, score
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
         return
     files, mapping = logs_given(options, trained)
     limit = options.memory_limit
-    with logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
+    with read_logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
         print(format_report(logged.report))
         rule = rule_given(options, trained)
         frames = score(trained, logged, rule, options.filter_seen)

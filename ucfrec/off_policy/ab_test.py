@@ -153,12 +153,12 @@ def compare_arms(
     sums: dict[str, Float64Array] = {}
     without_value: dict[str, int] = {}
     for arm in map(str, np.unique(groups[schema.ARM][counts])):
-        values, shown, rows = (
+        values, counted, rows = (
             groups[part][counts & (groups[schema.ARM] == arm)]
             for part in ("value", "shown", "rows")
         )
-        sums[arm] = np.stack([values, shown.astype(np.float64)])[:, shown > 0]
-        without_value[arm] = int((rows - shown).sum())
+        sums[arm] = np.stack([values, counted.astype(np.float64)])[:, counted > 0]
+        without_value[arm] = int((rows - counted).sum())
     users = {arm: values.shape[1] for arm, values in sums.items()}
     names = arms or tuple(sorted(users, key=lambda arm: -users[arm])[:2])
     if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
@@ -180,7 +180,7 @@ def compare_arms(
             stacklevel=2,
         )
     (value_a, error_a), (value_b, error_b) = (
-        cluster_mean(total / shown, None, shown) for total, shown in (sums[first], sums[second])
+        cluster_mean(total / count, None, count) for total, count in (sums[first], sums[second])
     )
     difference, variance = value_b - value_a, error_b**2 + error_a**2
     error = math.sqrt(variance)

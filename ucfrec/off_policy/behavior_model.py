@@ -95,10 +95,10 @@ def fit_behavior(
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
     folds = rng.permutation(int(owner.max()) + 1)[owner] % FOLDS
-    listed, count = item >= 0, int(group.max()) + 1
+    in_catalogue, count = item >= 0, int(group.max()) + 1
     samples = []
     for fold in range(FOLDS):
-        rows = np.flatnonzero(listed & (folds != fold))
+        rows = np.flatnonzero(in_catalogue & (folds != fold))
         if len(rows) > _MOST_ROWS:
             rows = np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
         samples.append(rows)
@@ -107,7 +107,7 @@ def fit_behavior(
     models = []
     with progress(FOLDS, "propensities", "folds") as bar:
         for fold, rows in enumerate(samples):
-            shares = np.bincount(group[listed & (folds != fold)], minlength=count) + 1.0
+            shares = np.bincount(group[in_catalogue & (folds != fold)], minlength=count) + 1.0
             models.append(_GroupModel(look_up(rows), group[rows], shares / shares.sum()))
             bar.update()
     calibration = _calibrate(models, look_up, group, folds, sample)
@@ -121,17 +121,19 @@ def fit_behavior(
             rows = folds[part] == fold
             probabilities[rows] = model.predict(batch[rows], *calibration)
         of_group[part] = np.take_along_axis(probabilities, group[part][:, None], axis=1)[:, 0]
-        rows = np.flatnonzero(listed[part])
+        rows = np.flatnonzero(in_catalogue[part])
         tenth = np.minimum((probabilities[rows] * 10).astype(np.int64), 9)
         logged = group[part][rows]
         np.add.at(table[0], (np.arange(count)[None, :], tenth), probabilities[rows])
         np.add.at(table[1], (logged, tenth[np.arange(len(rows)), logged]), 1.0)
         begin = part.stop
-    mean_shares = np.stack([model.shares for model in models])[folds[listed], group[listed]]
+    mean_shares = np.stack([model.shares for model in models])[
+        folds[in_catalogue], group[in_catalogue]
+    ]
     return BehaviorModel(
-        group=np.where(listed, of_group, 1.0),
-        item=np.where(listed, of_group * _item_shares(item, group, folds), 1.0),
-        log_loss=float(-np.log(of_group[listed]).mean()),
+        group=np.where(in_catalogue, of_group, 1.0),
+        item=np.where(in_catalogue, of_group * _item_shares(item, group, folds), 1.0),
+        log_loss=float(-np.log(of_group[in_catalogue]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
         calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
         temperature=calibration[0],
@@ -209,12 +211,12 @@ def _calibrate(
 def _item_shares(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
     """(N,) share of the item among its group's steps in the other folds, one step added to each
     item."""
-    listed, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
+    in_catalogue, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
     group_of = np.zeros(items, dtype=np.int64)
-    group_of[item[listed]] = group[listed]
+    group_of[item[in_catalogue]] = group[in_catalogue]
     for fold in range(FOLDS):
-        rows = listed & (folds == fold)
-        counts = np.bincount(item[listed & (folds != fold)], minlength=items) + 1.0
+        rows = in_catalogue & (folds == fold)
+        counts = np.bincount(item[in_catalogue & (folds != fold)], minlength=items) + 1.0
         totals = np.bincount(group_of, counts, int(group.max()) + 1)
         shares[rows] = counts[item[rows]] / totals[group[rows]]
     return shares

@@ -91,8 +91,8 @@ class Diagnosis:
     def unsupported_from_step(self) -> int | None:
         """First step (from 1) with fewer effective users than an estimate needs; None if the logs
         suffice to the end."""
-        few = [n < ENOUGH_USERS for n in self.effective_by_step]
-        return few.index(True) + 1 if any(few) else None
+        places = enumerate(self.effective_by_step, start=1)
+        return next((place for place, users in places if users < ENOUGH_USERS), None)
 
 
 def diagnose(
@@ -104,31 +104,30 @@ def diagnose(
 
     Args:
         reward_range: least and greatest reward of a step; None for those observed.
-        segment: (S,) number of each session's segment (of users, of weeks, of contexts known before
-            the first choice), each of which is tested alone.
+        segment: (S,) number of each session's segment (of users, of weeks), tested alone.
     """
     incomplete, users = steps.lacking, int(steps.users.max()) + 1
     if incomplete.all():
         return Diagnosis(len(incomplete), users, left_out=len(incomplete))
-    known = steps.weighable
-    weights = known.session_weights
-    by_user = np.bincount(known.users, weights).astype(np.float64)
-    rewarded = np.bincount(known.users, np.abs(weights * known.returns))
-    summed = known.per_decision is not None
+    weighable = steps.weighable
+    weights = weighable.session_weights
+    by_user = np.bincount(weighable.users, weights).astype(np.float64)
+    rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns))
+    summed = weighable.per_decision is not None
     reward_range = reward_range or (float(steps.reward.min()), float(steps.reward.max()))
     return Diagnosis(
         sessions=len(incomplete),
         users=users,
         left_out=int(incomplete.sum()),
-        overlap=float((known.target / known.propensity).mean()),
-        tests=weight_tests(known, None if segment is None else segment[~incomplete]),
-        effective_by_step=() if summed else _effective_by_step(known),
+        overlap=float((weighable.target / weighable.propensity).mean()),
+        tests=weight_tests(weighable, None if segment is None else segment[~incomplete]),
+        effective_by_step=() if summed else _effective_by_step(weighable),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
         mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
-        bounds=None if summed else identification_bounds(known, reward_range),
+        bounds=None if summed else identification_bounds(weighable, reward_range),
     )
 
 
@@ -181,42 +180,36 @@ def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> Weigh
     return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 
 
-def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTest | None:
+def check_catalogue_size(
+    steps: LoggedSteps, in_catalogue: BoolArray, items: int
+) -> WeightTest | None:
     """Test that the propensities of a catalogue can add up to 1.
 
     The mean of 1 / propensity over the logged choices among `items` items is the number of these
-    that the behavior policy chose from, at most all of them. So the test is one-sided, at 1%.
+    that the behavior policy chose from, at most all of them: a one-sided test, at 1%, of the share
+    of the items. None with fewer than 30 users that have a propensity.
 
     Args:
-        listed: (N,) whether the logged item is one of the items.
-
-    Returns:
-        The implied share of the items as a test, errors clustered by user; None with fewer than 30
-        users, or without propensities.
+        in_catalogue: (N,) whether the logged item is one of the items.
     """
-    known = ~np.isnan(steps.propensity)
-    user = steps.users[steps.session]
-    if not known.any() or len(np.unique(user[known])) < ENOUGH_TO_TEST:
+    rows = np.flatnonzero(~np.isnan(steps.propensity))
+    user = steps.users[steps.session[rows]]
+    if len(np.unique(user)) < ENOUGH_TO_TEST:
         return None
-    shares = np.where(listed[known], 1 / steps.propensity[known], 0.0) / items
-    mean, error = cluster_mean(shares, user[known])
+    shares = np.where(in_catalogue[rows], 1 / steps.propensity[rows], 0.0) / items
+    mean, error = cluster_mean(shares, user)
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
     passed = mean - 1 <= max(_TOLERANCE, limit * error)
     return WeightTest("items to choose from", mean, error, passed)
 
 
 def pareto_tail(weights: Float64Array) -> float | None:
-    """Shape k of a generalised Pareto distribution fitted to the largest weights.
+    """Shape k of a generalised Pareto distribution fitted to the largest weights (n,).
 
     From 0.5 on the variance is infinite; from 0.7 on a mean, and its interval, is unreliable
     whatever the sample (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted by Zhang &
-    Stephens, Technometrics 2009.
-
-    Args:
-        weights: (n,).
-
-    Returns:
-        None where the largest fifth, or 3√n, have fewer than ten different values: no tail.
+    Stephens, Technometrics 2009. None where the largest fifth, or 3√n, have fewer than ten
+    different values: no tail.
     """
     size = int(min(0.2 * len(weights), 3 * len(weights) ** 0.5))
     ordered = np.sort(weights)

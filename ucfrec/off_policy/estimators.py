@@ -66,9 +66,8 @@ class Estimate:
     value: float
     low: float | None
     """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
-    DM and FQE, whose error is the model's and not that of the sessions it is averaged over; for
-    MIPS and where weights are shrunk, whose bias no resampling shows; and where nothing spreads:
-    too few sessions have a reward under the weights."""
+    DM and FQE, whose error is the model's; for MIPS and where weights are shrunk, whose bias no
+    resampling shows; and where too few sessions have a reward under the weights."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -105,10 +104,9 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
     """Mean return per session as logged, and under the evaluated policy.
 
     DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
-    weigh need propensities: sessions with a step whose propensity is unknown are excluded from
-    them, which is right where propensities are lost at random. Where no session has any weight,
-    those that weigh are omitted. SWITCH-DR, DRos and sub-Gaussian DR are defined for sessions of
-    one step.
+    weigh leave out sessions with a step of unknown propensity, which is right where propensities
+    are lost at random, and are omitted where no session has any weight. SWITCH-DR, DRos and
+    sub-Gaussian DR are defined for sessions of one step.
 
     Args:
         seed: draws the bootstrap's resamples.
@@ -127,29 +125,28 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
 
 
 def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
-    """Estimates with intervals.
+    """Estimates with intervals, of terms of S units by name of the estimator.
 
     Args:
-        terms: of S units each, by name of the estimator.
         user: (S,) whose they are; None where each is of another user.
         seed: draws the bootstrap's resamples.
     """
-    above = np.stack([one.above for one in terms.values()], axis=1)
-    below = np.stack([one.below for one in terms.values()], axis=1)
+    above = np.stack([term.above for term in terms.values()], axis=1)
+    below = np.stack([term.below for term in terms.values()], axis=1)
     estimates = {}
     intervals = cluster_intervals(above, below, user, seed)
-    for (name, one), interval in zip(terms.items(), intervals, strict=True):
-        if one.biased:
+    for (name, term), interval in zip(terms.items(), intervals, strict=True):
+        if term.biased:
             interval = None
-        weights = one.weights
+        weights = term.weights
         estimates[name] = Estimate(
-            value=float(one.above.sum() / one.below.sum()),
+            value=float(term.above.sum() / term.below.sum()),
             low=None if interval is None else interval.low,
             high=None if interval is None else interval.high,
             error=None if interval is None else interval.error,
             effective_sessions=effective_number(weights),
             largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
-            parameter=one.parameter,
+            parameter=term.parameter,
         )
     return estimates
 
@@ -201,16 +198,6 @@ def _shrunk_terms(steps: LoggedSteps) -> dict[str, Terms]:
     return terms
 
 
-def clip(weights: Float64Array, most: float) -> Float64Array:
-    """min(w, λ)."""
-    return np.minimum(weights, most)
-
-
-def switch(weights: Float64Array, most: float) -> Float64Array:
-    """w where w ≤ λ, else 0."""
-    return np.where(weights <= most, weights, 0.0)
-
-
 def shrink_optimistically(weights: Float64Array, strength: float) -> Float64Array:
     """λ w / (w² + λ): w where λ is infinite, 0 where it is 0."""
     if math.isinf(strength):
@@ -227,12 +214,12 @@ Shrink = Callable[[Float64Array, float], Float64Array]
 _BOUNDS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0, math.inf)
 _STRENGTHS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 IPS_KINDS: Final[dict[str, tuple[Shrink, Sequence[float]]]] = {
-    "clipped IPS": (clip, _BOUNDS),
+    "clipped IPS": (np.minimum, _BOUNDS),
     "sub-Gaussian IPS": (shrink_to_sub_gaussian, _STRENGTHS),
 }
 """How each shrinks weights, and the parameters λ to choose from."""
 DR_KINDS: Final[dict[str, tuple[Shrink, Sequence[float]]]] = {
-    "SWITCH-DR": (switch, (0.0, *_BOUNDS)),
+    "SWITCH-DR": (lambda weights, most: np.where(weights <= most, weights, 0.0), (0.0, *_BOUNDS)),
     "DRos": (shrink_optimistically, (0.0, *_BOUNDS[:-1], 1e4, 1e5, math.inf)),
     "sub-Gaussian DR": (shrink_to_sub_gaussian, _STRENGTHS),
 }
@@ -279,24 +266,19 @@ class StepSums:
 
     @classmethod
     def of(cls, steps: LoggedSteps, left: Float64Array) -> "StepSums":
-        """The sums of some sessions.
-
-        Args:
-            left: (N,).
-        """
+        """The sums of some sessions, of `left` (N,)."""
         rewarded = np.bincount(steps.step, steps.weights * left).astype(np.float64)
         return cls(len(steps.first), steps.step_totals(), rewarded)
 
     def __add__(self, other: "StepSums") -> "StepSums":
         longest = max(len(self.totals), len(other.totals))
 
-        def sums(name: str, mode: Any) -> Float64Array:
-            # Sessions that have ended keep the weight of their last step, and have no reward.
-            both = (getattr(one, name) for one in (self, other))
-            padded = (np.pad(values, (0, longest - len(values)), mode) for values in both)
-            return np.asarray(sum(padded), dtype=np.float64)
+        def pad(values: Float64Array, mode: Any) -> Float64Array:
+            return np.pad(values, (0, longest - len(values)), mode)
 
-        totals, rewarded = sums("totals", "edge"), sums("rewarded", "constant")
+        # Sessions that have ended keep the weight of their last step, and have no reward.
+        totals = pad(self.totals, "edge") + pad(other.totals, "edge")
+        rewarded = pad(self.rewarded, "constant") + pad(other.rewarded, "constant")
         return StepSums(self.sessions + other.sessions, totals, rewarded)
 
 
@@ -322,11 +304,11 @@ def normalise_by_step(
     slopes = rewarded / totals
     value, start = float(rewarded.sum()), 0.0
     if v is not None:
-        before = np.append(float(sessions), totals[:-1])
+        totals_before = np.append(float(sessions), totals[:-1])
         earlier = steps.shift(weights)
-        valued = by_step * np.bincount(step, earlier * v) / before
-        mine = mine + steps.discounts * earlier * v / before[step]
-        slopes[:-1] += (valued / before)[1:]
+        valued = by_step * np.bincount(step, earlier * v) / totals_before
+        mine = mine + steps.discounts * earlier * v / totals_before[step]
+        slopes[:-1] += (valued / totals_before)[1:]
         value, start = value + float(valued.sum()), float(valued[0]) / sessions
     # After its last step a session's weight stays and goes on to count in the denominators.
     tail = np.append(np.cumsum(slopes[::-1])[::-1], 0.0)
@@ -343,11 +325,9 @@ BEST: Final = "DR"
 class StepValue:
     """What N' logged steps with a propensity say of the evaluated policy, per step.
 
-    The contextual bandit of Dudík, Langford & Li (ICML 2011) on those steps: the mean reward of a
-    step, had the evaluated policy chosen its item after a history as the logging policy makes them.
-    It says nothing of the histories that the policy itself would make, and so nothing of a
-    session's return. The steps have to be picked at random, as where a share of the requests is
-    randomised.
+    The contextual bandit of Dudík, Langford & Li (ICML 2011) on those steps, picked at random: the
+    mean reward of a step, had the evaluated policy chosen its item after a history as the logging
+    policy makes them. It says nothing of the return of sessions that the policy itself would make.
     """
 
     estimates: dict[str, Estimate]
@@ -383,11 +363,7 @@ class StepValue:
 
 
 def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
-    """Estimate the value per step; None where all steps have propensities, too few, or no weight.
-
-    Args:
-        seed: draws the bootstrap's resamples.
-    """
+    """The value per step; None where all steps have propensities, too few, or no weight."""
     weighable = ~np.isnan(steps.propensity)
     if steps.model is None or weighable.all() or weighable.sum() < 2:
         return None

@@ -13,7 +13,13 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.behavior_model import fit_behavior, group_items
-from ucfrec.off_policy.diagnostics import FAR_OFF, MOST_LEFT_OUT, Diagnosis, diagnose, implied_items
+from ucfrec.off_policy.diagnostics import (
+    FAR_OFF,
+    MOST_LEFT_OUT,
+    Diagnosis,
+    check_catalogue_size,
+    diagnose,
+)
 from ucfrec.off_policy.estimators import (
     LOGGED,
     SUITE,
@@ -27,7 +33,7 @@ from ucfrec.off_policy.features import InputsFile, array_on_disk, make_inputs
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
 from ucfrec.off_policy.pages import as_pages, number_pages
-from ucfrec.off_policy.score import LoggedSessions, scored_steps, seen_too_often, share_seen
+from ucfrec.off_policy.score import LoggedSessions, score_steps, seen_too_often, share_seen
 from ucfrec.off_policy.verdict import Verdict, conclude, list_cautions
 from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.row import ResultRow, Scalar
@@ -140,7 +146,7 @@ def evaluate_off_policy(
     doubts = _doubt_logs(logged, seen, options.pages)
     assert steps.groups is not None
     items, in_catalogue = len(trained.items), steps.groups.number >= 0
-    implied = None if declared else implied_items(steps, in_catalogue, items)
+    implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
     if implied is not None and not implied.passed:
         doubts.forbidden.append(
             f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
@@ -235,7 +241,7 @@ def make_report(
     }
     judged = {**columns, "warnings": warnings, **_columns_of_evidence(verdict, diagnosis)}
 
-    def make_row(name: str, one: Estimate, metric: str, units: str, table: str) -> ResultRow:
+    def make_row(name: str, result: Estimate, metric: str, units: str, table: str) -> ResultRow:
         row = ResultRow(
             suite=SUITE,
             table=table,
@@ -248,20 +254,22 @@ def make_report(
             config_hash=config_hash(record.settings),
             data_fingerprint=fingerprint,
             metric=metric,
-            metrics={metric: one.value},
-            interval=None if one.low is None or one.high is None else (one.low, one.high),
+            metrics={metric: result.value},
+            interval=None
+            if result.low is None or result.high is None
+            else (result.low, result.high),
             target_return=rule.target,
             rule=rule.hash,
             **provenance(),
         )
-        own = {
-            f"{metric}_error": one.error,
-            f"effective_{units}": one.effective_sessions,
-            "largest_weight": one.largest_weight,
-            "parameter": one.parameter,
+        numbers = {
+            f"{metric}_error": result.error,
+            f"effective_{units}": result.effective_sessions,
+            "largest_weight": result.largest_weight,
+            "parameter": result.parameter,
             "decision_rule": rule.as_dict(),
         }
-        return row.extended({**own, **judged})
+        return row.extended({**numbers, **judged})
 
     weighable = None if steps.lacking.all() else steps.weighable
     terms = None
@@ -269,7 +277,10 @@ def make_report(
         terms = session_terms(weighable)[verdict.estimator].influences
     of_steps = {} if per_step is None else per_step.estimates
     return OffPolicyReport(
-        rows=[make_row(*one, "R_cum", "sessions", "estimates") for one in estimates.items()],
+        rows=[
+            make_row(name, result, "R_cum", "sessions", "estimates")
+            for name, result in estimates.items()
+        ],
         warnings=warnings,
         verdict=verdict,
         models=models,
@@ -277,7 +288,10 @@ def make_report(
         user=None if weighable is None else weighable.user,
         terms=terms,
         per_step=per_step,
-        step_rows=[make_row(*one, "R_step", "steps", "per step") for one in of_steps.items()],
+        step_rows=[
+            make_row(name, result, "R_step", "steps", "per step")
+            for name, result in of_steps.items()
+        ],
     )
 
 
@@ -392,7 +406,7 @@ def collect_steps(
     )
     inputs = InputsFile(len(items))
     shown_before = logged.rows if options.filter_seen else None
-    for batch in scored_steps(trained, store, rule, shown_before):
+    for batch in score_steps(trained, store, rule, shown_before):
         rows = slice(end, end + len(batch.steps))
         target[rows], probabilities, batch_inputs = make_inputs(trained, batch)
         groups.target[rows] = (probabilities @ one_hot).numpy()

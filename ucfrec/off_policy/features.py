@@ -55,9 +55,9 @@ class StepInputs:
         """
         dim, size = items.shape[1], self.state_size
         left = self.context[:, [size]]
-        embeddings, others = self.context[:, : 3 * dim], self.context[:, 3 * dim : size]
-        leading = items[:, : _PRODUCTS // max(others.shape[1], 1)]
-        products = (others.unsqueeze(2) * leading.unsqueeze(1)).flatten(1)
+        embeddings, remainder = self.context[:, : 3 * dim], self.context[:, 3 * dim : size]
+        leading = items[:, : _PRODUCTS // max(remainder.shape[1], 1)]
+        products = (remainder.unsqueeze(2) * leading.unsqueeze(1)).flatten(1)
         ones, matches = torch.ones(len(items), 1), embeddings * items.repeat(1, 3)
         parts = [ones, self.context, items, score, matches, left * items, products]
         return np.asarray(torch.cat(parts, dim=1))
@@ -74,19 +74,19 @@ def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tens
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
-    known, column = batch.items >= 0, batch.items[:, None].clamp(min=0)
+    in_catalogue, column = batch.items >= 0, batch.items[:, None].clamp(min=0)
     probabilities = batch.log_probabilities.exp()
-    target = probabilities.gather(1, column)[:, 0].double() * known
+    target = probabilities.gather(1, column)[:, 0].double() * in_catalogue
     # What the policy thinks of an item counts for the models also where the rule takes the best.
     scores = batch.scores.log_softmax(-1).clamp(min=_LOWEST_SCORE)
     mean_score = (probabilities * scores).sum(1)
-    score = torch.where(known, scores.gather(1, column)[:, 0], mean_score)
+    score = torch.where(in_catalogue, scores.gather(1, column)[:, 0], mean_score)
     context = [batch.states, batch.returns_left[:, None]]
     context += [] if batch.features is None else [batch.features]
     inputs = StepInputs(
         context=torch.cat([part.float() for part in context], dim=1),
         state_size=batch.states.shape[1],
-        chosen=embeddings[batch.items] * known[:, None],
+        chosen=embeddings[batch.items] * in_catalogue[:, None],
         shown=probabilities @ embeddings,
         scores=torch.stack([score, mean_score], dim=1),
     )
@@ -118,14 +118,14 @@ class InputsFile:
 
     def states(self) -> Iterator[Float32Array]:
         """(B, S) states of all steps in order, some thousand at once."""
-        return (np.asarray(one.context[:, : one.state_size]) for one in self._read())
+        return (np.asarray(part.context[:, : part.state_size]) for part in self._read())
 
     def _read(self) -> Iterator[StepInputs]:
         at_once = max(1, min(ROWS_AT_ONCE, _NUMBERS_AT_ONCE // self._rows.shape[1]))
         for begin in range(0, self._steps, at_once):
             rows = torch.from_numpy(np.array(self._rows[begin : begin + at_once]))
-            context, chosen, shown, scores = torch.split(rows, self._sizes, dim=1)
-            yield StepInputs(context, self._state_size, chosen, shown, scores)
+            context, chosen, mean, scores = torch.split(rows, self._sizes, dim=1)
+            yield StepInputs(context, self._state_size, chosen, mean, scores)
 
 
 def array_on_disk(shape: tuple[int, int]) -> Float32Array:

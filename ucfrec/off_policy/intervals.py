@@ -92,13 +92,7 @@ class Resamples:
 def resample(
     above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
 ) -> Resamples:
-    """Draw clusters with replacement, each with all its sessions.
-
-    Args:
-        above: (S, K), one row per session, one column per ratio Σ above / Σ below.
-        below: (S, K).
-        cluster: (S,) of each session, any integers; None where each session is its own.
-    """
+    """Draw clusters with replacement, each with all its sessions: `cluster_intervals`."""
     names, clusters = _number_clusters(cluster, len(above))
     if clusters > MOST_CLUSTERS:
         shuffled = np.random.default_rng(seed).permutation(clusters)
@@ -126,12 +120,7 @@ def resample(
 def cluster_mean(
     values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
 ) -> tuple[float, float]:
-    """Mean of values (S,) and its standard error over clusters.
-
-    Args:
-        cluster: (S,); None where each value is its own.
-        weights: (S,) how often each value counts; None for once each.
-    """
+    """Mean of values (S,), of weights (S,) if given, and its standard error over clusters (S,)."""
     names, clusters = _number_clusters(cluster, len(values))
     above = np.bincount(names, values if weights is None else values * weights, clusters)
     below = np.bincount(names, weights, clusters)
@@ -151,11 +140,8 @@ def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray,
 def _draw_resamples(
     moments: Float64Array, correction: float, seed: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Deviation from the estimate (B, K) in each resample, and the resample's standard error.
-
-    Args:
-        moments: (5, C, K) of clusters: e, b, e², e b and b², where the estimate is Σe / Σb = 0.
-    """
+    """Deviation from the estimate (B, K) in each resample, and the resample's standard error, of
+    moments (5, C, K) of clusters: e, b, e², e b and b², where the estimate is Σe / Σb = 0."""
     _, clusters, columns = moments.shape
     flat = np.moveaxis(moments, 1, 0).reshape(clusters, -1)
     counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)

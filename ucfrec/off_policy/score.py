@@ -93,7 +93,7 @@ class ScoredSteps:
 
 
 @contextmanager
-def logged_sessions(
+def read_logged_sessions(
     trained: TrainedPolicy,
     files: Sequence[Path],
     mapping: LogMapping,
@@ -116,12 +116,12 @@ def logged_sessions(
             is known, or their observations are not those of the training logs.
     """
     require_items(trained)
-    mapping, options = as_trained(trained, mapping, memory_limit)
-    with prepared_sessions(trained, files, mapping, options, keep_unknown) as logged:
+    mapping, options = training_options(trained, mapping, memory_limit)
+    with prepare_sessions(trained, files, mapping, options, keep_unknown) as logged:
         yield logged
 
 
-def as_trained(
+def training_options(
     trained: TrainedPolicy, mapping: LogMapping, memory_limit: str = "2GB"
 ) -> tuple[LogMapping, PrepareOptions]:
     """The mapping and options that read logs as the training logs of a policy were read."""
@@ -138,14 +138,14 @@ def as_trained(
 
 
 @contextmanager
-def prepared_sessions(
+def prepare_sessions(
     trained: TrainedPolicy,
     files: Sequence[Path],
     mapping: LogMapping,
     options: PrepareOptions,
     keep_unknown: bool = False,
 ) -> Iterator[LoggedSessions]:
-    """`logged_sessions` of logs whose columns and options are given in full."""
+    """`read_logged_sessions` of logs whose columns and options are given in full."""
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
         folder, run = scratch / "store", trained.folder
         report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
@@ -159,8 +159,8 @@ def prepared_sessions(
         if len(trained.user_ids):
             numbers = np.unique(store.episode_values(schema.USER))
             strangers = report["users"] - int((numbers >= 0).sum())
-            about = schema.USER_ID, strangers, report["users"], "the run was trained on"
-            note_unknown(str(files[0]), *about)
+            name, users = str(files[0]), report["users"]
+            note_unknown(name, schema.USER_ID, strangers, users, "the run was trained on")
         store = _select_observations(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         store, rows = _add_history(trained, store, users, readable_store(trained))
@@ -194,7 +194,7 @@ def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> Episode
     return store.without_observation_dimensions(trained.dropped)
 
 
-def scored_steps(
+def score_steps(
     trained: TrainedPolicy,
     store: EpisodeStore,
     rule: DecisionRule | None = None,
@@ -265,7 +265,7 @@ def score(
         and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.items.ids
-    for batch in scored_steps(trained, store, rule, logged.rows if filter_seen else None):
+    for batch in score_steps(trained, store, rule, logged.rows if filter_seen else None):
         column, places = batch.items.unsqueeze(1), (batch.episodes, batch.steps)
         columns = {
             schema.USER_ID: logged.users[batch.episodes],
@@ -291,9 +291,6 @@ def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> di
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     """The test split of the store that policies were trained on, whose rows none of them has seen.
 
-    Args:
-        trained: at least one; all of the same store.
-
     Raises:
         InputError: the actions are vectors, the store is gone or has no test split, or a policy is
             a refit, trained on all rows.
@@ -317,11 +314,7 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
 
 
 def require_items(trained: TrainedPolicy) -> None:
-    """Check that a policy chooses items.
-
-    Raises:
-        InputError: its actions are vectors.
-    """
+    """Refuse a policy whose actions are vectors."""
     if trained.item_states is None:
         raise InputError(
             f"{trained.folder}: the actions of this policy are vectors; it chooses one for "

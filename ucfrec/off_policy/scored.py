@@ -95,7 +95,7 @@ def evaluate_scored(
     )
 
 
-def _check_file(file: Path, about: Mapping[str, str]) -> pq.FileMetaData:
+def _check_file(file: Path, scored_by: Mapping[str, str]) -> pq.FileMetaData:
     """The metadata of a file that the run and rule scored."""
     require_regular(file)
     try:
@@ -108,7 +108,7 @@ def _check_file(file: Path, about: Mapping[str, str]) -> pq.FileMetaData:
             f"{file} has no column {', '.join(dict.fromkeys(missing))}; name what ucfrec score "
             "made of logs with propensities"
         )
-    for name, value in about.items():
+    for name, value in scored_by.items():
         scored = (described.metadata or {}).get(name.encode(), b"").decode(errors="replace")
         if scored != value:
             raise InputError(
@@ -184,8 +184,8 @@ def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedStep
     sums: StepSums | None = None
     for steps, _ in _read_steps(files, options.discount):
         if not steps.lacking.all():
-            own = StepSums.of(steps.weighable, steps.weighable.reward)
-            sums = own if sums is None else sums + own
+            part = StepSums.of(steps.weighable, steps.weighable.reward)
+            sums = part if sums is None else sums + part
     columns: list[tuple[Array, ...]] = []
     for steps, users in _read_steps(files, options.discount):
         complete = ~steps.lacking
@@ -219,6 +219,6 @@ def _share_seen(trained: TrainedPolicy, files: Sequence[Path], rows: int) -> flo
     for file in files:
         for batch in _read_batches(file, _KEYS):
             users, items, times = (batch[name][::every] for name in _KEYS)
-            numbers = trained.users.numbers(users), trained.items.numbers(items)
-            keys.append(hash_rows(*numbers, times))
+            users, items = trained.users.numbers(users), trained.items.numbers(items)
+            keys.append(hash_rows(users, items, times))
     return share_of_rows_seen(trained, np.concatenate(keys))

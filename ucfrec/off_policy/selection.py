@@ -105,8 +105,8 @@ def select(
     standings = []
     for rank, k in enumerate(np.argsort(-value, kind="stable"), start=1):
         low, high = float(value[k] - half[k]), float(value[k] + half[k])
-        one = Standing(names[k], float(value[k]), float(error[k]), low, high, float(share[k]), rank)
-        standings.append(one)
+        worth, best_share = float(value[k]), float(share[k])
+        standings.append(Standing(names[k], worth, float(error[k]), low, high, best_share, rank))
     # What the first of each resample is worth there, beyond its worth in the whole sample.
     luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
     first = int(np.argmax(value))

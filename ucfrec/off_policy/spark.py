@@ -17,10 +17,10 @@ from ucfrec.logs.spark_users import GivenLog, by_users
 from ucfrec.off_policy.score import (
     SESSION,
     about_scores,
-    as_trained,
-    prepared_sessions,
+    prepare_sessions,
     require_items,
     score,
+    training_options,
 )
 from ucfrec.runs.on_workers import RunOnWorkers
 from ucfrec.runs.trained_policy import ITEMS, TrainedPolicy
@@ -57,7 +57,7 @@ def score_with_spark(
             or fails.
     """
     require_items(trained)
-    columns, options = as_trained(trained, mapping)
+    columns, options = training_options(trained, mapping)
     assert options.reward is not None
     log = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
@@ -83,9 +83,9 @@ class _ScorePart:
     def __call__(self, part: int, rows: Path, mapping: LogMapping) -> int:
         """Write the file of a part; returns its number of sessions."""
         trained = self.run.load()
-        _, options = as_trained(trained, mapping, self.memory_limit)
+        _, options = training_options(trained, mapping, self.memory_limit)
         options = replace(options, reward=schema.REWARD)
-        with prepared_sessions(trained, [rows], mapping, options) as logged:
+        with prepare_sessions(trained, [rows], mapping, options) as logged:
             frames = score(trained, logged, self.rule, self.filter_seen)
             write_frames(self.out / part_name(part), frames, about_scores(trained, self.rule))
             return logged.store.n_episodes

@@ -98,9 +98,8 @@ def conclude(
     Args:
         seed: draws the bootstrap's resamples.
         diagnosis: of the same steps; None to make it.
-        wanted_lift: return per session that a launch should gain; None for 5% of the mean logged
-            return.
-        forbidden: what else the caller knows to forbid a conclusion.
+        wanted_lift: return per session that a launch should gain; None for 5% of the mean logged.
+        forbidden: what else forbids a conclusion.
         declared: what the estimate rests on beside the logs, said with the verdict.
         filter_seen: whether the policy was evaluated without items that users had seen.
     """
@@ -111,8 +110,9 @@ def conclude(
     terms = {} if steps.lacking.all() else session_terms(steps.weighable)
     name = next((name for name in BEST_FIRST if name in terms), None)
     if name is None:
-        nothing = (None,) * 5
-        return Verdict(False, tuple(reasons), *nothing, wanted_lift, None, declared)
+        return Verdict(
+            False, tuple(reasons), None, None, None, None, None, wanted_lift, None, declared
+        )
     lifts = terms[name].influences - steps.weighable.returns
     ones, user = np.ones((len(lifts), 1)), steps.weighable.user
     (interval,) = cluster_intervals(lifts[:, None], ones, user, seed)

@@ -25,7 +25,7 @@ from ucfrec.logs.kept import note_dropped
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
 from ucfrec.logs.summary import MANY
-from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, logged_sessions
+from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
 from ucfrec.runs.later_logs import later_logs
@@ -164,7 +164,7 @@ def logs_given(
         trained: the policy.
         logs: the logs.
         mapping: of their columns; what it leaves open is as in the training log.
-        keep_unknown: see `logged_sessions`.
+        keep_unknown: see `read_logged_sessions`.
 
     Raises:
         InputError: the logs cannot be used.
@@ -177,7 +177,7 @@ def logs_given(
     with ExitStack() as stack:
         files, given, frame = stack.enter_context(files_given(trained, logs, mapping))
         with in_words_of_python(frame):
-            read = logged_sessions(trained, files, given, keep_unknown)
+            read = read_logged_sessions(trained, files, given, keep_unknown)
             logged = stack.enter_context(read)
             note_dropped("", _not_noted(logged.report), logged.report["rows_read"])
         with _errors_in_words_of_python(frame):

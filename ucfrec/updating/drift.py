@@ -36,29 +36,34 @@ def popularity_index(old: Array, new: Array) -> float:
         new: (n_items,) of the new rows.
     """
     order = np.argsort(-old, kind="stable")
-    before = np.cumsum(old[order]) - old[order]
-    group = np.minimum(_GROUPS * before // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)
-    counts = (np.bincount(group, each[order], _GROUPS) for each in (old, new))
-    return stability_index(*counts)
+    more_popular = np.cumsum(old[order]) - old[order]
+    group = np.minimum(_GROUPS * more_popular // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)
+    return stability_index(
+        np.bincount(group, old[order], _GROUPS), np.bincount(group, new[order], _GROUPS)
+    )
 
 
 def reward_index(old: Float64Array, new: Float64Array) -> float:
     """`stability_index` of rewards in groups between deciles of the old ones."""
     edges = np.unique(np.quantile(old, np.linspace(0, 1, _GROUPS + 1)[1:-1], method="lower"))
-    counts = (
-        np.bincount(np.searchsorted(edges, each, side="left"), minlength=len(edges) + 1)
-        for each in (old, new)
+    old_counts, new_counts = (
+        np.bincount(np.searchsorted(edges, rewards, side="left"), minlength=len(edges) + 1)
+        for rewards in (old, new)
     )
-    return stability_index(*counts)
+    return stability_index(old_counts, new_counts)
 
 
-def drift(
-    old: TrainedPolicy, before: EpisodeStore, added: EpisodeStore, counts: dict[str, Any], seed: int
+def measure_drift(
+    old: TrainedPolicy,
+    training: EpisodeStore,
+    added: EpisodeStore,
+    counts: dict[str, Any],
+    seed: int,
 ) -> dict[str, Any]:
     """What is different in new rows.
 
     Args:
-        before: its training episodes.
+        training: the run's training episodes.
         added: the new episodes of the grown store.
         counts: of `ucfrec.logs.append.append_logs`.
         seed: of the rows that are drawn from many.
@@ -69,49 +74,44 @@ def drift(
         `calibration_error`, `slope`: of the run's reward model on new rows of known items, absent
         without a reward model.
     """
-    few = added.select(_some_episodes(added, seed))
-    known = as_known(few, old)
-    items = known.column(schema.ITEM)
+    episodes = np.random.default_rng(seed).permutation(added.n_episodes)
+    last = int(np.searchsorted(np.cumsum(added.lengths[episodes]), _MOST_STEPS))
+    sample = restrict_to_run(added.select(np.sort(episodes[: last + 1])), old)
+    items = sample.column(schema.ITEM)
     assert old.counts is not None
-    shown = old.counts.shown.numpy()
-    rows = np.sort(np.random.default_rng(seed).integers(before.n_steps, size=_MOST_STEPS))
-    rewards = before.step_values(schema.REWARD, *before.locate(rows)).astype(np.float64)
-    new = known.column(schema.REWARD).astype(np.float64)
-    steps = max(counts["steps"], 1)
-    found: dict[str, Any] = {
+    times_shown = old.counts.shown.numpy()
+    times_shown_now = np.bincount(items[items >= 0], None, len(times_shown))
+    rows = np.sort(np.random.default_rng(seed).integers(training.n_steps, size=_MOST_STEPS))
+    where, steps = training.locate(rows), max(counts["steps"], 1)
+    rewards = training.step_values(schema.REWARD, *where).astype(np.float64)
+    measures = {
         "unknown_items": counts["new_item_steps"] / steps,
         "unknown_users": counts["new_user_steps"] / steps,
-        "item_popularity": popularity_index(
-            shown, np.bincount(items[items >= 0], None, len(shown))
-        ),
-        "rewards": reward_index(rewards, new),
+        "item_popularity": popularity_index(times_shown, times_shown_now),
+        "rewards": reward_index(rewards, sample.column(schema.REWARD).astype(np.float64)),
     }
-    return found | _calibration(old, known, seed)
-
-
-def _some_episodes(view: EpisodeStore, seed: int) -> Array:
-    """Episodes, in order, of about `_MOST_STEPS` steps, drawn from all."""
-    drawn = np.random.default_rng(seed).permutation(view.n_episodes)
-    last = int(np.searchsorted(np.cumsum(view.lengths[drawn]), _MOST_STEPS))
-    return np.sort(drawn[: last + 1])
-
-
-def _calibration(old: TrainedPolicy, known: EpisodeStore, seed: int) -> dict[str, float]:
     model = old.reward_model
     if model is None:
-        return {}
-    rows = RewardRows.of(known, model.reach, _MOST_STEPS, seed)
-    keep = (rows.items >= 0).nonzero()[:, 0]
+        return measures
+    reward_rows = RewardRows.of(sample, model.reach, _MOST_STEPS, seed)
+    keep = (reward_rows.items >= 0).nonzero()[:, 0]
     if not len(keep):
-        return {}
-    rows = RewardRows(
-        *(rows.items[keep], rows.users[keep], rows.shown.at(keep), rows.states[keep]),
-        *(rows.rewards[keep], rows.observations),
+        return measures
+    reward_rows = RewardRows(
+        reward_rows.items[keep],
+        reward_rows.users[keep],
+        reward_rows.shown.at(keep),
+        reward_rows.states[keep],
+        reward_rows.rewards[keep],
+        reward_rows.observations,
     )
-    scores = scores_of(model, rows)[0]
-    predicted, observed = model.expected(scores).double().numpy(), rows.rewards.double().numpy()
-    slope, _ = fit_line(scores, model.target(rows.rewards), bool(model.binary))
-    return {
+    scores = scores_of(model, reward_rows)[0]
+    predicted, observed = (
+        model.expected(scores).double().numpy(),
+        reward_rows.rewards.double().numpy(),
+    )
+    slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))
+    return measures | {
         "predicted": float(predicted.mean()),
         "observed": float(observed.mean()),
         "calibration_error": calibration(predicted, observed).error,
@@ -119,23 +119,23 @@ def _calibration(old: TrainedPolicy, known: EpisodeStore, seed: int) -> dict[str
     }
 
 
-def describe(found: dict[str, Any]) -> str:
+def describe(drift: dict[str, Any]) -> str:
     """The drift in a few lines."""
     lines = [
-        f"drift         {found['unknown_items']:.1%} of the new rows have new items, "
-        f"{found['unknown_users']:.1%} new users",
+        f"drift         {drift['unknown_items']:.1%} of the new rows have new items, "
+        f"{drift['unknown_users']:.1%} new users",
         "              population stability index: item popularity "
-        f"{found['item_popularity']:.3f}, rewards {found['rewards']:.3f} (above {LARGE:g}: large)",
+        f"{drift['item_popularity']:.3f}, rewards {drift['rewards']:.3f} (above {LARGE:g}: large)",
     ]
-    if "predicted" in found:
+    if "predicted" in drift:
         lines.append(
-            f"              the old run's reward model predicts {found['predicted']:.4g}, observed "
-            f"{found['observed']:.4g}; calibration slope {found['slope']:.3g}"
+            f"              the old run's reward model predicts {drift['predicted']:.4g}, observed "
+            f"{drift['observed']:.4g}; calibration slope {drift['slope']:.3g}"
         )
     return "\n".join(lines)
 
 
-def as_known(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
+def restrict_to_run(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
     """The episodes of a view, in memory, with the item states of a run.
 
     Args:

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -23,11 +23,15 @@ from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import without_columns
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.runs.warm_start import SHARE, warm_settings
-from ucfrec.updating.drift import drift
+from ucfrec.updating.drift import measure_drift
 from ucfrec.updating.verdict import compare_runs
 
 STORE_SUFFIX: Final = "-store"
 """Added to the name of the run, it is the default name of the grown store beside it."""
+_COUNTS: Final = (
+    *("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps"),
+    "expired_steps",
+)
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,23 @@ def update_run(
         InputError: the run or the logs cannot be used, or `out` or `store` is something else.
     """
     options, trained = options or UpdateOptions(), TrainedPolicy.load(run, split=True)
-    before = _store_before(run, trained)
-    _require_update(out, run, trained)
+    if trained.item_states is None or trained.counts is None:
+        raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
+    if trained.record.policy is None:
+        raise InputError(f"{run} is not finished; train it to its end first")
+    remedy = "move the run together with its store, or prepare all logs and train again"
+    store_before = trained.require_store(remedy)
+    if (out / RUN).is_file():
+        earlier_update = RunRecord.read(out).update
+        if earlier_update is None or earlier_update.run != trained.fingerprint:
+            raise InputError(f"{out} is not an update of {run}; name another run folder")
+    elif os.path.lexists(out):
+        raise InputError(f"{out} exists already and is no run; name another run folder")
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
-        counts = append_logs(before.path, paths, grown, mapping, options.append)
+        counts = append_logs(store_before.path, paths, grown, mapping, options.append)
     opened = without_columns(EpisodeStore.open(grown), trained.dropped)
-    full = _from_nothing(trained.record)
+    full = _initial_settings(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:
         config = replace(config, seed=options.seed)
@@ -96,80 +110,42 @@ def update_run(
         run=trained.fingerprint,
         settings_from_nothing=asdict(full),
         episodes=counts["episodes"],
-        appended=_numbers(counts),
+        appended={
+            **{name: counts[name] for name in _COUNTS},
+            "not_newer": counts["dropped"]["clock_out_of_range"],
+        },
     )
-    about = {"update": update, "dropped_observations": trained.dropped}
-    record = train_run(opened, out, config, about, initial=run)
+    entries = {"update": update, "dropped_observations": trained.dropped}
+    record = train_run(opened, out, config, entries, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
-        record = _compared(out, record, trained, before, opened, counts, options.filter_seen)
+        # The drift of the new rows and the verdict.
+        first = opened.n_episodes - record.update.episodes
+        added = opened.select(np.arange(first, opened.n_episodes))
+        seed, training = record.config.seed, store_before.split("train")
+        changes = measure_drift(trained, training, added, counts, seed)
+        is_newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
+        newest = opened.select(np.flatnonzero(is_newest))
+        earlier = opened.select(np.flatnonzero(~is_newest))
+        seen = None
+        if options.filter_seen:
+            seen = UserRows.of(newest, newest.episode_values(schema.USER), earlier)
+        new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
+        verdict = compare_runs(new, acting, newest, seed, seen)
+        update = record.update.model_copy(update={"drift": changes, "verdict": verdict})
+        record = record.copy_with(update=update).write(out)
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
 
 
-def _compared(
-    out: Path,
-    record: RunRecord,
-    trained: TrainedPolicy,
-    before: EpisodeStore,
-    opened: EpisodeStore,
-    counts: dict[str, Any],
-    filter_seen: bool,
-) -> RunRecord:
-    """Write the drift of the new rows and the verdict to the record of the new run."""
-    assert record.update is not None
-    seed, first = record.config.seed, opened.n_episodes - record.update.episodes
-    added = opened.select(np.arange(first, opened.n_episodes))
-    found = drift(trained, before.split("train"), added, counts, seed)
-    new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
-    newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
-    rows, others = (opened.select(np.flatnonzero(which)) for which in (newest, ~newest))
-    seen = UserRows.of(rows, rows.episode_values(schema.USER), others) if filter_seen else None
-    verdict = compare_runs(new, acting, rows, seed, seen)
-    update = record.update.model_copy(update={"drift": found, "verdict": verdict})
-    return record.copy_with(update=update).write(out)
-
-
-def _require_update(out: Path, run: Path, trained: TrainedPolicy) -> None:
-    """Check, before the store grows, that an update can begin, or go on, in the folder `out`.
-
-    Raises:
-        InputError: `out` is something else.
-    """
-    if (out / RUN).is_file():
-        update = RunRecord.read(out).update
-        if update is None or update.run != trained.fingerprint:
-            raise InputError(f"{out} is not an update of {run}; name another run folder")
-    elif os.path.lexists(out):
-        raise InputError(f"{out} exists already and is no run; name another run folder")
-
-
-def _store_before(run: Path, trained: TrainedPolicy) -> EpisodeStore:
-    if trained.item_states is None or trained.counts is None:
-        raise InputError(f"{run}: the actions of this policy are vectors; train it again instead")
-    if trained.record.policy is None:
-        raise InputError(f"{run} is not finished; train it to its end first")
-    return trained.require_store(
-        "move the run together with its store, or prepare all logs and train again"
-    )
-
-
-def _from_nothing(record: RunRecord) -> Config:
+def _initial_settings(record: RunRecord) -> Config:
     """The settings that a training from scratch had, of which the run is an update or refit."""
     config: Config = record.config
     if record.update is not None:
         return config_from_dict(record.update.settings_from_nothing)
     if record.refit_of is not None:
         # In place of the settings of the rule's choice, it has the rule.
-        others = ("rule", "weights")
-        given = {name: value for name, value in record.refit_of.items() if name not in others}
-        return replace(config_from_dict(given), rule=replace(config.rule, choose=True))
+        settings = {k: v for k, v in record.refit_of.items() if k not in ("rule", "weights")}
+        return replace(config_from_dict(settings), rule=replace(config.rule, choose=True))
     return config
-
-
-def _numbers(counts: dict[str, Any]) -> dict[str, Any]:
-    names = ("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps")
-    return {name: counts[name] for name in (*names, "expired_steps")} | {
-        "not_newer": counts["dropped"]["clock_out_of_range"]
-    }

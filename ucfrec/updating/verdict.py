@@ -12,12 +12,12 @@ from ucfrec.episodes.item_counts import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.diagnostics import check_mean_weight
 from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_intervals
-from ucfrec.off_policy.score import scored_steps
+from ucfrec.off_policy.score import score_steps
 from ucfrec.off_policy.verdict import OTHERS_REMOVED
 from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.drift import as_known
+from ucfrec.updating.drift import restrict_to_run
 
 RANKING: Final = "ndcg_liked"
 VALUE: Final = "reward per step"
@@ -50,7 +50,7 @@ def compare_runs(
     reward = rows.column(schema.REWARD)
     liked = liked_rewards(rows, reward)
     new_probability, new_gain = _judge_items(new, rows, seen)
-    old_probability, old_gain = _judge_items(old, as_known(rows, old), seen)
+    old_probability, old_gain = _judge_items(old, restrict_to_run(rows, old), seen)
     if liked.any():
         gained = (new_gain - old_gain) * liked
         differences = [_compare(RANKING, gained, liked.astype(np.float64), user, seed)]
@@ -87,11 +87,11 @@ def describe(verdict: UpdateVerdict) -> str:
         f"verdict       {verdict.result}, by {verdict.decided_by} on the newest {verdict.steps:,} "
         f"rows of {verdict.users:,} users"
     ]
-    for one in verdict.differences:
-        side = {1: "for", 0: "open", -1: "against"}[one.sign]
-        doubt = f"; not reliable: {one.doubt}" if one.doubt else ""
-        interval = f"{one.value:+.4g} [{one.low:+.4g}, {one.high:+.4g}]"
-        lines.append(f"  {side:<11} {one.measure} {interval}{doubt}")
+    for row in verdict.differences:
+        side = {1: "for", 0: "open", -1: "against"}[row.sign]
+        doubt = f"; not reliable: {row.doubt}" if row.doubt else ""
+        interval = f"{row.value:+.4g} [{row.low:+.4g}, {row.high:+.4g}]"
+        lines.append(f"  {side:<11} {row.measure} {interval}{doubt}")
     return "\n".join(lines)
 
 
@@ -105,12 +105,12 @@ def _judge_items(
         among the first ten; both 0 of items that it does not know.
     """
     probabilities, gains = [], []
-    for batch in scored_steps(trained, view, None, seen):
+    for batch in score_steps(trained, view, None, seen):
         column, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
         probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
         # From 1; items of equal scores share the mean rank.
-        own = batch.scores.gather(1, column)
-        above, equal = (batch.scores > own).sum(1), (batch.scores == own).sum(1)
+        score = batch.scores.gather(1, column)
+        above, equal = (batch.scores > score).sum(1), (batch.scores == score).sum(1)
         rank = 1 + above.double() + (equal - 1).double() / 2
         gain = torch.where(rank <= _K, 1 / torch.log2(1 + rank), 0.0)
         probabilities.append(probability.masked_fill(unknown, 0.0).numpy())

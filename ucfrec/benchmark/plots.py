@@ -1,4 +1,4 @@
-"""Plots of result rows; needs matplotlib (extra `plots`)."""
+"""Plots of result rows."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -5,7 +5,6 @@ How long it takes is estimated from what the suite says of the cost of its parts
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
@@ -131,7 +130,7 @@ class BenchmarkRequest:
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
     """Measure the cells of the tables that have no row yet.
 
-    Plots are written to `out/budget/plots` if matplotlib is installed.
+    Plots are written to `out/budget/plots`.
 
     Raises:
         InputError: the budget, a task or a method is unknown, another table than main is requested
@@ -154,7 +153,6 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         for name in plan.missing()
     ]
     plots = request.out / request.budget / "plots"
-    drawn = find_spec("matplotlib") is not None
     for table in tables:
         cells = [
             cell
@@ -166,11 +164,8 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
             cells, suite.how, request.results, request.workers, table, announce, request.again
         )
         parts.append(_shown(suite.tables[table], rows))
-        if drawn:
-            suite.tables[table].plot(rows, plots)
-    return "\n\n".join(
-        [*parts, f"pictures: {plots}" if drawn else "no pictures: install matplotlib"]
-    )
+        suite.tables[table].plot(rows, plots)
+    return "\n\n".join([*parts, f"pictures: {plots}"])
 
 
 def show(suite: Benchmark, tables: Sequence[str], rows: Rows) -> str:

@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.off_policy.score import held_out_sessions, logged_sessions
     from ucfrec.off_policy.training_rows import seen_too_often, share_seen
     from ucfrec.provenance import without_folders
-    from ucfrec.reporting.cards import card_of_ranking
+    from ucfrec.reporting.model_card import add_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
     from ucfrec.results.table import Ranking
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
-        card_of_ranking(policy.folder, row, on, said)
+        add_ranking(policy.folder, row, on, said)
     if options.json is not None:
         write_results(options.json, rows)
     print(_conclusion(rows, trained))

@@ -19,11 +19,9 @@ from ucfrec.files.record import CARD
 from ucfrec.python_api.given_data import histories_given
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import some_of
-from ucfrec.reporting import charts
-from ucfrec.reporting.charts import LineChart
-from ucfrec.reporting.forest import quoted
+from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
-from ucfrec.reporting.page_results import results_of
+from ucfrec.reporting.page_results import find_quoted, read_evidence
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -87,7 +85,6 @@ class Explorer:
             sliders=self._sliders(given),
             values=self.values,
             chart=self.values_chart,
-            layout=charts,
             users=self.runs[0].user_ids[:_USERS_LISTED].tolist(),
         )
 
@@ -99,14 +96,14 @@ class Explorer:
     def values(self) -> list[tuple[float, str, ResultRow]]:
         """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
         found = []
-        for one in results_of(self._results).estimates:
-            row = quoted(one.rows)
+        for one in read_evidence(self._results).estimates:
+            row = find_quoted(one.rows)
             if row is not None and row.target_return is not None and row.interval is not None:
                 found.append((row.target_return, one.name, row))
         return sorted(found, key=lambda each: each[:2])
 
     @cached_property
-    def values_chart(self) -> LineChart | None:
+    def values_chart(self) -> Chart | None:
         """The values as one curve per policy; None with fewer than two targets."""
         curves: dict[str, dict[float, float]] = {}
         for target, _, row in self.values:
@@ -114,9 +111,7 @@ class Explorer:
         if max(map(len, curves.values()), default=0) < 2:
             return None
         named = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
-        return charts.line_chart(
-            "Off-policy value against the target return", "target return", named
-        )
+        return line_chart("Off-policy value against the target return", "target return", named)
 
     @cached_property
     def reports(self) -> list[str]:

@@ -1,6 +1,6 @@
 """Style of all figures: a color-blind-safe palette and the column widths of a paper.
 
-Matplotlib (extra `plots`) is imported only when a figure is drawn.
+Matplotlib is imported only when a figure is drawn.
 """
 
 import re

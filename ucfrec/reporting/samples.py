@@ -13,7 +13,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import require_regular
-from ucfrec.reporting.tables import Table, shown
+from ucfrec.reporting.tables import Table, format_value
 from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
@@ -86,7 +86,9 @@ def _described(features: Mapping[str, Any]) -> str:
     """Text of the features that are neither missing nor zero, cut to `_CHARACTERS`."""
     parts = []
     for name, value in features.items():
-        text = ", ".join(map(shown, value)) if isinstance(value, list) else shown(value)
+        text = (
+            ", ".join(map(format_value, value)) if isinstance(value, list) else format_value(value)
+        )
         if value:
             parts.append(f"{name} {text}")
     described = "; ".join(parts) or "–"
@@ -97,7 +99,7 @@ def _session(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
-    lines = [("shown before", item, shown(reward)) for item, reward in history]
+    lines = [("shown before", item, format_value(reward)) for item, reward in history]
     lines.append(("shown next in the log", session["logged"], "–"))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""

@@ -1,12 +1,11 @@
 """Read and write files of result rows (JSON lines)."""
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, read_json, write_json
@@ -95,7 +94,8 @@ def append_rows(
         row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
     configurations = path.with_name(CONFIGURATIONS)
     with claim(configurations, wait=True):
-        if config is not None and named not in _hashes(configurations):
+        known = [value for _, value in read_lines(configurations) if isinstance(value, dict)]
+        if config is not None and named not in [value.get("hash") for value in known]:
             _append(configurations, [{"hash": named, "config": config}])
     with claim(path, wait=True):
         _append(path, [row.to_json() for row in rows])
@@ -105,9 +105,9 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
     """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
     with claim(path, wait=True):
         rows = read_rows(path)
-        kept = [row for row in rows if not any(key.covers(row) for key in keys)]
-        if len(kept) < len(rows):
-            _write(path, b"", [row.to_json() for row in kept])
+        others = [row for row in rows if not any(key.covers(row) for key in keys)]
+        if len(others) < len(rows):
+            _write(path, b"", [row.to_json() for row in others])
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -137,25 +137,6 @@ def benchmarking(path: Path) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
-    """Lock one measurement of the file `path`, so that no two processes run it at once.
-
-    Args:
-        wait: wait until the lock is free, instead of giving up at once.
-
-    Yields:
-        Whether the lock is held.
-    """
-    digest = hashlib.sha256(str(key).encode()).hexdigest()[:16]
-    with claim(path.with_name(f"{path.name}.{digest}"), wait) as held:
-        yield held
-
-
-def _hashes(path: Path) -> set[object]:
-    return {value.get("hash") for _, value in read_lines(path) if isinstance(value, dict)}
-
-
 def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
     before = path.read_bytes() if path.exists() else b""
     if before and not before.endswith(b"\n"):
@@ -169,9 +150,5 @@ def _write(path: Path, before: bytes, values: Sequence[Mapping[str, Any]]) -> No
         for value in values:
             line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
             file.write(line.encode() + b"\n")
-        _flush(file)
-
-
-def _flush(file: IO[bytes]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
+        file.flush()
+        os.fsync(file.fileno())

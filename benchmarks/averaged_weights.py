@@ -30,7 +30,7 @@ from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.start import new_policy, training_views
-from ucfrec_simulators.benchmark.tasks import Log, kuairand, sardine, synthetic_catalog
+from ucfrec_simulators.benchmark import tasks
 
 DECAYS = (0.0, 0.99, 0.999)
 TASKS = ("synthetic-catalog", "kuairand", "sardine-boredinf")
@@ -72,10 +72,7 @@ class Averages:
 
 def task_of(name: str, out: Path, sessions: int) -> Task:
     """The log of a task."""
-    folder, log = out / "logs" / name, Log(sessions, seed=0)
-    if name == "kuairand":
-        return kuairand(folder, log)
-    return synthetic_catalog(folder, log) if name == TASKS[0] else sardine(name, folder, log)
+    return tasks.TASKS[name](out / "logs" / name, tasks.Log(sessions, seed=0))
 
 
 def losses_of(store: EpisodeStore, config: Config, run: Path) -> dict[float, list[float]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ucfrec.errors import InputError
-from ucfrec.processes import interruptions_raised, pool_of_processes, without_ctrl_c
+from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.results.row import ResultRow, RowKey
@@ -156,7 +156,7 @@ def _in_processes(
 ) -> Generator[_Outcome, None, None]:
     waiting: dict[Future[list[ResultRow] | None], str] = {}
     with pool_of_processes(workers, _one_thread) as pool:
-        with without_ctrl_c():
+        with block_ctrl_c():
             waiting = {pool.submit(_measure, task): name for name, task in tasks.items()}
         elsewhere: dict[Future[list[ResultRow] | None], str] = {}
         for done in chain.from_iterable(map(as_completed, (waiting, elsewhere))):

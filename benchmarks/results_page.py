@@ -23,7 +23,6 @@ from ucfrec.reporting.tables import NONE, markdown_table
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import latest, read_rows
 from ucfrec.results.statistics import Summary, grouped, summary
-from ucfrec_control.benchmark.spread import spreads
 
 ROOT = Path(__file__).parents[1]
 RESULTS, PAGE = ROOT / "benchmarks" / "results", ROOT / "docs" / "tables.md"
@@ -401,13 +400,19 @@ def robustness(rows: Sequence[ResultRow]) -> str:
 def spread(rows: Sequence[ResultRow]) -> str:
     """Standard deviations of scores, raw and averaged, over seeds and over last checkpoints."""
     lines = []
-    for line in spreads(rows):
-        score, over_seeds, over_last = (
-            NONE if math.isnan(line[name]) else rounded(line[name])
-            for name in ("score", "sd_seeds", "sd_last")
+    groups = grouped(rows, lambda row: (row.task, row.method, str(row.conditions["weights"])))
+    for (task, method, weights), group in groups.items():
+        last = summary(r.value for r in group if r.conditions["checkpoints_before_last"] == 0)
+        trainings = grouped(group, lambda row: row.training_seed).values()
+        within = [summary(row.value for row in training) for training in trainings]
+        over_last = summary(w.sd**2 for w in within if w.count > 1).mean ** 0.5
+        score, sd_seeds, sd_last = (
+            NONE if math.isnan(value) else rounded(value)
+            for value in (last.mean, last.sd, over_last)
         )
-        about = (line["task"].removesuffix("-zoo"), line["method"], line["weights"])
-        lines.append((*about, line["seeds"], score, over_seeds, line["checkpoints"], over_last))
+        count = max(w.count for w in within)
+        named = (task.removesuffix("-zoo"), method, weights)
+        lines.append((*named, last.count, score, sd_seeds, count, sd_last))
     head = ("file", "method", "weights", "seeds", "score", "sd over seeds", "checkpoints")
     return markdown_table((*head, "sd over checkpoints"), lines)
 
@@ -565,7 +570,7 @@ SECTIONS = (
         "The search for the context of each method at the medium budget: one seed, in other "
         "episodes than those of the reported scores, trained on a GPU (H200). DT and DC do better "
         "with 8 steps, UCF with 20. LSDT with 20 was measured on one file only, so it keeps 8.",
-        "`ucfrec-control contexts --data $UCFREC_DATA/control`",
+        "`python benchmarks/control_search.py contexts --budget medium`",
         of("control_medium", "contexts"),
         contexts,
     ),
@@ -597,7 +602,7 @@ SECTIONS = (
         "10,000 steps in batches of 64 windows of 8 steps at width 128, learning rate 1e-3, 50 "
         "episodes. Each training gives both: the weights of a step, and their exponential moving "
         "average (0.999). Checkpoints are 1,000 steps apart, the last ones of each training.",
-        "`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count`",
+        f"`ucfrec-control spread --data $UCFREC_DATA/control --method ucf-wo-count` {IN_TAG}",
         of("control_spread", "spread"),
         spread,
     ),

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from ucfrec.reporting.plot_style import OURS, PAGE, PLAIN, save, styled
 from ucfrec.results.row import ResultRow
 from ucfrec.results.statistics import grouped, summary
-from ucfrec_control.benchmark.spread import AVERAGING, BACK
 
 
 @styled
@@ -64,9 +63,9 @@ def _checkpoints(rows: Sequence[ResultRow], folder: Path, name: str) -> None:
         seeds = sorted({row.training_seed for row in own if row.training_seed is not None})
         axes.set_xticks(seeds, [f"seed {seed}" for seed in seeds])
         for weights, color, aside in (("raw", PLAIN, -0.15), ("averaged", OURS, 0.15)):
-            shown = [row for row in own if row.conditions[AVERAGING] == weights]
+            shown = [row for row in own if row.conditions["weights"] == weights]
             at = [(row.training_seed or 0) + aside for row in shown]
-            last = [row.conditions[BACK] == 0 for row in shown]
+            last = [row.conditions["checkpoints_before_last"] == 0 for row in shown]
             sizes = [26 if each else 7 for each in last]
             axes.scatter(at, [row.value for row in shown], sizes, color=color, label=weights)
     panels[0].set_ylabel("normalized score")

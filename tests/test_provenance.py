@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from ucfrec.provenance import command_line, without_folders
+from ucfrec.provenance import command_line, shorten_paths
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ from ucfrec.provenance import command_line, without_folders
     ],
 )
 def test_folders_of_a_machine_are_not_written_down(argument: str, written: str) -> None:
-    assert without_folders(argument) == written
+    assert shorten_paths(argument) == written
 
 
 def test_a_command_is_its_name_and_arguments(monkeypatch: pytest.MonkeyPatch) -> None:

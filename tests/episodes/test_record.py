@@ -27,14 +27,14 @@ NEEDED = {"version", "n_steps", "n_episodes", "n_shards", "columns", "fingerprin
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
     path = write_store(tmp_path / "store", random_episodes([3, 4, 5]), some_states()).path
-    record = StoreRecord.read(path).with_entries(source=Source.model_validate(SOURCE))
-    record.sealed(path)
+    record = StoreRecord.read(path).copy_with(source=Source.model_validate(SOURCE))
+    record.seal(path)
     return path
 
 
 def test_an_adapters_entries_are_kept(store: Path) -> None:
     source = Source.model_validate({**SOURCE, "env_id": None, "seed": 3})
-    StoreRecord.read(store).with_entries(source=source).sealed(store)
+    StoreRecord.read(store).copy_with(source=source).seal(store)
     assert StoreRecord.read(store).source.others == {"env_id": None, "seed": 3}
 
 

@@ -114,7 +114,7 @@ def test_neither_shards_nor_the_size_of_appends_show(
 
         assert parts.record.n_shards >= min(len(lengths), sum(lengths) // (shard_steps + 8))
         layout = {"n_shards": 1, "files": {}}
-        assert parts.record.with_entries(**layout) == whole.record.with_entries(**layout)
+        assert parts.record.copy_with(**layout) == whole.record.copy_with(**layout)
         assert parts.lengths.tolist() == lengths
         assert np.array_equal(parts.returns, whole.returns)
         for column in of_episodes:

@@ -10,7 +10,6 @@ from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, estimate
 from ucfrec.off_policy.behavior_model import (
     BehaviorModel,
-    default_groups,
     fit_behavior,
     group_items,
 )
@@ -139,6 +138,8 @@ def test_equal_items_are_one_group() -> None:
     assert found.max() == 2
 
 
-@pytest.mark.parametrize(("items", "groups"), [(1, 2), (80, 9), (7583, 32)])
+@pytest.mark.parametrize(("items", "groups"), [(1, 1), (80, 9), (2000, 32)])
 def test_their_number_follows_the_catalogue(items: int, groups: int) -> None:
-    assert default_groups(items) == groups
+    embeddings = np.random.default_rng(0).normal(size=(items, 2)).astype(np.float32)
+    assert group_items(embeddings, 0, seed=0).max() + 1 == groups
+    assert not group_items(embeddings, 1, seed=0).any()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.support.logged_steps import random_steps
-from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps, conclude
 from ucfrec.off_policy.diagnostics import (
     diagnose,
@@ -117,11 +116,8 @@ def test_a_group_that_the_logs_lack_is_named() -> None:
     assert {"item group 1", "step 1"} <= {test.name for test in failed}
 
 
-def test_groups_have_a_row_for_each_step() -> None:
+def test_groups_go_with_their_steps() -> None:
     steps = grouped(np.full(4, 0.25), np.full(4, 0.25), sessions=50)
-    groups = ItemGroups(np.zeros(49, dtype=np.int64), np.ones((50, 1), dtype=np.float32))
-    with pytest.raises(InputError, match="groups have shapes"):
-        replace(steps, groups=groups)
-    kept = steps.only(np.arange(50) < 10)
+    kept = steps.select(np.arange(50) < 10)
     assert kept.groups is not None
     assert len(kept.groups.target) == 10

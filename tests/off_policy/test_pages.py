@@ -11,7 +11,7 @@ from tests.support.logged_steps import random_steps
 from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps, as_pages, conclude, estimate
 from ucfrec.off_policy.estimators import session_terms
-from ucfrec.off_policy.pages import pages_of
+from ucfrec.off_policy.pages import number_pages
 
 SLATE = Path(__file__).with_name("fixtures") / "slate.npz"
 BY_MODEL = {"independent": "IIPS", "cascade": "PDIS", "slate": "IPS"}
@@ -75,7 +75,7 @@ def test_the_cascade_follows_the_positions() -> None:
 def test_rows_of_one_user_within_ten_milliseconds_are_a_page() -> None:
     user = np.array([3, 8, 3, 3, 8, 3])
     time = np.array([1000, 1003, 1009, 1018, 1014, 1029])
-    np.testing.assert_array_equal(pages_of(user, time), [0, 2, 0, 0, 3, 1])
+    np.testing.assert_array_equal(number_pages(user, time), [0, 2, 0, 0, 3, 1])
 
 
 def test_normalised_weights_ignore_the_scale_of_a_position() -> None:
@@ -105,7 +105,7 @@ def test_influences_of_uneven_pages_are_derivatives() -> None:
     pages = as_pages(many, page)
     above = session_terms(pages)["SNIIPS"].above
     value, kept = above.mean(), np.arange(len(above)) > 0
-    without = session_terms(pages.only(kept))["SNIIPS"].above.mean()
+    without = session_terms(pages.select(kept))["SNIIPS"].above.mean()
     assert (value - without) * kept.sum() == pytest.approx(above[0] - value, rel=0.01, abs=1e-3)
 
 

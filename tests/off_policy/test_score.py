@@ -1,5 +1,7 @@
 """Scores of logged choices: probabilities, and what the policy would see when acting."""
 
+import re
+import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,12 +14,16 @@ import torch
 
 from tests.support.replay import replayed
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
+from ucfrec.files.record import CARD
 from ucfrec.logs import LogMapping
-from ucfrec.off_policy.evaluate import EstimateOptions, logged_steps, step_features
-from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps
+from ucfrec.off_policy.evaluate import EstimateOptions, collect_steps, evaluate_off_policy
+from ucfrec.off_policy.features import make_inputs
+from ucfrec.off_policy.score import LoggedSessions, logged_sessions, score, scored_steps, share_seen
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
+from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
@@ -110,7 +116,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
 ) -> None:
     rule = replace(RULE, temperature=0.0) if greedy else RULE
     frame = pd.concat(score(trained, logged, RULE))
-    steps = logged_steps(trained, logged, rule, seed=0).steps
+    steps = collect_steps(trained, logged, rule, seed=0)[0]
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
@@ -126,12 +132,12 @@ def test_features_at_the_policy_are_the_mean_over_its_items(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     batch = next(scored_steps(trained, logged.store, RULE))
-    at_policy = step_features(trained, batch)[2].features()[1]
+    at_policy = make_inputs(trained, batch)[2].features()[1]
     probabilities = batch.log_probabilities.exp().numpy()
     mean = np.zeros(at_policy.shape)
     for item in range(probabilities.shape[1]):
         shown = torch.full_like(batch.items, item)
-        target, _, seen = step_features(trained, replace(batch, items=shown))
+        target, _, seen = make_inputs(trained, replace(batch, items=shown))
         of_item, _ = seen.features()
         np.testing.assert_allclose(target, probabilities[:, item], rtol=1e-6)
         mean += probabilities[:, item, None] * of_item
@@ -163,13 +169,13 @@ def test_unknown_items_may_stay_with_no_probability(
     log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
-    before = logged_steps(trained, logged, RULE, seed=0).steps
+    before = collect_steps(trained, logged, RULE, seed=0)[0]
     files = [tmp_path / "log.parquet"]
     with logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
-        steps = logged_steps(trained, kept, RULE, seed=0).steps
+        steps = collect_steps(trained, kept, RULE, seed=0)[0]
     assert (steps.target[unknown] == 0).all()
     assert (steps.weights[unknown] == 0).all()
     untouched = np.logical_and.accumulate(~unknown)
@@ -243,7 +249,7 @@ def test_rows_that_repeat_count_as_in_the_training_log(
     twice = pd.concat([log, log.assign(reward=kept(-1.0, 2.0)), log.assign(reward=0.5)])
     twice.to_parquet(tmp_path / "twice.parquet")
     data = trained.record.data.model_copy(update={"duplicates": duplicates})
-    alike = replace(trained, record=trained.record.with_entries(data=data))
+    alike = replace(trained, record=trained.record.copy_with(data=data))
     with logged_sessions(alike, [tmp_path / "twice.parquet"], LogMapping()) as logged:
         assert set(pd.concat(score(alike, logged, RULE)).reward) == {kept(-1.0, 2.0)}
 
@@ -269,8 +275,81 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
         whole, filtered = (
             pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
         )
-        steps = logged_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True)).steps
+        steps = collect_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True))[0]
     np.testing.assert_allclose(filtered.probability, log.propensity, rtol=1e-4)
     np.testing.assert_allclose(steps.target, log.propensity, rtol=1e-4)
     assert (whole.probability < 0.99 * log.propensity.to_numpy()).any()
     assert (whole.probability <= 1.0001 * log.propensity.to_numpy()).all()
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
+def test_the_share_of_rows_seen_in_training(
+    folder: Path,
+    trained: TrainedPolicy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    seen: int,
+    expected: float,
+) -> None:
+    monkeypatch.setattr("ucfrec.episodes.view._BATCH_STEPS", 100)
+    train = pd.read_parquet(folder / "train.parquet").sort_values("timestamp")
+    rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
+    # The last tenth of the training log is its test split, which the run never saw.
+    pd.concat([train.head(seen), rest]).to_parquet(tmp_path / "log.parquet")
+    with logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
+        assert share_seen(trained, logged.store) == pytest.approx(expected, abs=0.01)
+
+
+def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
+    log = folder / "train.parquet"
+    with logged_sessions(trained, [log], LogMapping(), keep_unknown=True) as logged:
+        rule = DecisionRule(5.0, temperature=1.0)
+        evaluated = evaluate_off_policy(trained, logged, rule=rule, seed=0)
+    assert not evaluated.verdict.reliable
+    assert "90% of the rows were seen in training" in evaluated.verdict.reasons[0]
+    assert evaluated.rows[0]["seen_in_training"] == pytest.approx(0.9, abs=0.01)
+
+
+def test_a_refit_has_seen_the_test_split_too(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, log, again = folder / "store", folder / "train.parquet", tmp_path / "refit"
+    assert main(["train", str(store), "--out", str(again), "--refit", str(folder / "run")]) == 0
+    held_out = pd.read_parquet(log).sort_values("timestamp").tail(50)
+    held_out.to_parquet(tmp_path / "held-out.parquet")
+    files = [tmp_path / "held-out.parquet"]
+    with logged_sessions(trained, files, LogMapping()) as logged:
+        assert share_seen(trained, logged.store) == 0
+        assert share_seen(TrainedPolicy.load(again), logged.store) == 1
+    capsys.readouterr()
+    assert main(["rank", str(folder / "run"), str(again)]) == 2
+    assert f"{again} is a refit" in capsys.readouterr().err
+    assert main(["rank", str(folder / "run"), str(again), str(files[0])]) == 0
+    said = re.findall("warning: (.*): (.*) of the rows were seen", capsys.readouterr().out)
+    assert said == [(str(again), "100%")]
+    assert "100% of the rows were seen in training" in (again / CARD).read_text()
+
+
+def test_without_the_training_store_nothing_is_known(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    shutil.copytree(folder / "store", tmp_path / "store")
+    for store in (tmp_path / "gone", tmp_path / "store"):
+        places = {"store": str(store), "store_from_run": "../gone"}
+        moved = replace(trained, record=trained.record.copy_with(**places))
+        with logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
+            assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
+
+
+def test_a_run_that_was_moved_with_its_store_finds_it(
+    folder: Path, trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    for name in ("run", "store"):
+        shutil.copytree(folder / name, tmp_path / name)
+    record = trained.record.copy_with(store=str(tmp_path / "gone"))
+    found = store_of(tmp_path / "run", record)
+    assert found is not None
+    assert found.path == (tmp_path / "store").resolve()
+    (tmp_path / "store").rename(tmp_path / "elsewhere")
+    assert store_of(tmp_path / "run", record) is None
+    assert store_of(tmp_path / "run", trained.record) is not None

@@ -75,105 +75,71 @@ def test_estimates_are_those_from_the_logs(
     assert not any("from step" in text or "step 1:" in text for text in found.warnings)
 
 
-def test_what_was_not_scored_by_the_run_and_rule_is_refused(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    parts = scored_parts(folder, trained, tmp_path, 0)
-
-    def estimated(path: Path, rule: DecisionRule = RULE, **options: Any) -> None:
-        chosen = EstimateOptions(**options)
-        evaluate_scored(trained, [path], rule=rule, seed=0, options=chosen)
-
-    with pytest.raises(InputError, match=r"part-0\.parquet was scored with rule '.*', not '"):
-        estimated(parts, DecisionRule(7.5))
-    with pytest.raises(InputError, match="has no column session, probability"):
-        estimated(tmp_path / "log.parquet")
-    with pytest.raises(InputError, match="need the logs"):
-        estimated(parts, pages=True)
-    with pytest.raises(InputError, match="reward range is of single steps"):
-        estimated(parts, reward_range=(0.0, 1.0))
-    (tmp_path / "broken.parquet").write_bytes(b"no Parquet")
-    with pytest.raises(InputError, match="cannot be read"):
-        estimated(tmp_path / "broken.parquet")
-    shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
-    with pytest.raises(InputError, match="not numbered in order"):
-        estimated(parts)
+def rewrite(file: Path, column: str, values: Any) -> None:
+    """Replace the values of a column in some rows of a file, or cast them."""
+    table = pq.read_table(file)
+    changed = table[column].to_numpy().astype(values if isinstance(values, type) else np.float64)
+    if not isinstance(values, type):
+        changed[9:11] = values
+    table = table.set_column(table.schema.get_field_index(column), column, pa.array(changed))
+    pq.write_table(table, file)
 
 
 @pytest.mark.parametrize(
     ("column", "values", "says"),
     [
-        ("session", pa.string(), "column session has type string, not whole numbers"),
-        ("timestamp", pa.string(), "column timestamp has type string, not whole numbers"),
-        ("reward", pa.string(), "column reward has type string, not floating point numbers"),
-        ("propensity", 0.0, r"rows 1 to 70: propensities must be above 0 .*; 70 of 70 are outside"),
-        ("probability", 1e300, "lie between 0 and 1; 70 of 70 are outside, the first is 1e\\+300"),
-        ("probability", math.nan, "target probability is not finite at 70 of 70 steps"),
+        ("session", float, None),
+        ("session", -1, "part-2.* not numbered in order"),
+        ("reward", math.inf, r"part-2\.parquet: reward is not finite at 2 of "),
+        ("propensity", 0.0, r"part-2\.parquet: propensities must be above 0 .*; 2 of "),
+        ("probability", 1e300, "lie between 0 and 1; 2 of .*, the first is 1e\\+300"),
+        ("probability", math.nan, "2 of .* are outside, the first is nan"),
+        ("probability", 1.0000000002, None),
+        ("session", None, "part-2.* has no column session"),
+        ("bytes", None, "part-2.* cannot be read"),
+        ("content", None, "part-2.* is damaged"),
+        ("twice", None, "not numbered in order"),
+        ("log", None, "has no column session, probability"),
+        ("rule", None, r"part-0\.parquet was scored with rule '.*', not '"),
+        ("pages", True, "need the logs"),
+        ("reward_range", (0.0, 1.0), "need the logs"),
     ],
 )
-def test_scored_rows_with_other_values_are_refused(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path, column: str, values: object, says: str
-) -> None:
-    parts = scored_parts(folder, trained, tmp_path, 0)
-    file = next(iter(sorted(parts.iterdir())))
-    rewrite(file, column, values)
-    with pytest.raises(InputError, match=f"part-0.parquet.*{says}"):
-        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
-
-
-def rewrite(file: Path, column: str, values: object, rows: slice = slice(None)) -> None:
-    """Cast a column of a file, or replace its values in some rows."""
-    table = pq.read_table(file)
-    changed = table[column]
-    if isinstance(values, pa.DataType):
-        changed = changed.cast(values)
-    else:
-        given = changed.to_numpy().astype(np.float64)
-        given[rows] = values
-        changed = pa.array(given)
-    table = table.set_column(table.schema.get_field_index(column), column, changed)
-    pq.write_table(table, file)
-
-
-@pytest.mark.parametrize(
-    ("column", "value"), [("reward", math.inf), ("propensity", 2), ("probability", -1)]
-)
-def test_the_file_and_rows_of_a_wrong_value_are_named(
+def test_scored_rows_that_cannot_be_used_are_refused(
     folder: Path,
     trained: TrainedPolicy,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     column: str,
-    value: float,
+    values: Any,
+    says: str | None,
 ) -> None:
-    parts = scored_parts(folder, trained, tmp_path, 0)
-    rewrite(parts / "part-2.parquet", column, value, slice(9, 11))
     monkeypatch.setattr(scored, "_BATCH_ROWS", 7)
-    with pytest.raises(InputError, match=r"part-2\.parquet, rows 8 to 14: .* 2 of 7 "):
-        evaluate_scored(trained, [parts], rule=RULE, seed=0, options=EstimateOptions())
-
-
-def test_rounding_errors_above_one_count_as_one(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
     parts = scored_parts(folder, trained, tmp_path, 0)
-    values = []
-    for certain in (1.0, 1.0000000002):
-        rewrite(parts / "part-0.parquet", "probability", certain, slice(0, 5))
-        found = evaluate_scored(trained, [parts], rule=RULE, seed=0, options=EstimateOptions())
-        values.append([row.value for row in found.rows])
-    assert values[0] == values[1]
-
-
-def test_damaged_scored_rows_are_named(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    file = next(iter(sorted(scored_parts(folder, trained, tmp_path, 0).iterdir())))
-    content = bytearray(file.read_bytes())
-    content[100:400] = bytes(300)
-    file.write_bytes(content)
-    with pytest.raises(InputError, match=rf"{file.name} is damaged"):
-        evaluate_scored(trained, [file], rule=RULE, seed=0, options=EstimateOptions())
+    file, rule, options = parts / "part-2.parquet", RULE, EstimateOptions()
+    if column in ("pages", "reward_range"):
+        options = EstimateOptions(**{column: values})
+    elif column == "rule":
+        rule = DecisionRule(7.5)
+    elif column == "log":
+        parts = tmp_path / "log.parquet"
+    elif column == "twice":
+        shutil.copy(parts / "part-0.parquet", parts / "part-7.parquet")
+    elif column == "bytes":
+        file.write_bytes(b"no Parquet")
+    elif column == "content":
+        content = bytearray(file.read_bytes())
+        content[100:400] = bytes(300)
+        file.write_bytes(content)
+    elif values is None:
+        pq.write_table(pq.read_table(file).drop_columns([column]), file)
+    else:
+        rewrite(file, column, values)
+    if says is None:
+        evaluate_scored(trained, [parts], rule=rule, seed=0, options=options)
+        return
+    with pytest.raises(InputError, match=says):
+        evaluate_scored(trained, [parts], rule=rule, seed=0, options=options)
 
 
 def test_the_command_reads_what_score_writes(

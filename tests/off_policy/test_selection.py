@@ -15,7 +15,6 @@ from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.off_policy.fqe import ModelReport
 from ucfrec.off_policy.selection import Selection, choose, names_of, select
-from ucfrec.off_policy.verdict import influences
 
 ITEMS = 8
 PAYS = np.linspace(0.1, 0.5, ITEMS)
@@ -38,7 +37,7 @@ def evaluated(seed: int, sessions: int = 3000) -> Selection:
         steps = LoggedSteps(
             np.arange(sessions), reward, np.full(sessions, 1 / ITEMS), policy(liking)[items]
         )
-        columns.append(influences(session_terms(steps)["SNPDIS"]))
+        columns.append(session_terms(steps)["SNPDIS"].influences)
     return select(list(LIKING), np.stack(columns, axis=1), seed, np.arange(sessions) // 2)
 
 
@@ -138,7 +137,7 @@ def test_wrong_arrays_are_input_errors(names: list[str], terms: Float64Array, sa
 
 def report(steps: LoggedSteps) -> OffPolicyReport:
     verdict = conclude(steps, seed=0)
-    terms = influences(session_terms(steps)["SNPDIS"])
+    terms = session_terms(steps)["SNPDIS"].influences
     models = ModelReport(reward_r2=0, td_loss=0, td_bias=0, iterations=1, converged=True)
     return OffPolicyReport([], [], verdict, models, steps.returns, None, terms)
 

@@ -9,7 +9,7 @@ import pytest
 from tests.support.logged_steps import fitted
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy import LoggedSteps, conclude, diagnose, estimate
-from ucfrec.off_policy.verdict import cautions
+from ucfrec.off_policy.verdict import list_cautions
 
 ITEMS = 10
 PAYS = np.linspace(0.1, 0.5, ITEMS)
@@ -80,7 +80,7 @@ def test_unknown_items_weigh_nothing() -> None:
     assert one.low is not None
     assert one.high is not None
     assert one.low < truth < one.high
-    dropped = estimate(evaluated.only(known[items]), seed=0)["IPS"]
+    dropped = estimate(evaluated.select(known[items]), seed=0)["IPS"]
     assert dropped.low is not None
     assert dropped.low > 1.5 * truth
     assert conclude(evaluated, seed=0).reliable
@@ -173,7 +173,7 @@ def test_one_missing_propensity_leaves_the_verdict_standing_and_many_do_not() ->
     few = replace(steps, propensity=one)
     verdict, diagnosis = conclude(few, seed=0), diagnose(few)
     assert verdict.reliable
-    assert "1 of 20,000 sessions have a step without propensity" in cautions(diagnosis, {})[0]
+    assert "1 of 20,000 sessions have a step without propensity" in list_cautions(diagnosis, {})[0]
     assert "10% of the sessions" in conclude(replace(steps, propensity=many), seed=0).reasons[0]
     nothing = conclude(replace(steps, propensity=np.full(20_000, np.nan)), seed=0)
     assert nothing.reasons == ("no session has all its propensities, so nothing can be weighed",)
@@ -222,7 +222,7 @@ def test_the_step_at_which_the_logs_stop_telling() -> None:
         weights = steps.weights[steps.step == place]
         expected = weights.sum() ** 2 / (weights**2).sum()
         assert diagnosis.effective_by_step[place] == pytest.approx(expected)
-    assert any("from step" in line for line in cautions(diagnosis, {}))
+    assert any("from step" in line for line in list_cautions(diagnosis, {}))
 
 
 @pytest.mark.parametrize(("sigma", "heavy"), [(0.5, False), (3.0, True)])

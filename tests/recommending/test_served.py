@@ -163,8 +163,8 @@ def test_a_run_that_is_made_again_under_its_name_replaces_the_one_that_answers(
         before = served.trained.fingerprint
         (folder / "run").rename(folder / "kept")
         shutil.copytree(folder / "other", folder / "run")
-        record = RunRecord.read(folder / "run").with_entries(fingerprint="another store")
-        record.written(folder / "run")
+        record = RunRecord.read(folder / "run").copy_with(fingerprint="another store")
+        record.write(folder / "run")
         try:
             served.check()
             assert served.trained.fingerprint == before

@@ -40,7 +40,7 @@ def updated(run: Path, of: TrainedPolicy, result: str) -> Path:
         appended={},
         verdict=verdict,
     )
-    RunRecord.read(run).with_entries(update=update).written(run)
+    RunRecord.read(run).copy_with(update=update).write(run)
     return run
 
 
@@ -73,7 +73,7 @@ def test_another_run_under_the_name_of_the_current_one_needs_a_verdict(
 ) -> None:
     folder = runs(trained, tmp_path, "a")
     promote(folder / "a")
-    RunRecord.read(folder / "a").with_entries(fingerprint="another store").written(folder / "a")
+    RunRecord.read(folder / "a").copy_with(fingerprint="another store").write(folder / "a")
     with pytest.raises(InputError, match="no verdict"):
         promote(folder / "a")
     with pytest.raises(InputError, match="was compared with a, not with the current run a"):
@@ -87,8 +87,8 @@ def test_a_verdict_against_another_run_does_not_count(
     trained: TrainedPolicy, tmp_path: Path
 ) -> None:
     folder = runs(trained, tmp_path, "a", "b")
-    record = RunRecord.read(folder / "a").with_entries(seed=5)
-    record.with_entries(fingerprint="another store").written(folder / "a")
+    record = RunRecord.read(folder / "a").copy_with(seed=5)
+    record.copy_with(fingerprint="another store").write(folder / "a")
     promote(folder / "a")
     with pytest.raises(InputError, match="was compared with a, not with the current run a"):
         promote(updated(folder / "b", trained, "better"))

@@ -44,7 +44,7 @@ def record_of(folder: Path) -> dict[str, Any]:
 
 def test_what_is_written_comes_back(folder: Path, tmp_path: Path) -> None:
     record = read_record(folder / "run")
-    record.written(tmp_path)
+    record.write(tmp_path)
     assert read_json(tmp_path / "run.json") == record_of(folder)
     assert record.data == EpisodeStore.open(folder / "store").record.source
     assert record.session_gap_ms == 20 * 60_000

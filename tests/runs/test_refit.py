@@ -83,7 +83,7 @@ def test_an_interrupted_refit_is_not_used_and_goes_on(folder: Path, tmp_path: Pa
     store, whole = EpisodeStore.open(folder / "store"), TrainedPolicy.load(run)
     file = run / REFIT / "run.json"
     record = RunRecord.read(run / REFIT)
-    record.with_entries(rule=None).written(run / REFIT)  # killed before the rule is copied
+    record.copy_with(rule=None).write(run / REFIT)  # killed before the rule is copied
     assert TrainedPolicy.load(run).record.refit_of is None
     refit_within(store, run)
     assert TrainedPolicy.load(run).fingerprint == whole.fingerprint

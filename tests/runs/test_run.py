@@ -240,7 +240,7 @@ def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_pa
 
     def sealed_store(seed: int) -> EpisodeStore:
         store = write_store(tmp_path / f"store-{seed}", episodes, some_states(seed=seed))
-        store.record.sealed(store.path)
+        store.record.seal(store.path)
         return EpisodeStore.open(store.path)
 
     first, other = sealed_store(0), sealed_store(1)
@@ -258,6 +258,6 @@ def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_pa
         train(first, 2)
     record = train(first, 8)
     assert record.finished.steps == 8
-    record.with_entries(policy=None).sealed(tmp_path / "run")
+    record.copy_with(policy=None).seal(tmp_path / "run")
     with pytest.warns(InputNote, match="has not ended"):
         TrainedPolicy.load(tmp_path / "run")

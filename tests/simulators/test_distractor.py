@@ -79,7 +79,7 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
             assert file.read_bytes() == (planted.path / file.relative_to(store.path)).read_bytes()
     assert planted.record.fingerprint != store.record.fingerprint
     own_entries = {"columns": {}, "fingerprint": "", "source": None, "files": {}}
-    assert planted.record.with_entries(**own_entries) == store.record.with_entries(**own_entries)
+    assert planted.record.copy_with(**own_entries) == store.record.copy_with(**own_entries)
 
 
 def test_clicks_that_are_the_rule_are_high_and_equal_rewards_are_refused(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from tests.support.result_rows import result_row
 from ucfrec.files.atomic import read_json
-from ucfrec.off_policy.columns import SUITE
+from ucfrec.off_policy.estimators import SUITE
 from ucfrec.reporting.page import write_report
 from ucfrec.results.row import ResultRow
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ucfrec.errors import InputError
-from ucfrec.processes import interruptions_raised, pool_of_processes, without_ctrl_c
+from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.results.row import ResultRow, RowKey
@@ -132,7 +132,7 @@ resume from their checkpoints."""
 
 def _measure_in_processes(tasks: Mapping[str, _Task[Cell]], workers: int) -> _Outcomes:
     with pool_of_processes(workers, _use_one_thread) as pool:
-        with without_ctrl_c():
+        with block_ctrl_c():
             names = {pool.submit(_measure, task): name for name, task in tasks.items()}
         for done in as_completed(names):
             yield names[done], done.exception() or done.result()

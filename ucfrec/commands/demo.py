@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.processes import pool_of_processes, without_ctrl_c
-from ucfrec.progress import labelled, progress
+from ucfrec.processes import block_ctrl_c, pool_of_processes
+from ucfrec.progress import label_progress, progress
 
 if TYPE_CHECKING:
     from ucfrec.results.row import ResultRow
@@ -97,10 +97,10 @@ def run(options: argparse.Namespace) -> None:
         f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
         f"simulators. Everything goes to {out}."
     )
-    from ucfrec.files.locks import claimed, remove_leftovers
+    from ucfrec.files.locks import lock_path, remove_leftovers
     from ucfrec.reporting.tables import evaluation_table
 
-    with claimed(out, "filled"):
+    with lock_path(out, "filled"):
         remove_leftovers(out.parent)
         rows = demo(out, options.seed, config)
     _say(f"\n{evaluation_table(rows)}\n")
@@ -184,7 +184,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     # One thread each: at this size two trainings side by side beat one on two threads.
     workers = min(len(jobs), os.cpu_count() or 1)
     with pool_of_processes(workers) as pool:
-        with without_ctrl_c():
+        with block_ctrl_c():
             started = [
                 pool.submit(_learn, out / environment, name, seed, config)
                 for environment, name in jobs
@@ -235,7 +235,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     size += [] if policy == "bc" else [f"policy.context={config.context}"]
     resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
     shared = SharedStages(folder / "stages")
-    with labelled(f"{folder.name}, {name}"):
+    with label_progress(f"{folder.name}, {name}"):
         train_run(EpisodeStore.open(folder / "store"), folder / name, resolved, shared=shared)
         trained = TrainedPolicy.load(folder / name)
         return evaluate_policy(

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-    from ucfrec.provenance import without_folders
+    from ucfrec.provenance import shorten_paths
     from ucfrec.reporting.model_card import add_evaluation
     from ucfrec.reporting.tables import evaluation_table
     from ucfrec.results.rows_file import write_results
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
         row = evaluate_policy(
             environment, trained, trained.name, options.episodes, options.seed, rule
         )
-        conditions = {**row.conditions, "run": without_folders(str(run))}
+        conditions = {**row.conditions, "run": shorten_paths(str(run))}
         rows.append(replace(row, conditions=conditions, checkpoint=options.checkpoint))
         add_evaluation(run, rows[-1])
     rows += [

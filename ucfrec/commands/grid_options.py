@@ -14,7 +14,6 @@ from ucfrec.results.rows_file import benchmarking, latest, read_rows
 if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell
     from ucfrec.benchmark.grid import Measurement
-    from ucfrec.benchmark.suite import Costs
 
 
 BUDGETS: Final = {
@@ -154,7 +153,6 @@ def rows_of(
     tables: Sequence[str],
     cells: "Callable[[], Iterable[Cell]]",
     how: "Measurement[Cell]",
-    costs: "Callable[[], Costs] | None" = None,
     describe: str = "",
 ) -> list[ResultRow]:
     """The rows that a command shows: with --show-only those of --results, else those of `cells`,
@@ -164,19 +162,15 @@ def rows_of(
         options: of `grid_options`.
         tables: tables of the suite; empty for all.
         cells: lists what to measure; writes the stores that it needs.
-        costs: for the announcement of how long it takes; None for none.
         describe: name of the benchmark in progress output; "" for `suite`.
 
     Raises:
         InputError: as `rows_given`, as `cells`, or as `run_grid`.
     """
-    from ucfrec.benchmark.suite import announcement
-
     if options.show_only:
         return rows_given(options, suite, tables)
     results = results_given(options)
     with benchmarking(results):
-        announce = None if costs is None else announcement(costs(), options.workers)
         return run_grid(
-            list(cells()), how, results, options.workers, describe or suite, announce, options.again
+            list(cells()), how, results, options.workers, describe or suite, again=options.again
         )

@@ -64,9 +64,13 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.evaluation.ranking import MEASURES
     from ucfrec.evaluation.ranking_table import require_one_catalogue
     from ucfrec.logs.summary import format_summary
-    from ucfrec.off_policy.score import held_out_sessions, logged_sessions
-    from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-    from ucfrec.provenance import without_folders
+    from ucfrec.off_policy.score import (
+        held_out_sessions,
+        logged_sessions,
+        seen_too_often,
+        share_seen,
+    )
+    from ucfrec.provenance import shorten_paths
     from ucfrec.reporting.model_card import add_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
@@ -101,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
             f"{lost:.1%} of the steps show an item that the user has seen, which is excluded: "
             f"hit_rate_shown is at most {1 - lost:.3g}; --keep-seen ranks these items too"
         )
-    on = ", ".join(map(without_folders, options.logs)) or "the test split"
+    on = ", ".join(map(shorten_paths, options.logs)) or "the test split"
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")

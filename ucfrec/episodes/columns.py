@@ -216,7 +216,7 @@ class Columns:
             sizes[name] = list(size)
         copy = Columns(
             self.path,
-            self.record.with_entries(columns=sizes),
+            self.record.copy_with(columns=sizes),
             self._arrays,
             self._item_states_in_memory,
             return_to_go or self.return_to_go,

@@ -82,12 +82,12 @@ def with_observations(
             begin = end
         changed = f"{schema.OBSERVATION}.npy"
         kept = store.record.files.items()
-        store.record.with_entries(
+        store.record.copy_with(
             files={name: each for name, each in kept if not name.endswith(f"/{changed}")},
             columns={**store.record.columns, schema.OBSERVATION: [values.shape[1]]},
             fingerprint=digest,
             source=Source.model_validate({**store.record.source.model_dump(), **source}),
-        ).sealed(scratch)
+        ).seal(scratch)
     return EpisodeStore.open(out)
 
 

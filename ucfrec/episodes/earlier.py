@@ -199,7 +199,7 @@ class _ContinuedColumns(Columns):
         }
         arrays |= {schema.OFFSETS: offsets, schema.RETURN_TO_GO: returns_to_go(rewards, offsets)}
         sizes = {"n_steps": len(source), "n_episodes": len(lengths), "n_shards": 0}
-        record = later.record.with_entries(**sizes)
+        record = later.record.copy_with(**sizes)
         super().__init__(later.path, record, arrays, later.item_states)
         self._rows, self._source, self.skipped = rows, source, counts
 

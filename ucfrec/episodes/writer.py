@@ -180,7 +180,7 @@ class StoreWriter:
             },
             source=Source.model_validate(dict(source)),
         )
-        return record.sealed(self._folder)
+        return record.seal(self._folder)
 
 
 def write_arrays(

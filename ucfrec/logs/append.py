@@ -272,7 +272,7 @@ class _Grown:
             files |= self._copy(shard, folder / f"shard-{number:05d}")
         write_grown_states(self._store, folder, found, range(len(self._kept), new.n_shards))
         made = {"made_of": dict(made_of), "appended": report}
-        self._record(new, report, made).with_entries(files=files).sealed(folder)
+        self._record(new, report, made).copy_with(files=files).seal(folder)
         return report
 
     def _copy(self, shard: _Shard, target: Path) -> dict[str, tuple[int, str]]:
@@ -365,7 +365,7 @@ class _Grown:
         splits["train"]["episodes"] += episodes
         splits["train"]["steps"] += steps
         chain = f"{old.fingerprint};{report['expired_steps']};{new.fingerprint}"
-        return new.with_entries(
+        return new.copy_with(
             n_steps=steps + new.n_steps,
             n_episodes=episodes + new.n_episodes,
             fingerprint=hashlib.sha256(chain.encode()).hexdigest(),

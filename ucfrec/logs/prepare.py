@@ -217,7 +217,7 @@ def prepare(
             if like is not None:
                 users = (each.users for each in found.episodes())
                 write_episode_users(log, folder / EPISODE_USERS, users)
-            record.sealed(folder)
+            record.seal(folder)
     return report
 
 

@@ -29,16 +29,17 @@ _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
 _MOST_ITEM_GROUPS = 32
 
 
-def default_groups(items: int) -> int:
-    """How many groups a catalogue has: the root of its items, from 2 to 32."""
-    return int(np.clip(round(items**0.5), 2, _MOST_ITEM_GROUPS))
-
-
 def group_items(embeddings: Float32Array, groups: int, seed: int) -> IntArray:
     """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D).
 
     Items of equal embeddings are in one group, so there may be fewer than `groups`.
+
+    Args:
+        groups: how many; 0 for the root of the number of items, from 2 to 32.
     """
+    groups = groups or int(np.clip(round(len(embeddings) ** 0.5), 2, _MOST_ITEM_GROUPS))
+    if groups == 1:
+        return np.zeros(len(embeddings), dtype=np.int64)
     # Importing scikit-learn takes a second, which no other estimate must cost.
     from sklearn.cluster import KMeans
 
@@ -94,97 +95,99 @@ def fit_behavior(
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
     folds = rng.permutation(int(owner.max()) + 1)[owner] % FOLDS
-    known, count = item >= 0, int(group.max()) + 1
-    samples = [_drawn(np.flatnonzero(known & (folds != fold)), rng) for fold in range(FOLDS)]
-    tables = _rows_of(states, np.unique(np.concatenate(samples)))
+    listed, count = item >= 0, int(group.max()) + 1
+    samples = []
+    for fold in range(FOLDS):
+        rows = np.flatnonzero(listed & (folds != fold))
+        if len(rows) > _MOST_ROWS:
+            rows = np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
+        samples.append(rows)
+    sample = np.unique(np.concatenate(samples))
+    look_up = _look_up_states(states, sample)
     models = []
     with progress(FOLDS, "propensities", "folds") as bar:
-        for fold, sample in enumerate(samples):
-            others = known & (folds != fold)
-            shares = np.bincount(group[others], minlength=count) + 1.0
-            models.append(_Groups(tables(sample), group[sample], shares / shares.sum()))
+        for fold, rows in enumerate(samples):
+            shares = np.bincount(group[listed & (folds != fold)], minlength=count) + 1.0
+            models.append(_GroupModel(look_up(rows), group[rows], shares / shares.sum()))
             bar.update()
-    calibrated = _calibrated(models, tables, group, folds, np.unique(np.concatenate(samples)))
-    of_group, begin, table = np.ones(len(item)), 0, np.zeros((2, count, 10))
-    for rows in states():
-        part = slice(begin, begin + len(rows))
-        probabilities = np.empty((len(rows), count))
+    calibration = _calibrate(models, look_up, group, folds, sample)
+    of_group, begin = np.ones(len(item)), 0
+    # By group and tenth of the probability: what is expected, and what occurs.
+    table = np.zeros((2, count, 10))
+    for batch in states():
+        part = slice(begin, begin + len(batch))
+        probabilities = np.empty((len(batch), count))
         for fold, model in enumerate(models):
-            here = folds[part] == fold
-            probabilities[here] = model(rows[here], *calibrated)
-        mine = group[part][:, None]
-        of_group[part] = np.take_along_axis(probabilities, mine, axis=1)[:, 0]
-        _count_calibration(table, probabilities[known[part]], group[part][known[part]])
+            rows = folds[part] == fold
+            probabilities[rows] = model.predict(batch[rows], *calibration)
+        of_group[part] = np.take_along_axis(probabilities, group[part][:, None], axis=1)[:, 0]
+        rows = np.flatnonzero(listed[part])
+        tenth = np.minimum((probabilities[rows] * 10).astype(np.int64), 9)
+        logged = group[part][rows]
+        np.add.at(table[0], (np.arange(count)[None, :], tenth), probabilities[rows])
+        np.add.at(table[1], (logged, tenth[np.arange(len(rows)), logged]), 1.0)
         begin = part.stop
-    mean_shares = np.stack([model.shares for model in models])[folds[known], group[known]]
+    mean_shares = np.stack([model.shares for model in models])[folds[listed], group[listed]]
     return BehaviorModel(
-        group=np.where(known, of_group, 1.0),
-        item=np.where(known, of_group * _within(item, group, folds), 1.0),
-        log_loss=float(-np.log(of_group[known]).mean()),
+        group=np.where(listed, of_group, 1.0),
+        item=np.where(listed, of_group * _item_shares(item, group, folds), 1.0),
+        log_loss=float(-np.log(of_group[listed]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
-        calibration_error=_calibration_error(table),
-        temperature=calibrated[0],
-        share=calibrated[1],
+        calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
+        temperature=calibration[0],
+        share=calibration[1],
     )
 
 
-class _Groups:
+class _GroupModel:
     """Probabilities of groups given a state."""
 
     def __init__(self, states: Float32Array, group: IntArray, shares: Float64Array) -> None:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
 
-        self.shares = shares
-        self._present = np.unique(group)
-        self._model = None
+        self.shares, self._present, self._model = shares, np.unique(group), None
         # There may be no row at all, where all other users were shown unknown items.
         if len(self._present) > 1:
             self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
             self._spread[self._spread == 0] = 1.0
             require_blas_memory()
-            self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
-            self._model.fit(self._scaled(states), group)
+            model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
+            self._model = model.fit(self._scale(states), group)
 
-    def __call__(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
+    def predict(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
         if self._model is None or not len(states):
             return np.tile(self.shares, (len(states), 1))
-        scores = self._model.decision_function(self._scaled(states)) / temperature
+        scores = self._model.decision_function(self._scale(states)) / temperature
         if scores.ndim == 1:
             scores = np.stack([-scores / 2, scores / 2], axis=1)
         exponents = np.exp(scores - scores.max(axis=1, keepdims=True))
-        found = np.zeros((len(states), len(self.shares)))
-        found[:, self._present] = exponents / exponents.sum(axis=1, keepdims=True)
-        return np.asarray((1 - share) * found + share * self.shares)
+        probabilities = np.zeros((len(states), len(self.shares)))
+        probabilities[:, self._present] = exponents / exponents.sum(axis=1, keepdims=True)
+        return np.asarray((1 - share) * probabilities + share * self.shares)
 
-    def _scaled(self, states: Float32Array) -> Float32Array:
+    def _scale(self, states: Float32Array) -> Float32Array:
         scaled = np.asarray(states - self._mean, dtype=np.float32)
         scaled /= self._spread
         return scaled
 
 
-def _drawn(rows: IntArray, rng: np.random.Generator) -> IntArray:
-    if len(rows) <= _MOST_ROWS:
-        return rows
-    return np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
-
-
-def _rows_of(states: States, wanted: IntArray) -> Callable[[IntArray], Float32Array]:
-    """Looks up the states of some rows, all among `wanted` (sorted)."""
+def _look_up_states(states: States, rows: IntArray) -> Callable[[IntArray], Float32Array]:
+    """Looks up the states of numbered steps, all among `rows` (sorted)."""
     table, begin = array_on_disk((0, 0)), 0
-    for rows in states():
+    for batch in states():
         if not begin:
-            table = array_on_disk((len(wanted), rows.shape[1]))
-        low, high = np.searchsorted(wanted, [begin, begin + len(rows)])
-        table[low:high] = rows[wanted[low:high] - begin]
-        begin += len(rows)
-    return lambda rows: np.asarray(table[np.searchsorted(wanted, rows)])
+            table = array_on_disk((len(rows), batch.shape[1]))
+        low, high = np.searchsorted(rows, [begin, begin + len(batch)])
+        table[low:high] = batch[rows[low:high] - begin]
+        begin += len(batch)
+    return lambda some: np.asarray(table[np.searchsorted(rows, some)])
 
 
-def _calibrated(
-    models: list[_Groups],
-    tables: Callable[[IntArray], Float32Array],
+def _calibrate(
+    models: list[_GroupModel],
+    look_up: Callable[[IntArray], Float32Array],
     group: IntArray,
     folds: IntArray,
     sample: IntArray,
@@ -194,38 +197,24 @@ def _calibrated(
     losses = np.zeros((len(_TEMPERATURES), len(_SHARES)))
     for fold, model in enumerate(models):
         mine = sample[folds[sample] == fold][:_MOST_ROWS]
-        states, rows = tables(mine), np.arange(len(mine))
+        states, rows = look_up(mine), np.arange(len(mine))
         shares = model.shares[group[mine]]
         for loss, temperature in zip(losses, _TEMPERATURES, strict=True):
-            likely = model(states, temperature, 0.0)[rows, group[mine]]
+            likely = model.predict(states, temperature, 0.0)[rows, group[mine]]
             loss -= np.log((1 - mixed_in) * likely + mixed_in * shares).sum(axis=1)
     best, share = np.unravel_index(losses.argmin(), losses.shape)
     return _TEMPERATURES[best], _SHARES[share]
 
 
-def _within(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
+def _item_shares(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
     """(N,) share of the item among its group's steps in the other folds, one step added to each
     item."""
-    items, found = int(item.max()) + 1, np.ones(len(item))
-    known = item >= 0
+    listed, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
     group_of = np.zeros(items, dtype=np.int64)
-    group_of[item[known]] = group[known]
+    group_of[item[listed]] = group[listed]
     for fold in range(FOLDS):
-        others, here = known & (folds != fold), known & (folds == fold)
-        counts = np.bincount(item[others], minlength=items) + 1.0
+        rows = listed & (folds == fold)
+        counts = np.bincount(item[listed & (folds != fold)], minlength=items) + 1.0
         totals = np.bincount(group_of, counts, int(group.max()) + 1)
-        found[here] = counts[item[here]] / totals[group[here]]
-    return found
-
-
-def _count_calibration(table: Float64Array, probabilities: Float64Array, group: IntArray) -> None:
-    """Add to table (2, K, 10), by group and tenth of the probability: what is expected, and what
-    occurs."""
-    tenth = np.minimum((probabilities * 10).astype(np.int64), 9)
-    groups, rows = np.arange(probabilities.shape[1]), np.arange(len(group))
-    np.add.at(table[0], (groups[None, :], tenth), probabilities)
-    np.add.at(table[1], (group, tenth[rows, group]), 1.0)
-
-
-def _calibration_error(table: Float64Array) -> float:
-    return float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0))
+        shares[rows] = counts[item[rows]] / totals[group[rows]]
+    return shares

@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.estimators import step_totals
 from ucfrec.off_policy.intervals import cluster_mean
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
@@ -23,11 +22,21 @@ ENOUGH_TO_TEST: Final = 30
 ENOUGH_USERS: Final = 200
 """Effective users below which no estimate stands: in `benchmarks/off_policy_coverage.py` intervals
 of fewer hold the truth too seldom."""
+ENOUGH_REWARDED: Final = 30
+"""Users with weight and reward."""
 LEAST_SHOWN: Final = 0.01
 """Share of the evaluated policy's choices below which an item group is not tested."""
-_SIGNIFICANCE, _TOLERANCE = 0.01, 0.02
+DOMINANT: Final = 0.1
+"""Largest share of one user in all weight."""
+HEAVY_TAIL: Final = 0.5
+"""Pareto shape from which on the variance is infinite, and no interval means anything."""
+FAR_OFF: Final = 0.1
+"""A mean session weight further from 1 shows that the heaviest sessions are missing, or too many,
+though their number may be too small for a test to show it."""
+MOST_LEFT_OUT: Final = 0.05
+"""Largest share of sessions, or rows, without which an estimate stands."""
+_SIGNIFICANCE, _TOLERANCE, _ERRORS = 0.01, 0.02, 3.0
 SESSION_PRODUCTS: Final = "session products"
-ITEMS_TO_CHOOSE_FROM: Final = "items to choose from"
 
 
 @dataclass(frozen=True)
@@ -39,8 +48,6 @@ class WeightTest:
     error: float
     """Standard error over users."""
     passed: bool
-    """Within 2% of 1, or not significantly away from it: two-sided, 1% for all tests together
-    (Bonferroni)."""
 
     def __str__(self) -> str:
         return f"{self.name}: mean weight {self.mean:.3g} ± {self.error:.2g}"
@@ -48,7 +55,7 @@ class WeightTest:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What `diagnose` finds."""
+    """What `diagnose` finds in logs."""
 
     sessions: int
     users: int
@@ -75,6 +82,12 @@ class Diagnosis:
     lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
     @property
+    def few_weigh(self) -> bool:
+        """Whether few users have most of the weight: then tests of weights, which take means for
+        normal, reject too often."""
+        return (self.tail or 0.0) > HEAVY_TAIL or self.effective_users < ENOUGH_USERS
+
+    @property
     def unsupported_from_step(self) -> int | None:
         """First step (from 1) with fewer effective users than an estimate needs; None if the logs
         suffice to the end."""
@@ -94,26 +107,26 @@ def diagnose(
         segment: (S,) number of each session's segment (of users, of weeks, of contexts known before
             the first choice), each of which is tested alone.
     """
-    lacking, users = steps.lacking, int(steps.users.max()) + 1
-    if lacking.all():
-        return Diagnosis(len(lacking), users, left_out=len(lacking))
-    known = steps.known()
-    by_user = np.bincount(known.users, known.session_weights).astype(np.float64)
-    rewarded = np.bincount(known.users, np.abs(known.session_weights * known.returns))
-    if reward_range is None:
-        reward_range = (float(steps.reward.min()), float(steps.reward.max()))
+    incomplete, users = steps.lacking, int(steps.users.max()) + 1
+    if incomplete.all():
+        return Diagnosis(len(incomplete), users, left_out=len(incomplete))
+    known = steps.weighable
+    weights = known.session_weights
+    by_user = np.bincount(known.users, weights).astype(np.float64)
+    rewarded = np.bincount(known.users, np.abs(weights * known.returns))
     summed = known.per_decision is not None
+    reward_range = reward_range or (float(steps.reward.min()), float(steps.reward.max()))
     return Diagnosis(
-        sessions=len(lacking),
+        sessions=len(incomplete),
         users=users,
-        left_out=int(lacking.sum()),
+        left_out=int(incomplete.sum()),
         overlap=float((known.target / known.propensity).mean()),
-        tests=weight_tests(known, None if segment is None else segment[~lacking]),
+        tests=weight_tests(known, None if segment is None else segment[~incomplete]),
         effective_by_step=() if summed else _effective_by_step(known),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
-        mean_weight=float(known.session_weights.mean()),
+        mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
         bounds=None if summed else identification_bounds(known, reward_range),
     )
@@ -122,7 +135,8 @@ def diagnose(
 def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[WeightTest, ...]:
     """Two-sided tests that mean weights are 1: the ratios of each step, the session products, and
     those of each segment and item group. Errors are clustered by user; what fewer than 30 users
-    have is excluded.
+    have is excluded. A mean passes within 2% of 1, or if it is not significantly away from it: 1%
+    for all tests together (Bonferroni).
 
     Over all steps, the ratios of an item group's own have the mean of the evaluated policy's
     probability of the group; their quotient is tested.
@@ -130,47 +144,41 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     Args:
         segment: (S,) as `diagnose` takes it.
     """
-    ratios = steps.target / steps.propensity
+    ratios, weights = steps.target / steps.propensity, steps.session_weights
+    step_user = steps.users[steps.session]
+    samples = []
     # Of sums of sessions the ratios are the session products.
-    places = _by_place(steps) if steps.per_decision is None else []
-    groups = [
-        (f"step {place + 1}", ratios[rows], steps.session[rows])
-        for place, rows in enumerate(places)
-    ]
-    everyone = np.arange(len(steps.first))
-    groups.append((SESSION_PRODUCTS, steps.session_weights, everyone))
+    for place, rows in enumerate(_rows_by_place(steps) if steps.per_decision is None else []):
+        samples.append((f"step {place + 1}", ratios[rows], step_user[rows]))
+    samples.append((SESSION_PRODUCTS, weights, steps.users))
     for number in [] if segment is None else np.unique(segment):
-        there = np.flatnonzero(segment == number)
-        groups.append((f"segment {number}", steps.session_weights[there], there))
-    found = []
-    for name, values, sessions in groups:
-        user = steps.users[sessions]
-        if len(np.unique(user)) >= ENOUGH_TO_TEST:
-            found.append((name, *cluster_mean(values, user)))
-    found += _group_weights(steps, ratios)
-    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(found), 1)))
+        inside = segment == number
+        samples.append((f"segment {number}", weights[inside], steps.users[inside]))
+    means = [
+        (name, *cluster_mean(values, user))
+        for name, values, user in samples
+        if len(np.unique(user)) >= ENOUGH_TO_TEST
+    ]
+    if steps.groups is not None:
+        for number, target in enumerate(steps.groups.target.T):
+            inside = steps.groups.number == number
+            expected = target.astype(np.float64)
+            share = float(expected.mean())
+            if len(np.unique(step_user[inside])) >= ENOUGH_TO_TEST and share >= LEAST_SHOWN:
+                beyond = (np.where(inside, ratios, 0.0) - expected) / share
+                mean, error = cluster_mean(beyond, step_user)
+                means.append((f"item group {number}", 1 + mean, error))
+    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE / (2 * max(len(means), 1)))
     return tuple(
         WeightTest(name, mean, error, abs(mean - 1) <= max(_TOLERANCE, limit * error))
-        for name, mean, error in found
+        for name, mean, error in means
     )
 
 
-def _group_weights(steps: LoggedSteps, ratios: Float64Array) -> list[tuple[str, float, float]]:
-    """Name, mean weight and its error of each item group that the evaluated policy shows."""
-    if steps.groups is None:
-        return []
-    user = steps.users[steps.session]
-    found = []
-    for number in range(steps.groups.target.shape[1]):
-        here = steps.groups.number == number
-        expected = steps.groups.target[:, number].astype(np.float64)
-        share = float(expected.mean())
-        if len(np.unique(user[here])) < ENOUGH_TO_TEST or share < LEAST_SHOWN:
-            continue
-        beyond = (np.where(here, ratios, 0.0) - expected) / share
-        mean, error = cluster_mean(beyond, user)
-        found.append((f"item group {number}", 1 + mean, error))
-    return found
+def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> WeightTest:
+    """One test that weights (N,) of users (N,) have mean 1: within three standard errors."""
+    mean, error = cluster_mean(weights, user)
+    return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 
 
 def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTest | None:
@@ -194,7 +202,7 @@ def implied_items(steps: LoggedSteps, listed: BoolArray, items: int) -> WeightTe
     mean, error = cluster_mean(shares, user[known])
     limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
     passed = mean - 1 <= max(_TOLERANCE, limit * error)
-    return WeightTest(ITEMS_TO_CHOOSE_FROM, mean, error, passed)
+    return WeightTest("items to choose from", mean, error, passed)
 
 
 def pareto_tail(weights: Float64Array) -> float | None:
@@ -237,9 +245,9 @@ def identification_bounds(
     `reward_range`, or nothing once the session has ended. No session is longer than the longest
     logged.
     """
-    totals = step_totals(steps, steps.weights) / len(steps.first)
-    lacking = np.maximum(1 - totals, 0)
-    worth = float((steps.discount ** np.arange(len(totals)) * lacking).sum())
+    totals = steps.step_totals() / len(steps.first)
+    unsupported = np.maximum(1 - totals, 0)
+    worth = float((steps.discount ** np.arange(len(totals)) * unsupported).sum())
     supported = steps.per_session(steps.discounts * steps.weights * steps.reward).mean()
     low, high = reward_range
     # A single step is always taken; a longer session may end.
@@ -248,7 +256,7 @@ def identification_bounds(
     return float(supported + worth * low), float(supported + worth * high)
 
 
-def _by_place(steps: LoggedSteps) -> list[IntArray]:
+def _rows_by_place(steps: LoggedSteps) -> list[IntArray]:
     """The rows of every place in a session, sessions in order."""
     order = np.argsort(steps.step, kind="stable")
     return np.split(order, np.cumsum(np.bincount(steps.step))[:-1])
@@ -256,11 +264,11 @@ def _by_place(steps: LoggedSteps) -> list[IntArray]:
 
 def _effective_by_step(steps: LoggedSteps) -> tuple[float, ...]:
     users, weights = steps.users, steps.weights
+    changes = weights - steps.shift(weights)
     # An ended session keeps the weight of its last step.
-    summed, found = np.bincount(users).astype(np.float64), []
-    for place, rows in enumerate(_by_place(steps)):
-        before = weights[rows - 1] if place else np.ones(len(rows))
-        change = np.bincount(users[steps.session[rows]], weights[rows] - before, len(summed))
-        summed = np.maximum(summed + change, 0)
-        found.append(effective_number(summed))
-    return tuple(found)
+    totals, effective = np.bincount(users).astype(np.float64), []
+    for rows in _rows_by_place(steps):
+        change = np.bincount(users[steps.session[rows]], changes[rows], len(totals))
+        totals = np.maximum(totals + change, 0)
+        effective.append(effective_number(totals))
+    return tuple(effective)

@@ -1,50 +1,35 @@
 """Estimates from logs the return of a trained policy, and reports how reliable that is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array, Float64Array, IntArray
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.behavior_model import (
-    BehaviorModel,
-    default_groups,
-    fit_behavior,
-    group_items,
+from ucfrec.off_policy.behavior_model import fit_behavior, group_items
+from ucfrec.off_policy.diagnostics import FAR_OFF, MOST_LEFT_OUT, Diagnosis, diagnose, implied_items
+from ucfrec.off_policy.estimators import (
+    LOGGED,
+    SUITE,
+    Estimate,
+    StepValue,
+    estimate,
+    session_terms,
+    step_value,
 )
-from ucfrec.off_policy.columns import Subject, diagnosis_columns, verdict_columns
-from ucfrec.off_policy.diagnostics import Diagnosis, diagnose, implied_items
-from ucfrec.off_policy.estimators import StepValue, estimate, session_terms, step_value
-from ucfrec.off_policy.features import (
-    InputsFile,
-    StepInputs,
-    array_on_disk,
-    context_of,
-    scores_of,
-)
+from ucfrec.off_policy.features import InputsFile, array_on_disk, make_inputs
 from ucfrec.off_policy.fqe import ModelReport, fit_models
 from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
-from ucfrec.off_policy.pages import as_pages, pages_of
-from ucfrec.off_policy.score import LoggedSessions, ScoredSteps, scored_steps
-from ucfrec.off_policy.training_rows import seen_too_often, share_seen
-from ucfrec.off_policy.verdict import (
-    FAR_OFF,
-    MOST_LEFT_OUT,
-    Verdict,
-    cautions,
-    conclude,
-    influences,
-)
-from ucfrec.provenance import without_folders
+from ucfrec.off_policy.pages import as_pages, number_pages
+from ucfrec.off_policy.score import LoggedSessions, scored_steps, seen_too_often, share_seen
+from ucfrec.off_policy.verdict import Verdict, conclude, list_cautions
+from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.row import ResultRow, Scalar
 from ucfrec.results.table import ResultTable
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -73,7 +58,6 @@ class EstimateOptions:
     """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
-
     filter_seen: bool = False
     """Exclude items that the user was shown before a step, in earlier rows too, as `recommend` and
     `serve` do by default; then their logs have to be evaluated so."""
@@ -112,20 +96,18 @@ class OffPolicyReport(ResultTable):
     """Its result rows, one for each estimator."""
 
     def _said(self) -> list[str]:
-        said = [f"warning: {text}" for text in self.warnings]
-        return [*said, f"verdict: {self.verdict.headline}"]
+        warnings = [f"warning: {text}" for text in self.warnings]
+        return [*warnings, f"verdict: {self.verdict.headline}"]
 
 
-@dataclass(frozen=True)
-class EvaluatedSteps:
-    """Logged steps with the evaluated policy's probabilities, and the models fitted on them."""
+@dataclass
+class Doubts:
+    """What the logs say against an estimate, beside their weights."""
 
-    steps: LoggedSteps
-    models: ModelReport
-    behavior: BehaviorModel | None
-    """None where neither MIPS nor a lacking propensity needs it."""
-    estimated: int
-    """Number of steps whose propensity is estimated."""
+    forbidden: list[str] = field(default_factory=list)
+    """What forbids a conclusion."""
+    remarks: list[str] = field(default_factory=list)
+    """What to know of an estimate that may stand all the same."""
 
 
 def evaluate_off_policy(
@@ -152,172 +134,220 @@ def evaluate_off_policy(
         InputError: propensities are not probabilities, there is only one user, or a page would have
             a session of several steps.
     """
-    rule = rule or trained.rule
-    evaluated = logged_steps(trained, logged, rule, seed, options)
-    steps = as_pages(evaluated.steps, *_pages(logged)) if options.pages else evaluated.steps
-    steps, of_groups = _without_far_off_groups(steps)
-    segment = None if options.pages else _quarters(logged.store, steps)
-    found, diagnosis = estimate(steps, seed), diagnose(steps, options.reward_range, segment)
-    value = None if options.pages else step_value(evaluated.steps, seed)
-    seen = share_seen(trained, logged.store)
-    lacking, notes = _of_dropped_rows(logged, options.pages)
-    forbidden = [*seen_too_often(seen), *_too_many_items(trained, evaluated), *lacking]
-    verdict = conclude(
-        *(steps, seed, diagnosis, options.wanted_lift, forbidden, _declared(evaluated)),
-        filter_seen=options.filter_seen,
-    )
-    warnings = [*verdict.reasons, *cautions(diagnosis, found), *_of_the_logs(seen, logged)]
-    warnings += [*notes, *of_groups, *_of_the_models(evaluated)]
-    warnings += [value.doubt] if value is not None and value.doubt else []
-    about = {
+    rule, store = rule or trained.rule, logged.store
+    steps, models, declared = collect_steps(trained, logged, rule, seed, options)
+    seen, segment, per_step = share_seen(trained, store), None, None
+    doubts = _doubt_logs(logged, seen, options.pages)
+    assert steps.groups is not None
+    items, in_catalogue = len(trained.items), steps.groups.number >= 0
+    implied = None if declared else implied_items(steps, in_catalogue, items)
+    if implied is not None and not implied.passed:
+        doubts.forbidden.append(
+            f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
+            f"items to choose from, the run knows {items:,}: propensities are too small"
+        )
+    if options.pages:
+        steps = as_pages(steps, *_find_pages(logged))
+    else:
+        # The quarter of the logs, 1 to 4 by time, in which each session begins.
+        times = store.column(schema.TIMESTAMP)[steps.first]
+        segment = 1 + np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
+        per_step = step_value(steps, seed)
+    clusters = steps.cluster_weights
+    if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
+        # The estimated probabilities of groups are not good enough for sessions of this length.
+        steps = replace(steps, cluster_propensity=None, cluster_target=None)
+        doubts.remarks.append(
+            f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
+        )
+    if not models.converged:
+        doubts.remarks.append(
+            "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
+            "stopped: ignore FQE"
+        )
+    if per_step is not None and per_step.doubt:
+        doubts.remarks.append(per_step.doubt)
+    columns = {
         "seen_in_training": seen,
-        "warnings": warnings,
         "dropped": logged.report["dropped"],
         "unknown_item_rows": logged.unknown_items,
-        **verdict_columns(verdict),
-        **diagnosis_columns(diagnosis),
-        **evaluated.models.columns(),
+        **models.columns(),
     }
-    fingerprint = logged.store.record.fingerprint
-    read = conditions(trained.folder, len(steps.first), len(steps.reward), options)
-    subject = Subject(trained, rule, seed, fingerprint, read, about)
-    return OffPolicyReport(
-        subject.rows(found),
-        warnings,
-        verdict,
-        evaluated.models,
-        *of_sessions(steps, diagnosis, verdict),
-        value,
-        [] if value is None else subject.rows(value.estimates, per_step=True),
+    return make_report(
+        trained,
+        rule,
+        steps,
+        seed,
+        options,
+        rows=len(steps.reward),
+        doubts=doubts,
+        columns=columns,
+        segment=segment,
+        declared=declared,
+        fingerprint=store.record.fingerprint,
+        models=models,
+        per_step=per_step,
     )
 
 
-def conditions(run: Path, sessions: int, steps: int, options: EstimateOptions) -> dict[str, Scalar]:
-    """How the logs were read, and their size."""
-    return {
-        "run": without_folders(str(run)),
+def make_report(
+    trained: TrainedPolicy,
+    rule: DecisionRule,
+    steps: LoggedSteps,
+    seed: int,
+    options: EstimateOptions,
+    *,
+    rows: int,
+    doubts: Doubts,
+    columns: dict[str, Any],
+    segment: IntArray | None = None,
+    declared: str = "",
+    fingerprint: str | None = None,
+    models: ModelReport | None = None,
+    per_step: StepValue | None = None,
+) -> OffPolicyReport:
+    """Estimate from logged steps, judge the estimates, and make their result rows.
+
+    `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the mean
+    reward of a step; a row may have no interval.
+
+    Args:
+        rows: number of rows of the logs.
+        columns: further columns of the result rows.
+        segment: (S,) as `diagnose` takes it.
+        declared: what the estimates rest on beside the logs.
+        fingerprint: of the logs.
+    """
+    estimates = estimate(steps, seed)
+    diagnosis = diagnose(steps, options.reward_range, segment)
+    lift, filter_seen = options.wanted_lift, options.filter_seen
+    verdict = conclude(steps, seed, diagnosis, lift, doubts.forbidden, declared, filter_seen)
+    warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *doubts.remarks]
+    record, choice = trained.record, "softmax" if rule.draws else "greedy"
+    conditions: dict[str, Scalar] = {
+        "run": shorten_paths(str(trained.folder)),
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
         "filter_seen": options.filter_seen,
-        "sessions": sessions,
-        "steps": steps,
+        "sessions": len(steps.first),
+        "steps": rows,
     }
+    judged = {**columns, "warnings": warnings, **_columns_of_evidence(verdict, diagnosis)}
 
+    def make_row(name: str, one: Estimate, metric: str, units: str, table: str) -> ResultRow:
+        row = ResultRow(
+            suite=SUITE,
+            table=table,
+            task="logs",
+            method=name,
+            policy="behavior" if name == LOGGED else trained.name,
+            training_seed=record.seed,
+            evaluation_seed=seed,
+            conditions={**conditions, "choice": "as logged" if name == LOGGED else choice},
+            config_hash=config_hash(record.settings),
+            data_fingerprint=fingerprint,
+            metric=metric,
+            metrics={metric: one.value},
+            interval=None if one.low is None or one.high is None else (one.low, one.high),
+            target_return=rule.target,
+            rule=rule.hash,
+            **provenance(),
+        )
+        own = {
+            f"{metric}_error": one.error,
+            f"effective_{units}": one.effective_sessions,
+            "largest_weight": one.largest_weight,
+            "parameter": one.parameter,
+            "decision_rule": rule.as_dict(),
+        }
+        return row.extended({**own, **judged})
 
-def of_sessions(
-    steps: LoggedSteps, diagnosis: Diagnosis, verdict: Verdict
-) -> tuple[Float64Array, IntArray | None, Float64Array | None]:
-    """`returns`, `user` and `terms` of the report."""
-    if diagnosis.left_out == diagnosis.sessions:
-        return np.empty(0), None, None
-    known = steps.known()
-    terms = {} if verdict.estimator is None else session_terms(known)
-    weighed = influences(terms[verdict.estimator]) if verdict.estimator in terms else None
-    return known.returns, known.user, weighed
-
-
-def _pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
-    """(N,) page of each step, and its position there where the observation is one-hot."""
-    store = logged.store
-    users = np.unique(logged.users, return_inverse=True)[1][store.all_steps()[0]]
-    page = pages_of(users, store.column(schema.TIMESTAMP).astype(np.int64))
-    if store.observation_size < 2:
-        return page, None
-    seen = store.column(schema.OBSERVATION)
-    one_hot = np.isin(seen, (0, 1)).all() and (seen.sum(axis=1) == 1).all()
-    return page, seen.argmax(axis=1) if one_hot else None
-
-
-def _without_far_off_groups(steps: LoggedSteps) -> tuple[LoggedSteps, list[str]]:
-    """The steps without weights of item groups, and why, where their mean is not 1: the estimated
-    probabilities of groups are not good enough for sessions of this length."""
-    weights = steps.cluster_weights
-    if weights is None or abs((mean := float(weights[steps.last].mean())) - 1) <= FAR_OFF:
-        return steps, []
-    said = f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
-    return replace(steps, cluster_propensity=None, cluster_target=None), [said]
-
-
-def _quarters(store: EpisodeStore, steps: LoggedSteps) -> IntArray:
-    """(S,) quarter of the logs, 1 to 4 by time, in which each session begins."""
-    times = store.column(schema.TIMESTAMP)[steps.first]
-    quarters = np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
-    return np.asarray(1 + quarters)
-
-
-def _declared(evaluated: EvaluatedSteps) -> str:
-    if not evaluated.estimated:
-        return ""
-    return (
-        f"with the propensities of {evaluated.estimated:,} steps estimated ({evaluated.behavior})"
+    weighable = None if steps.lacking.all() else steps.weighable
+    terms = None
+    if weighable is not None and verdict.estimator is not None:
+        terms = session_terms(weighable)[verdict.estimator].influences
+    of_steps = {} if per_step is None else per_step.estimates
+    return OffPolicyReport(
+        rows=[make_row(*one, "R_cum", "sessions", "estimates") for one in estimates.items()],
+        warnings=warnings,
+        verdict=verdict,
+        models=models,
+        returns=np.empty(0) if weighable is None else weighable.returns,
+        user=None if weighable is None else weighable.user,
+        terms=terms,
+        per_step=per_step,
+        step_rows=[make_row(*one, "R_step", "steps", "per step") for one in of_steps.items()],
     )
 
 
-def _of_the_models(evaluated: EvaluatedSteps) -> list[str]:
-    if evaluated.models.converged:
-        return []
-    return [
-        "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
-        "stopped: ignore FQE"
-    ]
+def _columns_of_evidence(verdict: Verdict, diagnosis: Diagnosis) -> dict[str, Any]:
+    """The verdict, and what speaks against the estimates, by name."""
+    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
+    del columns["estimator"], columns["reasons"]
+    return columns | {
+        "overlap": diagnosis.overlap,
+        "users": diagnosis.users,
+        "sessions_without_propensity": diagnosis.left_out,
+        "effective_users": diagnosis.effective_users,
+        "effective_by_step": list(diagnosis.effective_by_step),
+        "unsupported_from_step": diagnosis.unsupported_from_step,
+        "weight_tests": [asdict(test) for test in diagnosis.tests],
+        "mean_weight": diagnosis.mean_weight,
+        "pareto_tail": diagnosis.tail,
+        "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
+    }
 
 
-def _too_many_items(trained: TrainedPolicy, evaluated: EvaluatedSteps) -> list[str]:
-    steps = evaluated.steps
-    assert steps.groups is not None
-    items = len(trained.items)
-    found = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
-    if found is None or found.passed:
-        return []
-    return [
-        f"the propensities imply {found.mean * items:,.0f} ± {found.error * items:,.0f} items to "
-        f"choose from, the run knows {items:,}: propensities are too small"
-    ]
-
-
-def _of_the_logs(seen: float | None, logged: LoggedSessions) -> list[str]:
-    said = []
+def _doubt_logs(logged: LoggedSessions, seen: float | None, pages: bool) -> Doubts:
+    """What rows seen in training, of unknown items, and dropped rows say."""
+    doubts, dropped = Doubts(seen_too_often(seen)), logged.report["dropped"]
     if seen is None:
-        said.append(
+        doubts.remarks.append(
             "the store that the run was trained on is gone or has changed: whether these logs were "
             "seen in training is not known, and users begin without a history; move the run "
             "together with its store"
         )
-    if unknown := logged.unknown_items:
-        said.append(
-            f"{unknown:,} rows show items that the run does not know, and so never would: they "
-            "weigh 0"
+    if logged.unknown_items:
+        doubts.remarks.append(
+            f"{logged.unknown_items:,} rows show items that the run does not know, and so never "
+            "would: they weigh 0"
         )
-    return said
-
-
-def _of_dropped_rows(logged: LoggedSessions, pages: bool) -> tuple[list[str], list[str]]:
-    """What dropped rows forbid, and what to know of them."""
-    dropped, forbidden, notes = logged.report["dropped"], [], []
-    if lacking := dropped.get("reward_not_finite", 0):
-        rows = logged.store.n_steps + lacking
-        said = f"{lacking:,} of {rows:,} rows have no finite reward: they are left out"
-        if lacking > MOST_LEFT_OUT * rows:
-            forbidden.append(f"{said}, and may differ from the rest")
+    if without_reward := dropped.get("reward_not_finite", 0):
+        rows = logged.store.n_steps + without_reward
+        text = f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
+        if without_reward > MOST_LEFT_OUT * rows:
+            doubts.forbidden.append(f"{text}, and may differ from the rest")
         else:
-            notes.append(said)
+            doubts.remarks.append(text)
     if pages and (repeated := dropped.get("duplicate", 0)):
-        notes.append(
+        doubts.remarks.append(
             f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "
             "page can show an item twice, log its positions a millisecond apart"
         )
-    return forbidden, notes
+    return doubts
 
 
-def logged_steps(
+def _find_pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
+    """(N,) page of each step, and its position there where the observation is one-hot."""
+    store = logged.store
+    users = np.unique(logged.users, return_inverse=True)[1][store.all_steps()[0]]
+    page = number_pages(users, store.column(schema.TIMESTAMP).astype(np.int64))
+    if store.observation_size < 2:
+        return page, None
+    observations = store.column(schema.OBSERVATION)
+    one_hot = np.isin(observations, (0, 1)).all() and (observations.sum(axis=1) == 1).all()
+    return page, observations.argmax(axis=1) if one_hot else None
+
+
+def collect_steps(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
-) -> EvaluatedSteps:
-    """Collect the logged steps, the policy's probabilities and models of its return.
+) -> tuple[LoggedSteps, ModelReport, str]:
+    """Collect the logged steps, in order, the policy's probabilities and models of its return.
 
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
     groups, lie on disk.
@@ -327,50 +357,17 @@ def logged_steps(
         seed: seed of the folds, item groups and samples.
 
     Returns:
-        The N logged steps, in order.
+        The steps, how good the models are, and which propensities are estimated; "" if none is.
 
     Raises:
         InputError: propensities are not probabilities, or there is only one user.
     """
-    store, plain = logged.store, _logged_only(logged, options)
-    _require_two_users(logged, plain)
-    items = store.column(schema.ITEM).astype(np.int64)
-    group_of = _item_groups(trained, options, seed)
-    group = np.where(items >= 0, group_of[items], -1)
-    one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
-    target, shown = np.empty(len(items)), array_on_disk((len(items), one_hot.shape[1]))
-    done, behavior = 0, None
-    with InputsFile() as inputs:
-        shown_before = logged.rows if options.filter_seen else None
-        for batch in scored_steps(trained, store, rule, shown_before):
-            rows = slice(done, done + len(batch.steps))
-            target[rows], probabilities, seen = step_features(trained, batch)
-            shown[rows] = (probabilities @ one_hot).numpy()
-            inputs.append(seen)
-            done = rows.stop
-        grouped = shown.shape[1] > 1 and plain.unknown_propensities < len(items)
-        if grouped or options.estimate_propensities:
-            known = np.maximum(group, 0)
-            behavior = fit_behavior(inputs.states, items, known, plain.session, seed, plain.user)
-        modelled, models = fit_models(
-            inputs.chunks, plain.reward, plain.session, seed, plain.user, plain.discount
-        )
-    groups = ItemGroups(group, shown)
-    steps = replace(plain, target=target, model=modelled, groups=groups)
-    estimated = 0
-    if behavior is not None:
-        estimated = plain.unknown_propensities if options.estimate_propensities else 0
-        steps = _weighed_by_model(steps, groups, behavior, options.estimate_propensities)
-    return EvaluatedSteps(steps, models, behavior, estimated)
-
-
-def _logged_only(logged: LoggedSessions, options: EstimateOptions) -> LoggedSteps:
-    """What the logs say, without any policy. Checks the propensities before the slow scoring."""
     store = logged.store
     propensity = np.full(store.n_steps, np.nan)
     if schema.PROPENSITY in store.record.columns:
         propensity = store.column(schema.PROPENSITY).astype(np.float64)
-    return LoggedSteps(
+    # What the logs say without any policy is checked before the slow scoring.
+    plain = LoggedSteps(
         session=store.all_steps()[0],
         reward=store.column(schema.REWARD).astype(np.float64),
         propensity=propensity,
@@ -378,72 +375,40 @@ def _logged_only(logged: LoggedSessions, options: EstimateOptions) -> LoggedStep
         user=np.unique(logged.users, return_inverse=True)[1] if options.users_known else None,
         discount=options.discount,
     )
-
-
-def _require_two_users(logged: LoggedSessions, plain: LoggedSteps) -> None:
-    """Check, before the slow scoring, that a model of other users can predict each user.
-
-    Raises:
-        InputError: there is only one user.
-    """
-    sessions = len(plain.first)
-    users = sessions if plain.user is None else len(np.unique(plain.user))
-    if users < 2:
-        name = logged.report.get("files", [logged.store.path])[0]
+    if len(np.unique(plain.users)) < 2:
+        sessions = len(plain.first)
         raise InputError(
-            f"{name}: the logs have {sessions:,} session{'s' * (sessions > 1)} of one user; at "
-            "least two users are needed, as each is predicted by models of the others; give logs "
-            "of more users"
+            f"{logged.report.get('files', [store.path])[0]}: the logs have {sessions:,} "
+            f"session{'s' * (sessions > 1)} of one user; each user is predicted by models of "
+            "others: give logs of more users"
         )
-
-
-def _weighed_by_model(
-    steps: LoggedSteps, groups: ItemGroups, behavior: BehaviorModel, fill: bool
-) -> LoggedSteps:
-    """The steps with the probabilities of their items' groups, for MIPS, and with `fill` the
-    estimated propensities where the logs lack them."""
-    lacking = np.isnan(steps.propensity) & fill
-    of_group = np.take_along_axis(groups.target, np.maximum(groups.number, 0)[:, None], axis=1)
-    return replace(
-        steps,
-        propensity=np.where(lacking, behavior.item, steps.propensity),
-        cluster_propensity=behavior.group,
-        cluster_target=np.where(groups.number < 0, 0.0, of_group[:, 0]).clip(0, 1),
-    )
-
-
-def _item_groups(trained: TrainedPolicy, options: EstimateOptions, seed: int) -> IntArray:
-    """(n_items,) group of every item."""
+    items = store.column(schema.ITEM).astype(np.int64)
     assert trained.item_states is not None
-    embeddings = trained.item_states.embeddings.numpy()
-    wanted = options.item_groups or default_groups(len(embeddings))
-    if wanted == 1:
-        return np.zeros(len(embeddings), dtype=np.int64)
-    return group_items(embeddings, wanted, seed)
-
-
-def step_features(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tensor, StepInputs]:
-    """Compute the policy's probability and the models' inputs for B logged steps.
-
-    An item that the run does not know (−1) has probability 0 and an embedding of zeros.
-
-    Returns:
-        The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;
-        and what the models see.
-    """
-    assert trained.item_states is not None
-    embeddings = trained.item_states.embeddings
-    items = batch.items
-    known = items >= 0
-    probabilities = batch.log_probabilities.exp()
-    target = probabilities.gather(1, items[:, None].clamp(min=0))[:, 0].double() * known
-    # What the policy thinks of an item counts for the models also where the rule takes the best.
-    of_chosen, of_shown = scores_of(batch.scores.log_softmax(-1), items, probabilities)
-    seen = StepInputs(
-        context=context_of(batch),
-        state_size=batch.states.shape[1],
-        chosen=embeddings[items] * known[:, None],
-        shown=probabilities @ embeddings,
-        scores=torch.stack([of_chosen, of_shown], dim=1),
+    group_of = group_items(trained.item_states.embeddings.numpy(), options.item_groups, seed)
+    one_hot = torch.from_numpy(np.eye(group_of.max() + 1, dtype=np.float32)[group_of])
+    target, end = np.empty(len(items)), 0
+    groups = ItemGroups(
+        np.where(items >= 0, group_of[items], -1), array_on_disk((len(items), one_hot.shape[1]))
     )
-    return target.clamp(0, 1).numpy(), probabilities, seen
+    inputs = InputsFile(len(items))
+    shown_before = logged.rows if options.filter_seen else None
+    for batch in scored_steps(trained, store, rule, shown_before):
+        rows = slice(end, end + len(batch.steps))
+        target[rows], probabilities, batch_inputs = make_inputs(trained, batch)
+        groups.target[rows] = (probabilities @ one_hot).numpy()
+        inputs.append(batch_inputs)
+        end = rows.stop
+    columns: dict[str, Any] = {}
+    declared, unknown = "", plain.unknown_propensities
+    if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
+        group = np.maximum(groups.number, 0)
+        behavior = fit_behavior(inputs.states, items, group, plain.session, seed, plain.user)
+        of_group = np.take_along_axis(groups.target, group[:, None], axis=1)[:, 0]
+        columns["cluster_propensity"] = behavior.group
+        columns["cluster_target"] = np.where(groups.number < 0, 0.0, of_group).clip(0, 1)
+        if options.estimate_propensities and unknown:
+            declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
+            columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
+    reward, session = plain.reward, plain.session
+    modelled, models = fit_models(inputs.chunks, reward, session, seed, plain.user, plain.discount)
+    return replace(plain, target=target, model=modelled, groups=groups, **columns), models, declared

@@ -53,29 +53,23 @@ def cluster_intervals(
         One per column; None where nothing spreads: one cluster, all clusters equal, or so few that
         differ that more than a tenth of the resamples have no spread.
     """
-    drawn = resample(above, below, cluster, seed)
-    found: list[Interval | None] = []
-    for k in range(above.shape[1]):
-        usable = drawn.usable[:, k]
-        if not drawn.spreads[k] or usable.mean() < _USABLE:
-            found.append(None)
+    resamples = resample(above, below, cluster, seed)
+    usable = resamples.usable
+    intervals: list[Interval | None] = []
+    for k, (value, error) in enumerate(zip(resamples.value, resamples.error, strict=True)):
+        rows = usable[:, k]
+        if not resamples.spreads[k] or rows.mean() < _USABLE:
+            intervals.append(None)
             continue
-        shift, error = drawn.shift[usable, k], drawn.errors[usable, k]
-        low_t, high_t = np.quantile(shift / error, [0.025, 0.975])
-        value, spread = drawn.value[k], drawn.error[k]
-        found.append(
-            Interval(
-                low=float(value - high_t * spread),
-                high=float(value - low_t * spread),
-                error=float(spread),
-                above_zero=float((value + shift > 0).mean()),
-            )
-        )
-    return found
+        shift, errors = resamples.shift[rows, k], resamples.errors[rows, k]
+        low_t, high_t = np.quantile(shift / errors, [0.025, 0.975])
+        low, high = float(value - high_t * error), float(value - low_t * error)
+        intervals.append(Interval(low, high, float(error), float((value + shift > 0).mean())))
+    return intervals
 
 
 @dataclass(frozen=True)
-class Resampled:
+class Resamples:
     """K ratios, and B resamples of them; the same clusters are drawn for all K."""
 
     value: Float64Array
@@ -97,7 +91,7 @@ class Resampled:
 
 def resample(
     above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
-) -> Resampled:
+) -> Resamples:
     """Draw clusters with replacement, each with all its sessions.
 
     Args:
@@ -105,23 +99,28 @@ def resample(
         below: (S, K).
         cluster: (S,) of each session, any integers; None where each session is its own.
     """
-    names, clusters = _numbered(cluster, len(above))
+    names, clusters = _number_clusters(cluster, len(above))
     if clusters > MOST_CLUSTERS:
         shuffled = np.random.default_rng(seed).permutation(clusters)
         names, clusters = shuffled[names] % MOST_CLUSTERS, MOST_CLUSTERS
-    sums = [_by_cluster(values, names, clusters) for values in (above, below)]
-    totals = sums[1].sum(axis=0)
-    value = sums[0].sum(axis=0) / totals
+    above, below = (
+        np.stack([np.bincount(names, column, clusters) for column in values.T], axis=1).astype(
+            np.float64, copy=False
+        )
+        for values in (above, below)
+    )
+    value = above.sum(axis=0) / below.sum(axis=0)
     # Deviations from the estimate, in units that keep squares of large weights finite.
-    scale = np.maximum(np.abs(sums[0] - value * sums[1]).max(axis=0), np.finfo(float).tiny)
-    size = np.abs(sums[1]).max(axis=0)
-    e, b = (sums[0] - value * sums[1]) / scale, sums[1] / size
+    scale = np.maximum(np.abs(above - value * below).max(axis=0), np.finfo(float).tiny)
+    size = np.abs(below).max(axis=0)
+    e, b = (above - value * below) / scale, below / size
     unit = scale / size
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
-    shift, errors = _resampled(np.stack([e, b, e * e, e * b, b * b]), correction, seed)
+    moments = np.stack([e, b, e * e, e * b, b * b])
+    shift, errors = _draw_resamples(moments, correction, seed)
     spreads = (error > 1e-12) & (clusters > 1)
-    return Resampled(value, error * unit, shift * unit, errors * unit, spreads)
+    return Resamples(value, error * unit, shift * unit, errors * unit, spreads)
 
 
 def cluster_mean(
@@ -133,7 +132,7 @@ def cluster_mean(
         cluster: (S,); None where each value is its own.
         weights: (S,) how often each value counts; None for once each.
     """
-    names, clusters = _numbered(cluster, len(values))
+    names, clusters = _number_clusters(cluster, len(values))
     above = np.bincount(names, values if weights is None else values * weights, clusters)
     below = np.bincount(names, weights, clusters)
     mean = above.sum() / below.sum()
@@ -141,7 +140,7 @@ def cluster_mean(
     return float(mean), float(np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum())
 
 
-def _numbered(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
+def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
     """(S,) clusters numbered from 0, and how many there are."""
     if cluster is None:
         return np.arange(sessions), sessions
@@ -149,13 +148,7 @@ def _numbered(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
     return names, int(names.max()) + 1
 
 
-def _by_cluster(values: Float64Array, names: IntArray, clusters: int) -> Float64Array:
-    """(C, K) sums of the rows of values (S, K)."""
-    columns = [np.bincount(names, column, clusters) for column in values.T]
-    return np.stack(columns, axis=1)
-
-
-def _resampled(
+def _draw_resamples(
     moments: Float64Array, correction: float, seed: int
 ) -> tuple[Float64Array, Float64Array]:
     """Deviation from the estimate (B, K) in each resample, and the resample's standard error.
@@ -165,12 +158,12 @@ def _resampled(
     """
     _, clusters, columns = moments.shape
     flat = np.moveaxis(moments, 1, 0).reshape(clusters, -1)
-    counts, at_once = _counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
+    counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
     shifts, errors = [], []
     for begin in range(0, RESAMPLES, at_once):
         # How often each cluster is drawn stands for the resampled rows.
-        drawn = counts[begin : begin + at_once].astype(np.float64)
-        e, b, ee, eb, bb = (drawn @ flat).reshape(-1, 5, columns).swapaxes(0, 1)
+        times = counts[begin : begin + at_once].astype(np.float64)
+        e, b, ee, eb, bb = (times @ flat).reshape(-1, 5, columns).swapaxes(0, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             shift = np.where(b > 0, e / b, np.nan)
             spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
@@ -180,7 +173,7 @@ def _resampled(
 
 
 @lru_cache(maxsize=1)
-def _counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
+def _draw_counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
     """(B, C) how often each resample has each cluster, at most 40 MB.
 
     Kept for the next call: an estimate, its verdict and a selection draw the same clusters.
@@ -192,7 +185,7 @@ def _counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
         draws = min(at_once, RESAMPLES - begin)
         picked = generator.integers(clusters, size=(draws, clusters))
         picked += np.arange(draws)[:, None] * clusters
-        found = np.bincount(picked.ravel(), minlength=draws * clusters)
-        counts[begin : begin + draws] = found.reshape(draws, clusters)
+        times = np.bincount(picked.ravel(), minlength=draws * clusters)
+        counts[begin : begin + draws] = times.reshape(draws, clusters)
     counts.setflags(write=False)
     return counts

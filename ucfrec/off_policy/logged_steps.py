@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.array_inputs import array_of, ids, numbers, whole_numbers
 
 _LARGEST = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
 _ROUNDING = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
-_MAY_LACK = ("propensity", "cluster_propensity")
-_PROBABILITIES = (*_MAY_LACK, "target", "cluster_target")
-_NUMBERS = ("reward", *_PROBABILITIES, "per_decision", "by_step")
+_PROPENSITIES = ("propensity", "cluster_propensity")
+_TARGETS = ("target", "cluster_target")
+_COLUMNS = ("reward", *_PROPENSITIES, *_TARGETS, "per_decision", "by_step")
 """What there is one number of a step."""
 
 
@@ -39,7 +38,9 @@ class Modelled:
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
-            object.__setattr__(self, name, numbers(f"modelled {name}", values))
+            column = _convert_to_floats(f"modelled {name}", values)
+            _require_finite(f"modelled {name}", column)
+            object.__setattr__(self, name, column)
 
 
 @dataclass(frozen=True)
@@ -51,22 +52,17 @@ class ItemGroups:
     target: Float32Array
     """(N, K) the evaluated policy's probability of every group."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "number", whole_numbers("number of the group", self.number))
-        object.__setattr__(self, "target", array_of("target of groups", self.target, dimensions=2))
-
 
 @dataclass(frozen=True)
 class LoggedSteps:
     """N logged steps of S sessions, a session's steps together and in order.
 
     Lists and pandas Series are taken as well, by place and not by index; numbers are kept as
-    float64, and users that are not integers are numbered. Masked and missing propensities are
-    unknown ones.
+    float64, and users that are not integers are numbered.
 
     Raises:
-        InputError: lengths differ, sessions are not numbered in order, a number is missing, masked
-            or not finite, a user is missing, a probability or the discount is out of its range.
+        InputError: lengths differ, sessions are not numbered in order, a number is missing or not
+            finite, a user is missing, a probability or the discount is out of its range.
     """
 
     session: IntArray
@@ -101,49 +97,40 @@ class LoggedSteps:
     `ucfrec.off_policy.pages`."""
 
     def __post_init__(self) -> None:
-        self._convert()
-        n = len(self.session)
-        rises = np.diff(self.session, prepend=-1)
-        if n == 0 or rises[0] != 1 or not np.isin(rises, (0, 1)).all():
+        replace_field = partial(object.__setattr__, self)
+        session: Array = np.asarray(self.session)
+        if session.dtype.kind not in "iu":
+            session = _convert_to_floats("session", session)
+        rises = np.diff(session, prepend=-1)
+        if not len(session) or rises[0] != 1 or not np.isin(rises, (0, 1)).all():
             raise InputError("sessions are numbered from 0 in order, and there is at least one")
-        finite = {"reward": self.reward}
-        if self.model is not None:
-            finite |= {f"modelled {name}": values for name, values in vars(self.model).items()}
-        finite |= {name: getattr(self, name) for name in ("per_decision", "by_step")}
-        for name, values in finite.items():
-            if values is not None:
-                _require_finite(name, values, n)
-        most = np.inf if self.densities else 1.0
-        _require_probabilities(self.propensity, self.target, n, most)
+        replace_field("session", session.astype(np.int64, copy=False))
+        n = len(session)
+        for name in _COLUMNS:
+            if getattr(self, name) is not None:
+                column = _convert_to_floats(name, getattr(self, name))
+                if name in (*_PROPENSITIES, *_TARGETS):
+                    column = _check_probabilities(name, column, self.densities)
+                else:
+                    _require_finite(name, column)
+                replace_field(name, column)
+        if self.user is not None:
+            replace_field("user", _number_users(self.user))
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
             raise InputError("give both cluster_propensity and cluster_target, or neither")
-        if self.cluster_propensity is not None and self.cluster_target is not None:
-            _require_probabilities(self.cluster_propensity, self.cluster_target, n)
-        if self.groups is not None:
-            of, target = self.groups.number.shape, self.groups.target.shape
-            if of != (n,) or len(target) != 2 or target[0] != n:
-                raise InputError(f"groups have shapes {of} and {target}; {n} steps are one each")
-        if self.user is not None and self.user.shape != (len(self.first),):
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        for part in (self.model, self.groups):
+            columns |= {} if part is None else vars(part)
+        for name, values in columns.items():
+            if values is not None and len(values) != n:
+                raise InputError(f"{name} has {len(values):,} values for {n:,} steps")
+        if self.user is not None and len(self.user) != len(self.first):
             raise InputError(
-                f"user has shape {self.user.shape}; {len(self.first)} sessions are "
-                f"({len(self.first)},): one user a session"
+                f"user has {len(self.user):,} values for {len(self.first):,} sessions: give one "
+                "user a session"
             )
         if not 0 < self.discount <= 1:
             raise InputError(f"discount is {self.discount}; it is above 0 and at most 1")
-
-    def _convert(self) -> None:
-        """Replace what was given by the arrays to compute with."""
-        keep = partial(object.__setattr__, self)
-        keep("session", whole_numbers("session", self.session))
-        for name in _NUMBERS:
-            if (values := getattr(self, name)) is None:
-                continue
-            found = numbers(name, values, masked_is_missing=name in _MAY_LACK)
-            if name in _PROBABILITIES and not self.densities:
-                found = _without_rounding(found)
-            keep(name, found)
-        if self.user is not None:
-            keep("user", ids("user", self.user))
 
     @cached_property
     def first(self) -> IntArray:
@@ -190,7 +177,7 @@ class LoggedSteps:
     @cached_property
     def weights(self) -> Float64Array:
         """(N,) w_it; NaN from a step without propensity on."""
-        return self._products(self.target / self.propensity)
+        return self._multiply(self.target / self.propensity)
 
     @cached_property
     def session_weights(self) -> Float64Array:
@@ -202,7 +189,7 @@ class LoggedSteps:
         """(N,) products of ratios of the logged actions' clusters; None without them."""
         if self.cluster_propensity is None or self.cluster_target is None:
             return None
-        return self._products(self.cluster_target / self.cluster_propensity)
+        return self._multiply(self.cluster_target / self.cluster_propensity)
 
     @property
     def unknown_propensities(self) -> int:
@@ -213,106 +200,120 @@ class LoggedSteps:
         """(S,) sums of values (N,)."""
         return np.asarray(np.add.reduceat(values, self.first))
 
-    def before(self, upto: Float64Array) -> Float64Array:
-        """(N,) w_i,t−1 of products (N,): 1 at the first step."""
-        earlier = np.roll(upto, 1)
+    def shift(self, products: Float64Array) -> Float64Array:
+        """(N,) w_i,t−1 of products w_it (N,): 1 at the first step."""
+        earlier = np.roll(products, 1)
         earlier[self.first] = 1.0
         return earlier
 
-    def known(self) -> "LoggedSteps":
+    def step_totals(self) -> Float64Array:
+        """(T,) Σ_i w_it by step of the longest session, ended sessions with their last weight."""
+        alive = np.bincount(self.step, self.weights)
+        ended = np.bincount(self.lengths, self.session_weights, len(alive) + 1)
+        return np.asarray(alive + np.cumsum(ended)[:-1])
+
+    @cached_property
+    def weighable(self) -> "LoggedSteps":
         """The sessions of whose every step the propensity is known, renumbered.
 
         Raises:
             InputError: there is none.
         """
-        if not self.unknown_propensities:
-            return self
-        return self.only(~self.lacking)
+        return self.select(~self.lacking) if self.unknown_propensities else self
 
-    def only(self, keep: BoolArray) -> "LoggedSteps":
-        """The sessions that `keep` (S,) marks, renumbered.
+    def select(self, sessions: BoolArray) -> "LoggedSteps":
+        """The sessions that a mask (S,) marks, renumbered.
 
         Raises:
             InputError: it marks none.
         """
-        rows = keep[self.session]
-        return replace(
-            self,
-            session=(np.cumsum(keep) - 1)[self.session[rows]],
-            user=None if self.user is None else self.user[keep],
-            **self._columns(rows),
-        )
+        rows = np.flatnonzero(sessions[self.session])
+        numbers = (np.cumsum(sessions) - 1)[self.session[rows]]
+        return self.regroup(rows, numbers, None if self.user is None else self.user[sessions])
 
-    def regrouped(self, order: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
-        """The same steps in another order and other sessions.
+    def regroup(self, rows: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
+        """Some steps, in other sessions.
 
         Args:
-            order: (N,) steps in their new order.
-            session: (N,) session of each, in the new order.
+            rows: (M,) numbers of the steps, in their new order.
+            session: (M,) session of each, in the new order.
             user: (S,) of the new sessions; None where each is of another user.
         """
-        return replace(self, session=session, user=user, **self._columns(order))
-
-    def _columns(self, rows: IntArray | BoolArray) -> dict[str, Any]:
-        """What there is one of a step, at the given steps; without the sessions."""
+        columns = {name: getattr(self, name) for name in _COLUMNS}
         parts: dict[str, Any] = {
-            name: values[rows] for name in _NUMBERS if (values := getattr(self, name)) is not None
+            name: values[rows] for name, values in columns.items() if values is not None
         }
-        if self.model is not None:
-            parts["model"] = Modelled(*(values[rows] for values in vars(self.model).values()))
-        if self.groups is not None:
-            parts["groups"] = ItemGroups(self.groups.number[rows], self.groups.target[rows])
-        return parts
+        for name in ("model", "groups"):
+            if (part := getattr(self, name)) is not None:
+                values = {field: column[rows] for field, column in vars(part).items()}
+                parts[name] = replace(part, **values)
+        return replace(self, session=session, user=user, **parts)
 
-    def _products(self, upto: Float64Array) -> Float64Array:
-        """(N,) products of ratios (N,) from the session's first step to each."""
+    def _multiply(self, ratios: Float64Array) -> Float64Array:
+        """(N,) products of ratios (N,) from the session's first step to each, in place."""
         # One pass a place in the session: sums of logarithms would lose digits over many sessions.
         longest_first = np.argsort(-self.lengths, kind="stable")
         starts, lengths = self.first[longest_first], self.lengths[longest_first]
         for place in range(1, int(lengths[0])):
             at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
-            upto[at] = np.minimum(upto[at] * upto[at - 1], _LARGEST)
-        return np.asarray(np.minimum(upto, _LARGEST))
+            ratios[at] = np.minimum(ratios[at] * ratios[at - 1], _LARGEST)
+        return np.asarray(np.minimum(ratios, _LARGEST))
 
 
-def _without_rounding(probabilities: Float64Array) -> Float64Array:
-    """The probabilities without rounding errors above 1; the same array where there are none."""
-    above = (probabilities > 1) & (probabilities <= 1 + _ROUNDING)
-    return np.where(above, 1.0, probabilities) if above.any() else probabilities
+def _convert_to_floats(name: str, values: Any) -> Float64Array:
+    """(N,) values as float64, not copied where they are that; NaN where one is missing or masked.
 
-
-def _require_shape(name: str, values: Float64Array, n: int) -> None:
-    if values.shape != (n,):
-        raise InputError(f"{name} has shape {values.shape}, {n} steps are ({n},)")
-
-
-def _require_finite(name: str, values: Float64Array, n: int) -> None:
-    _require_shape(name, values, n)
-    if (others := ~np.isfinite(values)).any():
-        raise InputError(f"{name} is not finite at {others.sum():,} of {n:,} steps; correct it")
-
-
-def _require_probabilities(
-    propensity: Float64Array, target: Float64Array, n: int, most: float = 1.0
-) -> None:
-    """Args:
-    most: what they may not exceed; infinity for densities.
+    Raises:
+        InputError: they are no numbers, or have another shape.
     """
-    _require_shape("propensity", propensity, n)
-    _require_finite("target probability", target, n)
-    if (others := (target < 0) | (target > most)).any():
-        where = "are 0 or more" if most > 1 else "lie between 0 and 1"
-        raise InputError(
-            f"probabilities of the evaluated policy {where}; {_others(target, others)}"
-        )
-    if (others := (propensity <= 0) | (propensity > most) | np.isinf(propensity)).any():
-        raise InputError(
+    try:
+        column = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is no array of numbers ({error!s:.200})") from None
+    if column.ndim != 1:
+        raise InputError(f"{name} has shape {column.shape}; give one number a step")
+    return np.asarray(column)
+
+
+def _number_users(values: Any) -> Array:
+    """(S,) integer users as they are; others (text, objects) numbered from 0."""
+    users = np.asarray(values)
+    if users.dtype.kind in "iu":
+        return users
+    try:
+        missing = int(np.sum(users != users))
+        numbers = np.unique(users, return_inverse=True)[1]
+    except TypeError:
+        missing = 1
+    if missing:
+        raise InputError("users are missing, or of several types: give all as text, or none")
+    return np.asarray(numbers)
+
+
+def _require_finite(name: str, values: Float64Array) -> None:
+    if count := int((~np.isfinite(values)).sum()):
+        raise InputError(f"{name} is not finite at {count:,} of {len(values):,} steps; correct it")
+
+
+def _check_probabilities(name: str, values: Float64Array, densities: bool) -> Float64Array:
+    """The probabilities without rounding errors above 1; the same array where there are none."""
+    above = (values > 1) & (values <= 1 + _ROUNDING)
+    if above.any() and not densities:
+        values = np.where(above, 1.0, values)
+    inside = np.isfinite(values) if densities else values <= 1
+    if name in _TARGETS:
+        outside = ~((values >= 0) & inside)
+        rule, remedy = "probabilities of the evaluated policy lie between 0 and 1", ""
+    else:
+        outside = ~((values > 0) & inside | np.isnan(values))
+        rule = (
             "propensities must be above 0 and at most 1, the probability of the item shown and not "
-            f"a density; {_others(propensity, others)}; correct that column (arrays of vector "
-            "actions: LoggedSteps(densities=True))"
+            "a density"
         )
-
-
-def _others(values: Float64Array, others: BoolArray) -> str:
-    """How many values `others` marks, and the first of them."""
-    return f"{others.sum():,} of {len(values):,} are outside, the first is {values[others][0]:.10g}"
+        remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
+    if outside.any():
+        raise InputError(
+            f"{rule}; {outside.sum():,} of {len(values):,} are outside, the first is "
+            f"{values[outside][0]:.10g}{remedy}"
+        )
+    return values

@@ -20,7 +20,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.intervals import Resampled, resample
+from ucfrec.off_policy.intervals import Resamples, resample
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
@@ -96,51 +96,45 @@ def select(
         raise InputError(f"terms have shape {terms.shape}; give a column to each of {len(names)}")
     if not np.isfinite(terms).all():
         raise InputError(f"terms are not finite at {(~np.isfinite(terms)).sum()} places")
-    drawn = resample(terms, np.ones_like(terms), user, seed)
-    half = _critical(drawn) * drawn.error
-    again = drawn.value + drawn.shift
+    resamples = resample(terms, np.ones_like(terms), user, seed)
+    value, error = resamples.value, resamples.error
+    half = _critical(np.abs(_studentise(resamples))) * error
+    again = value + resamples.shift
     best = again == again.max(axis=1, keepdims=True)
     share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
-    order = np.argsort(-drawn.value, kind="stable")
-    standings = tuple(
-        Standing(
-            names[k],
-            float(drawn.value[k]),
-            float(drawn.error[k]),
-            float(drawn.value[k] - half[k]),
-            float(drawn.value[k] + half[k]),
-            float(share[k]),
-            rank,
-        )
-        for rank, k in enumerate(order, start=1)
-    )
+    standings = []
+    for rank, k in enumerate(np.argsort(-value, kind="stable"), start=1):
+        low, high = float(value[k] - half[k]), float(value[k] + half[k])
+        one = Standing(names[k], float(value[k]), float(error[k]), low, high, float(share[k]), rank)
+        standings.append(one)
     # What the first of each resample is worth there, beyond its worth in the whole sample.
-    luck = drawn.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
-    first = int(order[0])
-    corrected = float(drawn.value[first] - max(luck, 0.0))
-    return Selection(standings, corrected, _regret(terms, first, seed, user))
+    luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
+    first = int(np.argmax(value))
+    corrected = float(value[first] - max(luck, 0.0))
+    return Selection(tuple(standings), corrected, _find_regret(terms, first, seed, user))
 
 
-def _regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
+def _find_regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
     """Upper end of how much better than the first any other may be."""
-    others = np.delete(terms, first, axis=1) - terms[:, [first]]
-    if not others.shape[1]:
+    lead = np.delete(terms, first, axis=1) - terms[:, [first]]
+    if not lead.shape[1]:
         return 0.0
-    drawn = resample(others, np.ones_like(others), user, seed)
+    resamples = resample(lead, np.ones_like(lead), user, seed)
+    upper = resamples.value + _critical(-_studentise(resamples)) * resamples.error
     # Candidates that never differ are neither better nor worse.
-    differs = drawn.spreads
-    if not differs.any():
-        return 0.0
-    upper = drawn.value + _critical(drawn, two_sided=False) * drawn.error
-    return float(max(upper[differs].max(), 0.0))
+    return float(upper[resamples.spreads].max(initial=0.0))
 
 
-def _critical(drawn: Resampled, two_sided: bool = True) -> float:
-    """Quantile of the largest studentised deviation over candidates."""
+def _studentise(resamples: Resamples) -> Float64Array:
+    """(B, K) deviations in standard errors of the resample; 0 where there is none."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        t = np.where(drawn.usable & drawn.spreads, drawn.shift / drawn.errors, 0.0)
-    largest = np.abs(t).max(axis=1) if two_sided else (-t).max(axis=1)
-    return float(np.quantile(largest, LEVEL))
+        deviations = resamples.shift / resamples.errors
+    return np.where(resamples.usable & resamples.spreads, deviations, 0.0)
+
+
+def _critical(deviations: Float64Array) -> float:
+    """Quantile of the largest deviation over candidates."""
+    return float(np.quantile(deviations.max(axis=1), LEVEL))
 
 
 @dataclass(frozen=True)
@@ -161,21 +155,21 @@ class Choice:
 
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
-        found: dict[str, Any] = {"selection": self.headline}
-        standings = () if self.selection is None else self.selection.standings
-        one = next((each for each in standings if each.name == name), None)
-        if self.selection is None or one is None:
-            return found
-        found |= {
-            "band_low": one.low,
-            "band_high": one.high,
-            "probability_best": one.probability_best,
-            "rank": one.rank,
+        columns: dict[str, Any] = {"selection": self.headline}
+        if self.selection is None or name in self.excluded:
+            return columns
+        standings = self.selection.standings
+        standing = next(row for row in standings if row.name == name)
+        columns |= {
+            "band_low": standing.low,
+            "band_high": standing.high,
+            "probability_best": standing.probability_best,
+            "rank": standing.rank,
             "candidates": len(standings),
         }
-        if one is self.selection.chosen:
-            found |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
-        return found
+        if standing is self.selection.chosen:
+            columns |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
+        return columns
 
 
 def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
@@ -188,30 +182,24 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
     Raises:
         InputError: the candidates' runs read the logs as different sessions or rewards.
     """
-    _require_same_sessions(reports)
-    standing = {name: one for name, one in reports.items() if one.verdict.reliable}
-    excluded = {
-        name: "; ".join(one.verdict.reasons)
-        for name, one in reports.items()
-        if not one.verdict.reliable
-    }
-    terms = {name: one.terms for name, one in standing.items() if one.terms is not None}
-    if not terms:
-        return Choice(None, excluded)
-    user = next(iter(standing.values())).user
-    columns = np.stack(list(terms.values()), axis=1)
-    return Choice(select(list(terms), columns, seed, user), excluded)
-
-
-def _require_same_sessions(reports: "Mapping[str, OffPolicyReport]") -> None:
-    (first, one), *others = reports.items()
-    for name, other in others:
-        if len(other.returns) != len(one.returns) or not np.allclose(other.returns, one.returns):
+    first, *names = reports
+    returns = reports[first].returns
+    for name in names:
+        again = reports[name].returns
+        if len(again) != len(returns) or not np.allclose(again, returns):
             raise InputError(
                 f"{first} and {name} read these logs as different sessions or rewards (their "
                 "stores were prepared in different ways), so their estimates cannot be compared; "
                 "evaluate them one at a time"
             )
+    verdicts = {name: report.verdict for name, report in reports.items()}
+    excluded = {name: "; ".join(v.reasons) for name, v in verdicts.items() if not v.reliable}
+    terms = {name: report.terms for name, report in reports.items() if name not in excluded}
+    columns = [values for values in terms.values() if values is not None]
+    if not columns:
+        return Choice(None, excluded)
+    user = reports[first].user
+    return Choice(select(list(terms), np.stack(columns, axis=1), seed, user), excluded)
 
 
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
@@ -223,19 +211,16 @@ def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
         candidates: of each, what it is made of, e.g. run, target return and rule.
     """
     differing = [
-        key for key in candidates[0] if len({str(one[key]) for one in candidates}) > 1
+        key for key in candidates[0] if len({str(parts[key]) for parts in candidates}) > 1
     ] or list(candidates[0])[:1]
-    columns = [_parts(key, [one[key] for one in candidates]) for key in differing]
-    return [", ".join(parts) for parts in zip(*columns, strict=True)]
 
+    def describe(key: str, value: object, digits: int) -> str:
+        if value is None:
+            return f"largest {key} expected"
+        return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)
 
-def _parts(key: str, values: Sequence[object]) -> list[str]:
-    """What the names say of one part of all candidates."""
-    short, full = ([_part(key, value, digits) for value in values] for digits in (6, 17))
-    return short if len(set(short)) == len(set(values)) else full
-
-
-def _part(key: str, value: object, digits: int) -> str:
-    if value is None:
-        return f"largest {key} expected"
-    return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)
+    short, full = (
+        [", ".join(describe(key, parts[key], digits) for key in differing) for parts in candidates]
+        for digits in (6, 17)
+    )
+    return short if len(set(short)) == len(short) else full

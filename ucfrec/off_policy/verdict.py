@@ -1,28 +1,30 @@
 """Whether to believe an off-policy estimate, and what it says: computed, in plain words."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from ucfrec.off_policy.diagnostics import ENOUGH_USERS, SESSION_PRODUCTS, Diagnosis, diagnose
-from ucfrec.off_policy.estimators import Estimate, Terms, session_terms
-from ucfrec.off_policy.intervals import Interval, cluster_intervals
+from ucfrec.off_policy.diagnostics import (
+    DOMINANT,
+    ENOUGH_REWARDED,
+    ENOUGH_USERS,
+    FAR_OFF,
+    HEAVY_TAIL,
+    MOST_LEFT_OUT,
+    SESSION_PRODUCTS,
+    Diagnosis,
+    diagnose,
+)
+from ucfrec.off_policy.estimators import session_terms
+from ucfrec.off_policy.intervals import cluster_intervals
 from ucfrec.off_policy.logged_steps import LoggedSteps
 
 BEST_FIRST: Final = ("DR", "SNPDIS")
 """The estimator that a verdict is about: the first of these that there is."""
-DOMINANT: Final = 0.1
-HEAVY_TAIL: Final = 0.5
-"""Pareto shape from which on the variance is infinite, and no interval means anything."""
-FAR_OFF: Final = 0.1
-"""A mean session weight further from 1 shows that the heaviest sessions are missing, or too many,
-though their number may be too small for a test to show it."""
-ENOUGH_REWARDED: Final = 30
-MOST_LEFT_OUT: Final = 0.05
-_SEEN_REMOVED: Final = (
+SEEN_REMOVED: Final = (
     "such as seen items, which serve excludes without --keep-seen: evaluate with --filter-seen"
 )
 OTHERS_REMOVED: Final = (
@@ -103,21 +105,22 @@ def conclude(
         filter_seen: whether the policy was evaluated without items that users had seen.
     """
     diagnosis = diagnosis or diagnose(steps)
-    reasons = [*forbidden, *_reasons(diagnosis, filter_seen)]
+    reasons = [*forbidden, *_list_reasons(diagnosis, filter_seen)]
     if wanted_lift is None:
         wanted_lift = 0.05 * abs(float(steps.returns.mean()))
-    terms: Mapping[str, Terms] = {}
-    if diagnosis.left_out < diagnosis.sessions:
-        known = steps.known()
-        terms = session_terms(known)
+    terms = {} if steps.lacking.all() else session_terms(steps.weighable)
     name = next((name for name in BEST_FIRST if name in terms), None)
     if name is None:
         nothing = (None,) * 5
         return Verdict(False, tuple(reasons), *nothing, wanted_lift, None, declared)
-    lifts = influences(terms[name]) - known.returns
-    (interval,) = cluster_intervals(lifts[:, None], np.ones((len(lifts), 1)), known.user, seed)
+    lifts = terms[name].influences - steps.weighable.returns
+    ones, user = np.ones((len(lifts), 1)), steps.weighable.user
+    (interval,) = cluster_intervals(lifts[:, None], ones, user, seed)
     if interval is None:
         reasons.append("the sessions do not differ enough for an interval")
+    sessions_needed = None
+    if interval is not None and wanted_lift > 0:
+        sessions_needed = math.ceil(len(lifts) * (_DETECTED * interval.error / wanted_lift) ** 2)
     return Verdict(
         reliable=not reasons,
         reasons=tuple(reasons),
@@ -127,114 +130,96 @@ def conclude(
         lift_high=None if interval is None else interval.high,
         probability_better=None if interval is None else interval.above_zero,
         wanted_lift=wanted_lift,
-        sessions_needed=_sessions_needed(interval, wanted_lift, len(lifts)),
+        sessions_needed=sessions_needed,
         declared=declared,
     )
 
 
-def influences(terms: Terms) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """(S,) whose mean is the estimate, and whose spread is its error to first order."""
-    value = terms.above.sum() / terms.below.sum()
-    return np.asarray(value + (terms.above - value * terms.below) / terms.below.mean())
-
-
-def cautions(diagnosis: Diagnosis, found: Mapping[str, Estimate]) -> list[str]:
+def list_cautions(diagnosis: Diagnosis, estimators: Iterable[str]) -> list[str]:
     """What to know of an estimate that may stand all the same."""
-    said = []
+    cautions = []
     if diagnosis.left_out and diagnosis.left_out < diagnosis.sessions:
-        said.append(
+        cautions.append(
             f"{diagnosis.left_out:,} of {diagnosis.sessions:,} sessions have a step without "
             "propensity: estimates that weigh leave these sessions out"
         )
     stops = diagnosis.unsupported_from_step
     if stops is not None:
-        said.append(
+        cautions.append(
             f"from step {stops} on fewer than {ENOUGH_USERS} effective users are left: the logs "
             "do not support an estimate there"
         )
-    if "DM" in found:
-        said.append("DM and FQE are only as good as their models: they carry no interval")
-    if "MIPS" in found:
-        said.append(
+    if "DM" in estimators:
+        cautions.append("DM and FQE are only as good as their models: they carry no interval")
+    if "MIPS" in estimators:
+        cautions.append(
             "MIPS is right only if the reward of an item depends on its group alone: no interval"
         )
-    return said
+    return cautions
 
 
-def _reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
+def _list_reasons(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
     """What forbids a conclusion, the gravest first."""
     if diagnosis.overlap is None:
         return ["no session has all its propensities, so nothing can be weighed"]
-    said = []
+    reasons = []
     if diagnosis.left_out > MOST_LEFT_OUT * diagnosis.sessions:
-        said.append(
+        reasons.append(
             f"{diagnosis.left_out / diagnosis.sessions:.0%} of the sessions have a step without "
             f"propensity (above {MOST_LEFT_OUT:.0%}), and may differ from the rest"
         )
-    failed, mean = _failed_tests(diagnosis, filter_seen), diagnosis.mean_weight
-    said += failed
-    if not failed and mean is not None and abs(mean - 1) > FAR_OFF:
-        said.append(
+    mean = diagnosis.mean_weight
+    if any(not test.passed for test in diagnosis.tests):
+        reasons.append(_explain_failure(diagnosis, filter_seen))
+    elif mean is not None and abs(mean - 1) > FAR_OFF:
+        reasons.append(
             f"the mean session weight is {mean:.2f} where 1 is expected: at random, sessions that "
             f"the policy would often have are too {'rare' if mean < 1 else 'many'}; give more logs"
         )
     if not diagnosis.rewarded_users:
-        said.append("no session has both weight and reward: the logs support no estimate")
+        reasons.append("no session has both weight and reward: the logs support no estimate")
     elif diagnosis.rewarded_users < ENOUGH_REWARDED:
-        said.append(
+        reasons.append(
             f"only {diagnosis.rewarded_users} users have both weight and reward (below "
             f"{ENOUGH_REWARDED})"
         )
     if diagnosis.effective_users < ENOUGH_USERS:
-        said.append(
+        reasons.append(
             f"the weights leave {diagnosis.effective_users:,.0f} effective of {diagnosis.users:,} "
             f"users (below {ENOUGH_USERS})"
         )
     if diagnosis.largest_weight > DOMINANT:
-        said.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
+        reasons.append(f"one user has {diagnosis.largest_weight:.0%} of all weight")
     if diagnosis.tail is not None and diagnosis.tail > HEAVY_TAIL:
-        said.append(
+        reasons.append(
             f"the weights have too heavy a tail (Pareto k {diagnosis.tail:.2f}, above {HEAVY_TAIL})"
         )
-    return said
+    return reasons
 
 
-def _failed_tests(diagnosis: Diagnosis, filter_seen: bool) -> list[str]:
+def _explain_failure(diagnosis: Diagnosis, filter_seen: bool) -> str:
+    """What the worst of the failed tests shows."""
     failed = [test for test in diagnosis.tests if not test.passed]
-    if not failed:
-        return []
     # The products show the size of the error; else the test that is furthest off.
-    worst = next((t for t in failed if t.name == SESSION_PRODUCTS), None) or max(
+    worst = next((test for test in failed if test.name == SESSION_PRODUCTS), None) or max(
         failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
     )
-    alone = failed == [worst] and worst.name == SESSION_PRODUCTS
-    if worst.mean < 1 and alone and _few_weigh(diagnosis):
+    alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
+    if worst.mean >= 1:
+        return f"{worst}, where 1 is expected: propensities are too small"
+    if alone and diagnosis.few_weigh:
         cause = (
             "sessions that the policy would often have may be too rare in these logs: give more "
             "logs; or the logs lack choices that the policy makes"
         )
-    elif worst.mean < 1:
-        lacks = OTHERS_REMOVED if filter_seen else _SEEN_REMOVED
-        cause = (
-            f"the logs lack choices that the policy makes ({lacks}), or propensities are too large"
-        )
     else:
-        cause = "propensities are too small"
-    said = f"{worst}, where 1 is expected: {cause}"
-    if worst.mean < 1 and diagnosis.bounds is not None:
-        low, high = diagnosis.bounds
-        said += f" (if they are right, the value lies between {low:.4g} and {high:.4g})"
-    return [said]
-
-
-def _few_weigh(diagnosis: Diagnosis) -> bool:
-    """Whether the tests of weights, which take means for normal, reject too often: few users have
-    most of the weight."""
-    heavy = diagnosis.tail is not None and diagnosis.tail > HEAVY_TAIL
-    return heavy or diagnosis.effective_users < ENOUGH_USERS
-
-
-def _sessions_needed(interval: Interval | None, lift: float, sessions: int) -> int | None:
-    if interval is None or lift <= 0:
-        return None
-    return math.ceil(sessions * (_DETECTED * interval.error / lift) ** 2)
+        removed = OTHERS_REMOVED if filter_seen else SEEN_REMOVED
+        cause = (
+            f"the logs lack choices that the policy makes ({removed}), or propensities are too "
+            "large"
+        )
+    reason = f"{worst}, where 1 is expected: {cause}"
+    if diagnosis.bounds is None:
+        return reason
+    low, high = diagnosis.bounds
+    return f"{reason} (if they are right, the value lies between {low:.4g} and {high:.4g})"

@@ -15,12 +15,12 @@ import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arguments import (
-    checked,
-    of_kind,
+    check_arguments,
+    require_kind,
+    require_list,
     require_number,
     require_seed,
     require_whole,
-    several,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
@@ -44,10 +44,9 @@ from ucfrec.off_policy.evaluate import (
     OffPolicyReport,
     evaluate_off_policy,
 )
-from ucfrec.off_policy.score import score
-from ucfrec.off_policy.training_rows import seen_too_often, share_seen
+from ucfrec.off_policy.score import score, seen_too_often, share_seen
 from ucfrec.policies.registry import policy_class
-from ucfrec.provenance import without_folders
+from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,
@@ -73,22 +72,22 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
-_checked: Final = checked(
+_checked: Final = check_arguments(
     {
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,
         **dict.fromkeys(("gap_minutes", "window_days"), require_number),
         **dict.fromkeys(
-            ("reward", "session_by", "dataset", "screen", "liked"), of_kind("text", str)
+            ("reward", "session_by", "dataset", "screen", "liked"), require_kind("text", str)
         ),
-        **dict.fromkeys(("out", "run", "folder", "file"), of_kind("a path", str, Path)),
-        **dict.fromkeys(("on_step", "on_validation"), of_kind("a function", Callable)),
+        **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
+        **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
         "split": split_given,
-        "histories": of_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
-        "rule": of_kind("a DecisionRule", DecisionRule),
-        "options": of_kind("EstimateOptions", EstimateOptions),
-        "environment": of_kind("the name of a simulator or an Environment", str, Environment),
+        "histories": require_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
+        "rule": require_kind("a DecisionRule", DecisionRule),
+        "options": require_kind("EstimateOptions", EstimateOptions),
+        "environment": require_kind("the name of a simulator or an Environment", str, Environment),
     }
 )
 """Decorator of methods: the check of each argument by its name."""
@@ -388,7 +387,7 @@ class Recommender:
             InputError: the recommender is not trained, the logs cannot be used, or another policy
                 has another catalogue.
         """
-        beside = several("others", others, "a Recommender", Recommender)
+        beside = require_list("others", others, "a Recommender", Recommender)
         trained, *rest = (each._evaluated(logs) for each in (self, *beside))
         require_one_catalogue([trained, *rest])
         with in_words_of_python():
@@ -459,7 +458,7 @@ class Recommender:
             InputError: the recommender is not trained, or the environment does not fit it.
         """
         trained = self.trained
-        beside = several("behaviors", behaviors, "the name of a behavior", str)
+        beside = require_list("behaviors", behaviors, "the name of a behavior", str)
         simulated = Environment(environment) if isinstance(environment, str) else environment
         about = episodes, seed
         own = evaluate_policy(simulated, trained, trained.name, *about, rule)
@@ -576,7 +575,7 @@ class Recommender:
         what = "what evaluate or ope returned, or files of it"
         kinds = (Evaluation, OffPolicyReport, Path, str)
         listed = [results] if isinstance(results, ResultTable) else results
-        given: list[ResultTable | Path | str] = several("results", listed, what, *kinds)
+        given: list[ResultTable | Path | str] = require_list("results", listed, what, *kinds)
         with tempfile.TemporaryDirectory() as scratch:
             files = []
             for number, result in enumerate(given):
@@ -639,4 +638,4 @@ def _named(logs: Logs | None) -> str:
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
     listed = [files] if isinstance(files, (str, Path)) else files
-    return ", ".join(without_folders(str(file)) for file in listed)
+    return ", ".join(shorten_paths(str(file)) for file in listed)

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, Protocol
 
 from ucfrec.errors import InputError
-from ucfrec.processes import Interrupted, interruptions_raised, without_ctrl_c
+from ucfrec.processes import Interrupted, block_ctrl_c, interruptions_raised
 
 METRICS: Final = "PROMETHEUS_MULTIPROC_DIR"
 """Environment variable of the folder in which workers share their metrics."""
@@ -198,7 +198,7 @@ class Workers:
         given = self._work, self._listening, theirs, first, self._folder.name
         process = _SPAWN.Process(target=_begin, args=given, daemon=True)
         self._workers.append(_Worker(process, ours))
-        with without_ctrl_c():  # it reaches every process of a terminal; this one ends the others
+        with block_ctrl_c():  # it reaches every process of a terminal; this one ends the others
             process.start()
         theirs.close()
 

@@ -17,7 +17,7 @@ from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.off_policy.evaluate import OffPolicyReport
-from ucfrec.provenance import config_hash, without_folders
+from ucfrec.provenance import config_hash, shorten_paths
 from ucfrec.reporting.tables import Table, format_value, markdown_table
 from ucfrec.results.row import ResultRow
 from ucfrec.results.table import Ranking
@@ -90,7 +90,7 @@ def add_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -> No
     rows = {row.method: row for row in report.rows}
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
     names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
-    files = ", ".join(map(without_folders, logs))
+    files = ", ".join(map(shorten_paths, logs))
     of = f"{row.method} on {files}, {_format_rule(row)}"
     of += ", pages" if row.conditions["pages"] else ""
     discount = row.conditions["discount"]

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, read_json, write_json
-from ucfrec.files.locks import claim, claimed, remove_leftovers
+from ucfrec.files.locks import claim, lock_path, remove_leftovers
 from ucfrec.provenance import config_hash
 from ucfrec.results.row import ResultRow, RowKey, row_from_json
 
@@ -132,7 +132,7 @@ def benchmarking(path: Path) -> Iterator[None]:
     Raises:
         InputError: another command does; the message names it.
     """
-    with claimed(path, "filled", part="benchmark"):
+    with lock_path(path, "filled", part="benchmark"):
         remove_leftovers(path.parent)
         yield
 

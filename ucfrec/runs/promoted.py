@@ -74,14 +74,14 @@ def promote(run: Path, force: bool = False) -> Promoted:
     with claim(folder / POINTER, wait=True):
         before = promoted(folder)
         if before is None:
-            return _current(run, ()).written(folder)
+            return _current(run, ()).write(folder)
         fingerprint = TrainedPolicy.load(run).fingerprint
         again = before.current == run.name
         if not force and not (again and before.fingerprint in ("", fingerprint)):
             _require_verdict(run, record, before.run(folder))
         previous = before.previous if again else (*before.previous, before.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
-        return _current(run, previous).written(folder)
+        return _current(run, previous).write(folder)
 
 
 def promote_back(folder: Path) -> Promoted:
@@ -96,7 +96,7 @@ def promote_back(folder: Path) -> Promoted:
             raise InputError(f"{folder}: no run was current before; promote one")
         back = Promoted(files={}, current=before.previous[-1]).run(folder)
         verified(back)
-        return _current(back, before.previous[:-1]).written(folder)
+        return _current(back, before.previous[:-1]).write(folder)
 
 
 def _current(run: Path, previous: tuple[str, ...]) -> Promoted:

@@ -56,7 +56,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     record = train_run(store, out, _settings(trained), about, refit_of=first)
     if not distributed.leads():
         return record
-    record = record.reopened(out, INPUTS)
+    record = record.reopen(out, INPUTS)
     shutil.copyfile(first / RULE, out / RULE)
     if trained.reward_model is not None:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
@@ -66,7 +66,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         name: getattr(trained.record, name)
         for name in ("rule", "reward_model", "screening", "update")
     }
-    return record.with_entries(**chosen).sealed(out)
+    return record.copy_with(**chosen).seal(out)
 
 
 def refit_within(store: EpisodeStore, run: Path) -> RunRecord:

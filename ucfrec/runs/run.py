@@ -24,7 +24,7 @@ from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import Overlay
 from ucfrec.files.atomic import write_json
-from ucfrec.files.locks import claimed, remove_leftovers, remove_leftovers_within
+from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.policies.base import SequencePolicy
@@ -122,7 +122,7 @@ def train_run(
             too few training episodes or constant rewards, or the policy does not support its
             actions, or another process is training in `out`.
     """
-    with claimed(out, "trained") if distributed.leads() else nullcontext():
+    with lock_path(out, "trained") if distributed.leads() else nullcontext():
         if distributed.leads():
             remove_leftovers(out.parent)
             remove_leftovers_within(out)
@@ -138,12 +138,12 @@ def train_run(
             return run.record
         _require_whole(run.policy, run.train, config)
         chosen = run.record.rule is not None and run.record.policy == fit
-        record = run.record.with_entries(augmentation=augmentation, policy=fit)
+        record = run.record.copy_with(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
-            record = record.with_entries(**_selected(run, initial))
+            record = record.copy_with(**_selected(run, initial))
         _write_samples(run)
         seconds = record.wall_time_s + time.perf_counter() - begun
-        return record.with_entries(wall_time_s=seconds).sealed(out)
+        return record.copy_with(wall_time_s=seconds).seal(out)
 
 
 def _selected(run: _Inputs, initial: Path | None) -> dict[str, Any]:
@@ -176,13 +176,13 @@ def _prepare_inputs(
         _require_whole(policy, train, config)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
-        record = RunRecord.read(out).reopened(out, INPUTS)
+        record = RunRecord.read(out).reopen(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
     else:
         record = RunRecord.read(out)
     # The store may have been moved, or prepared again.
     place = {name: about.get(name, at) for name, at in place_of(store.path, out).items()}
-    record = record.with_entries(config=config, **place)
+    record = record.copy_with(config=config, **place)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:

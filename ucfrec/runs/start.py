@@ -155,7 +155,7 @@ def begin(
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
             entries["reference_losses"] = reference_losses(counts, validation)
-        RunRecord.of(entries, out / RUN).sealed(scratch)
+        RunRecord.of(entries, out / RUN).seal(scratch)
 
 
 @random_state_kept()

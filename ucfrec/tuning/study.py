@@ -21,10 +21,10 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import LikedByRange
 from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.files.locks import claimed
+from ucfrec.files.locks import lock_path
 from ucfrec.fitting.loop import Callbacks
-from ucfrec.processes import pool_of_processes, without_ctrl_c
-from ucfrec.progress import labelled
+from ucfrec.processes import block_ctrl_c, pool_of_processes
+from ucfrec.progress import label_progress
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
@@ -146,7 +146,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     store = EpisodeStore.open(plan.store)
     if plan.metric == VALUE:
         _require_values(plan.search, store)
-    with claimed(plan.out, "tuned"):
+    with lock_path(plan.out, "tuned"):
         plan.out.mkdir(parents=True, exist_ok=True)
         study: Study = optuna.create_study(
             storage=plan.storage, study_name=_NAME, direction="maximize", load_if_exists=True
@@ -229,7 +229,7 @@ def _searched(plan: Plan, shares: Sequence[tuple[int, int]], begun: int) -> None
         return
     threads = partial(torch.set_num_threads, max(1, torch.get_num_threads() // len(shares)))
     with pool_of_processes(len(shares), threads) as pool:
-        with without_ctrl_c():
+        with block_ctrl_c():
             ended = [pool.submit(_run_trials, plan, *share, begun) for share in shares]
         for each in ended:
             each.result()
@@ -262,7 +262,7 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
         config = plan.search.config(policy, values)
         run = plan.out / f"{TRIAL}{config_hash(asdict(config))}"
         shared, heard = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
-        with labelled(f"trial {trial.number}"):
+        with label_progress(f"trial {trial.number}"):
             train_run(store, run, config, shared=shared, callbacks=heard)
             found = measured(TrainedPolicy.load(run), store, plan.metric, plan.k)
     except InputError as error:

@@ -12,7 +12,7 @@ from ucfrec import schema
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.locks import claimed
+from ucfrec.files.locks import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
@@ -84,7 +84,7 @@ def update_run(
     before = _store_before(run, trained)
     _require_update(out, run, trained)
     grown = store or out.with_name(out.name + STORE_SUFFIX)
-    with claimed(grown, "updated"):
+    with lock_path(grown, "updated"):
         counts = append_logs(before.path, paths, grown, mapping, options.append)
     opened = without_columns(EpisodeStore.open(grown), trained.dropped)
     full = _from_nothing(trained.record)
@@ -128,7 +128,7 @@ def _compared(
     seen = UserRows.of(rows, rows.episode_values(schema.USER), others) if filter_seen else None
     verdict = compare_runs(new, acting, rows, seed, seen)
     update = record.update.model_copy(update={"drift": found, "verdict": verdict})
-    return record.with_entries(update=update).written(out)
+    return record.copy_with(update=update).write(out)
 
 
 def _require_update(out: Path, run: Path, trained: TrainedPolicy) -> None:

@@ -5,17 +5,13 @@ from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec_control.benchmark.methods import (
-    CONTEXTS,
     EQUAL_TIME,
     LAMBDA,
     LONGER,
     MAIN,
     PURSUING,
-    RATES,
     ROBUSTNESS,
-    SPREAD,
     TABLES,
-    WITH_HISTORY,
     WITH_TIME,
     WITHOUT_TIME,
 )
@@ -36,26 +32,10 @@ MEDIUM: Final = tuple(f"{task}_medium-zoo" for task in _TASKS)
 """Files of Appendix G.4."""
 _SWEPT: Final = ("hopper_medium-zoo", "halfcheetah_medium-zoo")
 """Files of Tables 9 and 10."""
-_TRIED: Final = ("halfcheetah_medium-expert-zoo", "hopper_medium-zoo", "walker2d_mixed-zoo")
-"""Files of the searches for learning rates and contexts: each task and kind of data once."""
-_SPREAD: Final = ("hopper_medium-zoo", "walker2d_medium-zoo", "hopper_mixed-zoo")
-"""Files on which scores vary most between trainings."""
 _FEWER: Final = {
     **{table: _SWEPT for table in TABLES if table not in (MAIN, PURSUING, EQUAL_TIME, LAMBDA)},
     ROBUSTNESS: MEDIUM,
-    RATES: _TRIED,
-    CONTEXTS: _TRIED,
-    SPREAD: _SPREAD,
 }
-TRIED_CONTEXTS: Final = (8, 20)
-SEARCH_SEED: Final = 2000
-"""Seed of the episodes by which contexts are chosen, other than that of reported scores."""
-TRIED_RATES: Final = {
-    "small": (2e-3, 6e-3, 2e-2),
-    "medium": (3e-4, 1e-3, 3e-3),
-    "full": (1e-4, 3e-4, 1e-3),
-}
-"""Learning rates that are tried, by the name of the budget."""
 BUDGETS: Final = {
     # Batches, steps and width are reduced; no file and no method is excluded.
     # At a quarter of the steps sequence policies are below cloning (benchmarks/LOG.md).
@@ -65,7 +45,7 @@ BUDGETS: Final = {
         tasks=ZOO,
         tasks_of={**_FEWER, LAMBDA: _SWEPT},
         seeds=4,
-        seeds_in={ROBUSTNESS: 2, RATES: 1},
+        seeds_in={ROBUSTNESS: 2},
         evaluation=Evaluation(episodes=20, seed=1000),
         settings=(
             "train.steps=4000",
@@ -104,7 +84,7 @@ BUDGETS: Final = {
         tasks_of=_FEWER,
         methods=WITHOUT_TIME,
         seeds=2,
-        seeds_in={ROBUSTNESS: 2, RATES: 1, CONTEXTS: 1, SPREAD: 4},
+        seeds_in={ROBUSTNESS: 2},
         evaluation=Evaluation(episodes=50, seed=1000),
         settings=(
             "train.steps=10000",
@@ -134,7 +114,6 @@ BUDGETS: Final = {
         optional=ANTMAZE,
         tasks_of=_FEWER,
         seeds=5,
-        seeds_in={RATES: 1},
         evaluation=Evaluation(episodes=100, seed=1000, all_targets=True),
         of_policies=dict.fromkeys(ALGORITHMS, ("steps=1000000",)),
         of_methods=_longer(100_000),
@@ -144,18 +123,15 @@ BUDGETS: Final = {
 
 
 def budget_of(table: str, name: str) -> Budget:
-    """The budget `name` of a table of scores, of the robustness table or of the search for rates,
-    with its tasks as `Budget.tasks`."""
+    """The budget `name` of a table of scores or of the robustness table, with its tasks as
+    `Budget.tasks`."""
     budget = BUDGETS[name]
-    methods_of = {MAIN: budget.methods, SPREAD: budget.methods, CONTEXTS: WITH_HISTORY}
-    searched = replace(budget.evaluation, seed=SEARCH_SEED)
-    evaluation = searched if table == CONTEXTS else budget.evaluation
     every = budget.evaluation.all_targets and table in (MAIN, PURSUING, EQUAL_TIME)
     return replace(
         budget,
         tasks=budget.tasks_in(table),
         tasks_of={},
         seeds=budget.seeds_in.get(table, budget.seeds),
-        methods=methods_of.get(table, ()),
-        evaluation=replace(evaluation, all_targets=every),
+        methods=budget.methods if table == MAIN else (),
+        evaluation=replace(budget.evaluation, all_targets=every),
     )

@@ -6,23 +6,17 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ucfrec.benchmark.cells import Cell, measured_by, opened, training_config
-from ucfrec.fitting.loop import SILENT
-from ucfrec.provenance import provenance
 from ucfrec.results.row import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.benchmark.robustness import verdicts
-from ucfrec_control.benchmark.spread import AVERAGING, BACK
 from ucfrec_control.data.distractor import CLEAN
-from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.training.evaluate import evaluate_run, held_out_losses
-from ucfrec_control.training.kept import WEIGHTS, checkpoint_name, keeping, kept_steps
 from ucfrec_control.training.rl_baselines import (
     ALGORITHMS,
     RLConfig,
     RLRecord,
-    action_loss,
     plain_config,
     rl_config,
     train_rl,
@@ -33,10 +27,8 @@ TARGET: Final = "target"
 """Condition of rows of budgets with several target returns."""
 DISTRACTOR: Final = "distractor"
 """Condition of rows of the robustness table: a key of `DISTRACTORS`."""
-CONTEXT: Final = "context"
-"""Condition of rows of the search for contexts."""
 RATE: Final = "learning_rate"
-"""Condition of rows of the search for rates."""
+"""Field of a configuration, and condition of rows, that holds a learning rate."""
 
 
 def config(cell: Cell) -> dict[str, Any] | None:
@@ -48,7 +40,7 @@ def config(cell: Cell) -> dict[str, Any] | None:
 
 def rl_config_of(cell: Cell) -> RLConfig:
     """The configuration of an IQL or CQL training, whose settings are `field=value` in JSON."""
-    parts = (each.partition("=") for each in cell.settings)
+    parts = (setting.partition("=") for setting in cell.settings)
     settings = {name: json.loads(value) for name, _, value in parts}
     return rl_config(dataset_of(opened(cell)), cell.policy, **settings)
 
@@ -63,30 +55,23 @@ def targets_of(cell: Cell) -> Sequence[float]:
     """The target returns of the preset, or the first; empty if the policy knows its own."""
     if cell.policy not in ALGORITHMS and cell.config.policy.max_return:
         return ()
-    found = preset_of(dataset_of(opened(cell)), cell.policy).targets
-    return found if cell.evaluation.all_targets else found[:1]
+    targets = preset_of(dataset_of(opened(cell)), cell.policy).targets
+    return targets if cell.evaluation.all_targets else targets[:1]
 
 
-def _train(cell: Cell) -> RunRecord | RLRecord:
+def train(cell: Cell) -> RunRecord | RLRecord:
     """Train the policy of the cell; returns the record of its run."""
     assert cell.run is not None
     store = opened(cell)
     if cell.policy in ALGORITHMS:
         return train_rl(store, cell.run, rl_config_of(cell), seed_of(cell))
-    config = cell.config
-    callbacks = keeping(cell.run, config.train) if config.train.average else SILENT
-    return train_control(
-        *(store, cell.run, config),
-        screening=cell.screening,
-        shared=cell.shared,
-        callbacks=callbacks,
-    )
+    return train_control(store, cell.run, cell.config, screening=cell.screening, shared=cell.shared)
 
 
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train, and evaluate every kept checkpoint; returns one row for each, and for each target."""
     assert cell.run is not None
-    _train(cell)
+    train(cell)
     evaluations = evaluate_run(
         cell.run,
         episodes=cell.evaluation.episodes,
@@ -100,33 +85,10 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [replace(r, conditions={**r.conditions, TARGET: r.target_return}) for r in rows]
 
 
-def measure_spread(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    """Train, and evaluate one of the last checkpoints; returns a row of its raw weights and one of
-    its averaged ones."""
-    assert cell.run is not None
-    _train(cell)
-    step = kept_steps(cell.config.train)[int(str(cell.conditions[BACK]))]
-    rows = []
-    for weights in WEIGHTS:
-        name = checkpoint_name(weights, step)
-        evaluations = evaluate_run(
-            cell.run,
-            episodes=cell.evaluation.episodes,
-            seed=cell.evaluation.seed,
-            targets=targets_of(cell),
-            checkpoints=(name,),
-        )
-        losses = held_out_losses(TrainedPolicy.load(cell.run, name), opened(cell))
-        more = {"step": step, "loss": losses["loss"]}
-        row = evaluations[0].of(row_key).extended(more)
-        rows.append(replace(row, conditions={**row.conditions, AVERAGING: weights}))
-    return rows
-
-
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train with the distractor, and evaluate with it fixed to 0 and to 1; returns one row."""
     assert cell.run is not None
-    record, store = _train(cell), opened(cell)
+    record, store = train(cell), opened(cell)
     # The last checkpoint: the best one is chosen on data in which the distractor varies.
     # All evaluations have the same initial states, with and without distractor.
     evaluations = [
@@ -147,25 +109,5 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [evaluations[0].of(row_key).extended(more)]
 
 
-def measure_rate(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    """Train at a learning rate; returns a row with the validation loss."""
-    assert cell.run is not None
-    record = _train(cell)
-    if isinstance(record, RunRecord):
-        loss = record.finished.best_validation
-    else:
-        loss = action_loss(cell.run, opened(cell))
-    row = ResultRow(
-        **vars(row_key),
-        metric="validation_loss",
-        metrics={"validation_loss": loss, "steps": float(record.finished.steps)},
-        wall_time_s=record.wall_time_s,
-        **provenance(PACKAGES),
-    )
-    return [row]
-
-
 SCORE_MEASUREMENT: Final = measured_by(measure_scores, config)
-SPREAD_MEASUREMENT: Final = measured_by(measure_spread, config)
 ROBUSTNESS_MEASUREMENT: Final = measured_by(measure_robustness, config)
-RATE_MEASUREMENT: Final = measured_by(measure_rate, config)

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 from ucfrec.benchmark.cells import Method, augmented_ucf
 
-SCORES, ROBUSTNESS, RATES = "control", "robustness", "rates"
-CONTEXTS, SPREAD = "contexts", "spread"
+SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
 Methods = dict[str, Method]
 _NO_TIME = "policy.max_timestep=1"
@@ -44,8 +43,6 @@ WITHOUT_TIME = (
     *("bc", "bc-10", "bc-25"),
 )
 """Methods of a training long enough to be trusted: one of each architecture, and cloning."""
-WITH_HISTORY = ("ucf-wo-count", "dc-wo-time", "dt-wo-time", "lsdt-wo-time")
-"""One of those of each policy that takes a history."""
 WITH_TIME = ("dt", "dc", "lsdt", "ucf-w-time")
 """Methods with embeddings of time steps of which there is one without."""
 

@@ -1,31 +1,28 @@
-"""Which cells the control tables have: scores, learning rates and robustness to distractors."""
+"""Which cells the control tables have, and the settings of each training."""
 
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from importlib.resources import files
 from pathlib import Path
+from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Cell, Method, Task
 from ucfrec.benchmark.grid import chosen
 from ucfrec.benchmark.plan import Plan, Presets
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
-from ucfrec_control.benchmark.budgets import TRIED_CONTEXTS, TRIED_RATES
-from ucfrec_control.benchmark.measure import CONTEXT, DISTRACTOR, RATE
+from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import (
-    CONTEXTS,
-    MAIN,
-    RATES,
+    METHODS,
+    METHODS_WO_TIME,
     ROBUST,
     ROBUSTNESS,
     SCORES,
-    SPREAD,
     TABLES,
+    Methods,
 )
-from ucfrec_control.benchmark.rates import SEARCHED, settings_of
-from ucfrec_control.benchmark.spread import BACK
 from ucfrec_control.data.distractor import DISTRACTORS, zoo_store
-from ucfrec_control.training.kept import KEPT, kept_steps
 from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
 
@@ -49,7 +46,7 @@ def score_cells(
     Raises:
         InputError: a file is missing, or a method is not in the table.
     """
-    selected = _selected(TABLES[table], methods or budget.methods)
+    selected = _select(TABLES[table], methods or budget.methods)
     plan = _plan(SCORES, folder, budget)
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
@@ -57,46 +54,12 @@ def score_cells(
             yield from plan.trained(table, Task(file, store), selected)
 
 
-def context_cells(
-    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = ()
-) -> Iterator[Cell]:
-    """The cells of methods of the main table with each of `TRIED_CONTEXTS`; arguments and errors as
-    of `score_cells`, which shares the runs of the context that it is given."""
-    names = methods or budget.methods
-    for context in TRIED_CONTEXTS:
-        given = with_contexts(budget, dict.fromkeys(names, context))
-        for cell in score_cells(data, folder, given, MAIN, names):
-            yield replace(cell, suite=CONTEXTS, table=CONTEXTS, conditions={CONTEXT: context})
-
-
-def with_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
+def set_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
     """`budget` with contexts of single methods."""
     settings = dict(budget.of_methods)
     for name, context in contexts.items():
         settings[name] = (*settings.get(name, ()), f"policy.context={context}")
     return replace(budget, of_methods=settings)
-
-
-def spread_cells(
-    data: Path, folder: Path, budget: Budget, methods: Sequence[str] = (), checkpoints: int = KEPT
-) -> Iterator[Cell]:
-    """A cell for each of the last checkpoints of the trainings of the main table.
-
-    Args:
-        data, folder, budget, methods: as of `score_cells`, whose runs they share.
-        checkpoints: number of last checkpoints, at most `KEPT`.
-
-    Raises:
-        InputError: as `score_cells`, or a method is trained without averaging.
-    """
-    for cell in score_cells(data, folder, budget, MAIN, methods):
-        if cell.policy in ALGORITHMS or not cell.config.train.average:
-            raise InputError(
-                f"{cell.method} of budget {budget.name} is trained without train.average, so it "
-                "has no averaged weights; name another --method, or --budget medium"
-            )
-        for back in range(min(checkpoints, len(kept_steps(cell.config.train)))):
-            yield replace(cell, suite=SPREAD, table=SPREAD, conditions={BACK: back})
 
 
 def robustness_cells(
@@ -108,7 +71,7 @@ def robustness_cells(
 ) -> Iterator[Cell]:
     """The cells of some methods of `ROBUST` and distractors (empty for all); arguments and errors
     as of `score_cells`."""
-    selected = _selected(ROBUST, methods)
+    selected = _select(ROBUST, methods)
     plan = _plan(ROBUSTNESS, folder, budget)
     for file in budget.tasks:
         for distractor in distractors or DISTRACTORS:
@@ -117,59 +80,73 @@ def robustness_cells(
             yield from plan.trained(ROBUSTNESS, task, selected)
 
 
-def rate_cells(
-    data: Path,
-    folder: Path,
-    budget: Budget,
-    methods: Sequence[str] = (),
-    steps: int | None = None,
-) -> Iterator[Cell]:
-    """The cells of every method at every rate, without augmentation and evaluation.
-
-    Args:
-        data, folder, budget: as of `score_cells`.
-        methods: some of `SEARCHED`; empty for all.
-        steps: updates of a training; None for the budget's.
-
-    Raises:
-        InputError: a file is missing or has no validation trajectories, or a method is unknown.
-    """
-    selected = _selected(SEARCHED, methods)
-    budget = replace(budget, evaluation=replace(budget.evaluation, episodes=0))
-    for file in budget.tasks:
-        store = zoo_store(data, stores_of(folder), file)
-        if not EpisodeStore.open(store).split("validation").n_episodes:
-            raise InputError(
-                f"{file} has too few trajectories for validation, by which rates are chosen; name "
-                "a larger file with --file"
-            )
-        for rate in TRIED_RATES[budget.name]:
-            plan = replace(
-                _plan(RATES, folder, budget), settings=partial(_at_rate, budget, rate, steps)
-            )
-            task = Task(file, store, conditions={RATE: rate})
-            yield from plan.trained(f"{rate:g}", task, selected)
-
-
 def _plan(suite: str, folder: Path, budget: Budget) -> Plan:
-    return Plan(suite, folder / budget.name, budget, partial(settings_of, budget), _presets)
+    return Plan(suite, folder / budget.name, budget, partial(settings_of, budget), presets_of)
 
 
-def _presets(store: EpisodeStore, policy: str) -> Presets:
+def presets_of(store: EpisodeStore, policy: str) -> Presets:
+    """The presets of a policy for the dataset of a store; none of d3rlpy's algorithms."""
     return {} if policy in ALGORITHMS else preset_of(dataset_of(store), policy).tables
 
 
-def _at_rate(
-    budget: Budget, rate: float, steps: int | None, name: str, method: Method
-) -> tuple[str, ...]:
-    """Settings of a training without augmentation at a rate."""
-    own = budget.of_policies.get(method.policy, ())
-    if method.policy in ALGORITHMS:
-        return (*own, *([] if steps is None else [f"steps={steps}"]), f"{RATE}={rate:g}")
-    shorter = [] if steps is None else [f"train.steps={steps}", f"train.validate_every={steps}"]
-    searched = ("augment.copies=0", *shorter, f"train.{RATE}={rate:g}")
-    return (*budget.settings, *own, *method.settings, *searched)
-
-
-def _selected(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
+def _select(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
     return {name: methods[name] for name in chosen(methods, names, "method")}
+
+
+def _time_settings(settings: Sequence[str]) -> tuple[str, ...]:
+    return tuple(setting for setting in settings if setting.startswith("policy.max_timestep"))
+
+
+def _find_tuned() -> Methods:
+    """The methods of the main table that can have a learning rate of their own: one for each policy
+    with embeddings of time, and one without."""
+    methods: dict[tuple[str, tuple[str, ...]], str] = {}
+    for name, method in METHODS.items():
+        methods.setdefault((method.policy, _time_settings(method.settings)), name)
+    return {name: METHODS[name] for name in methods.values()}
+
+
+_TUNED: Final = _find_tuned()
+SEARCHED: Final = {
+    name: method
+    for name, method in _TUNED.items()
+    if METHODS_WO_TIME.get(method.policy, name) == name
+}
+"""The methods whose learning rate is searched; others take the rate chosen for their policy."""
+
+
+@cache
+def chosen_rates(budget: str) -> Mapping[str, float]:
+    """The learning rate of each method of `SEARCHED`, chosen on validation loss by
+    `benchmarks/control_search.py`; empty for a budget without a search."""
+    text = files("ucfrec_control.benchmark").joinpath("rates.toml").read_text(encoding="utf-8")
+    rates: Mapping[str, float] = tomllib.loads(text).get(budget, {})
+    return rates
+
+
+def settings_of(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
+    """Settings of a training over its presets: the budget's, the chosen rate, the method's own."""
+    policy_settings = budget.of_policies.get(method.policy, ())
+    rate = _rate_of(budget, method)
+    if method.policy in ALGORITHMS:
+        return (*policy_settings, *(() if rate is None else (f"{RATE}={rate:g}",)))
+    searched = () if rate is None else (f"train.{RATE}={rate:g}",)
+    longer = budget.of_methods.get(name, ())
+    return (*budget.settings, *policy_settings, *searched, *method.settings, *longer)
+
+
+def _rate_of(budget: Budget, method: Method) -> float | None:
+    """The chosen rate of a method, or of another one of its policy; None if there is none."""
+    time = _time_settings(method.settings)
+    if method.policy == "ucf" and time == _time_settings(METHODS["dt-wo-time"].settings):
+        time = ()  # the preset
+    rates = chosen_rates(budget.name)
+    same_policy = [
+        *(
+            name
+            for name, tuned in _TUNED.items()
+            if (tuned.policy, _time_settings(tuned.settings)) == (method.policy, time)
+        ),
+        *(name for name, tuned in SEARCHED.items() if tuned.policy == method.policy),
+    ]
+    return next((rates[name] for name in same_policy if name in rates), None)

@@ -5,24 +5,15 @@ evaluated with the distractor fixed to 0. Two trainings also differ randomly. Ev
 policy with the distractor fixed to 1 instead isolates the effect of the distractor.
 """
 
-import math
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
-from itertools import product
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from ucfrec.benchmark.cells import Cell, Evaluation, measured_by, opened
-from ucfrec.counterfactual.screening import DimensionReport, ScreeningConfig, screen
+from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import NONE
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.row import ResultRow
 from ucfrec.results.statistics import grouped, summary
-from ucfrec.runs.start import training_views
-from ucfrec_control.data.distractor import CLEAN, DISTRACTORS, zoo_store
-from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.data.distractor import CLEAN
 
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
@@ -62,8 +53,8 @@ def largest_drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     """The largest of each method's drops, in percent, with the distractor fixed to 0 and to 1: over
     datasets and distractors, each in the mean over seeds."""
     lines = []
-    for method, own in grouped(drops(rows), lambda line: line["method"]).items():
-        cases = grouped(own, lambda line: (line["task"], line["distractor"])).values()
+    for method, lines_of_method in grouped(drops(rows), lambda line: line["method"]).items():
+        cases = grouped(lines_of_method, lambda line: (line["task"], line["distractor"])).values()
         largest = [
             max(summary(line[name] for line in case).mean for case in cases)
             for name in ("drop", "drop_at_one")
@@ -91,65 +82,22 @@ SHOWN_SCREENING: Final = (
     *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
     *("true_flagged", "weakest_true"),
 )
+SCREENING: Final = (
+    *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
+    *("true_flagged", "weakest_true"),
+)
 SEED: Final = 0
-SCREENING: Final = "screening"
-"""Suite of the rows."""
-
-
-def screening_cells(data: Path, stores: Path, files: Sequence[str]) -> Iterator[Cell]:
-    """A cell for each file, clean and with each distractor.
-
-    Args:
-        data: folder of the HDF5 files.
-        files: names of files in `data`, without their ending.
-
-    Raises:
-        InputError: a file is missing.
-    """
-    for file, distractor in product(files, DISTRACTORS):
-        yield Cell(
-            *(SCREENING, SCREENING, file, SCREENING, SCREENING, Evaluation(0, SEED)),
-            training_seed=SEED,
-            store=zoo_store(data, stores, file, distractor),
-            conditions={"distractor": distractor},
-        )
-
-
-def _config(cell: Cell) -> dict[str, Any]:
-    return asdict(ScreeningConfig())
-
-
-def _measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
-    store = opened(cell)
-    began = time.perf_counter()
-    report = screen(training_views(store)[0], ScreeningConfig(), SEED)
-    dimensions = verdicts(report.dimensions, store)
-    wrong = sum(each["flagged"] and not each["distractor"] for each in dimensions)
-    row = ResultRow(
-        **vars(row_key),
-        metric="true_flagged",
-        metrics={
-            "true_flagged": float(wrong),
-            "reward_r2": math.nan if report.reward_r2 is None else report.reward_r2,
-            "transitions": float(report.transitions),
-        },
-        details={"screening": dimensions},
-        wall_time_s=time.perf_counter() - began,
-        **provenance(PACKAGES),
-    )
-    return [row]
-
-
-SCREENING_MEASUREMENT: Final = measured_by(_measure, _config)
 
 
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
     """The verdict of a screening report on each state dimension of `store`."""
-    added = {each["dimension"] for each in store.record.source.others.get("distractors", [])}
+    distractors = {
+        distractor["dimension"] for distractor in store.record.source.others.get("distractors", [])
+    }
     return [
         {
             "dimension": d.dimension,
-            "distractor": d.dimension in added,
+            "distractor": d.dimension in distractors,
             "flagged": not d.causes,
             "effect": d.effect,
             "p_value": d.p_value,

@@ -1,7 +1,7 @@
 """`ucfrec-control benchmark`: every method on the zoo files; resumes."""
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
@@ -9,17 +9,15 @@ from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
-from ucfrec_control.benchmark.plan import score_cells
-from ucfrec_control.benchmark.rates import chosen_rates
+from ucfrec_control.benchmark.plan import chosen_rates, score_cells
 from ucfrec_control.commands.options import (
-    choices_options,
+    context_option,
     control_grid_options,
     data_given,
     data_option,
-    narrowed,
+    narrow_budget,
 )
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
@@ -34,46 +32,35 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="every method (main), ways to pursue reward, all trained for as long as DT or "
         "LSDT (equal-time), or a sweep over UCF's settings",
     )
-    choices_options(parser)
+    context_option(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control benchmark`."""
     table = options.table
-    budget = narrowed(budget_of(table, options.budget), options)
+    budget = narrow_budget(budget_of(table, options.budget), options)
 
     def cells() -> Iterator[Cell]:
         return score_cells(data_given(options), options.out, budget, table, options.methods)
 
-    rows = rows_of(options, SCORES, [table], cells, SCORE_MEASUREMENT, costs, f"benchmark {table}")
+    rows = rows_of(options, SCORES, [table], cells, SCORE_MEASUREMENT, f"benchmark {table}")
     with rows_explained(options):
-        print_scores(rows, table, budget.rates)
+        print_scores(rows, table)
     print(f"\nrows: {results_given(options)}")
 
 
-def print_scores(
-    rows: Sequence[ResultRow], table: str, given: Mapping[str, float] | None = None
-) -> None:
-    """Print the tables of rows of a benchmark, and how learning rates were chosen.
-
-    Args:
-        given: rates that were used instead of the package's.
-    """
+def print_scores(rows: Sequence[ResultRow], table: str) -> None:
+    """Print the tables of rows of a benchmark, and how learning rates were chosen."""
     _print_tables(rows, table)
-    _print_rates(rows, given)
-
-
-def _print_rates(rows: Sequence[ResultRow], given: Mapping[str, float] | None) -> None:
     for budget in dict.fromkeys(str(row.conditions["budget"]) for row in rows):
-        used = chosen_rates(budget) if given is None else given
-        rates = ", ".join(f"{method} {rate:g}" for method, rate in used.items())
-        how = (
+        rates = ", ".join(f"{method} {rate:g}" for method, rate in chosen_rates(budget).items())
+        choice = (
             f"chosen on validation loss: {rates}"
             if rates
             else "not searched: the budget's, over the presets"
         )
-        print(f"\nlearning rates of budget {budget}, {how}")
+        print(f"\nlearning rates of budget {budget}, {choice}")
 
 
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
@@ -89,9 +76,9 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
             print(format_rows(lines, list(lines[0])))
     last = [row for row in rows if row.checkpoint == "last"]
     by, values = ("task", "method"), ("score", "validation_loss")
-    shown = (*values, "acceptance")
+    columns = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
-    print(format_rows(over_seeds([row.as_line() for row in last], by, shown), (*by, *shown)))
+    print(format_rows(over_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
     reference = UCF if table == MAIN or not last else last[0].method
     for name in values:
         if lines := difference_table(last, reference, name):

@@ -82,13 +82,13 @@ def run(options: argparse.Namespace) -> None:
 def _explain_targets(runs: Sequence[Path]) -> None:
     """Note which runs --target does nothing for; refuse it if it does nothing for all."""
     records = {run: read_run(run) for run in runs}
-    without = {run: each for run, each in records.items() if not takes_target(each)}
+    without = {run: record for run, record in records.items() if not takes_target(record)}
     if not without:
         return
-    named = ", ".join(f"{run} ({record.config.policy_name})" for run, record in without.items())
+    names = ", ".join(f"{run} ({record.config.policy_name})" for run, record in without.items())
     if len(without) == len(records):
-        raise InputError(f"no target return is taken by {named}; leave --target out")
-    warnings.warn(f"--target does nothing for {named}", InputNote, stacklevel=2)
+        raise InputError(f"no target return is taken by {names}; leave --target out")
+    warnings.warn(f"--target does nothing for {names}", InputNote, stacklevel=2)
 
 
 def _shown(row: ResultRow) -> dict[str, Any]:

@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> None:
         make_figures,  # matplotlib takes half a second to import
     )
 
-    made, missing = make_figures(options.runs, options.results, options.out)
-    print("\n".join(map(str, made)))
+    files, missing = make_figures(options.runs, options.results, options.out)
+    print("\n".join(map(str, files)))
     for line in missing:
         print(f"missing: {line}", file=sys.stderr)

@@ -1,9 +1,8 @@
 """Options that several commands share, and their values."""
 
 import argparse
-import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -13,10 +12,8 @@ from ucfrec.commands.grid_options import budget_options, grid_options, rows_of
 from ucfrec.errors import InputError, one_line
 from ucfrec.results.row import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.methods import METHODS
-from ucfrec_control.benchmark.plan import with_contexts
-from ucfrec_control.benchmark.rates import read_rates
+from ucfrec_control.benchmark.plan import set_contexts
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari
 from ucfrec_control.data.trajectories import Trajectories
@@ -59,14 +56,8 @@ def source_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
 
 
-def choices_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for what `rates` and `contexts` chose."""
-    parser.add_argument(
-        "--rates",
-        type=Path,
-        metavar="TOML",
-        help="learning rates that `ucfrec-control rates --toml` wrote (those of the package)",
-    )
+def context_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the history of single methods."""
     parser.add_argument(
         "--context",
         dest="contexts",
@@ -74,7 +65,7 @@ def choices_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="METHOD=STEPS",
-        help="steps of history of a method, as `contexts` prints it; repeatable (the budget's)",
+        help="steps of history of a method; repeatable (default: the budget's)",
     )
 
 
@@ -122,19 +113,18 @@ def rows_of_suite(
     suite: str,
     how: Measurement[Cell],
     cells: Callable[..., Iterable[Cell]],
-    *more: object,
 ) -> list[ResultRow]:
     """The rows that a command shows, as `ucfrec.commands.grid_options.rows_of`.
 
     Args:
-        cells: makes the cells of data, folder, budget and methods, and of `more`.
+        cells: makes the cells of data, folder, budget and methods.
     """
-    budget = narrowed(budget_of(suite, options.budget), options)
+    budget = narrow_budget(budget_of(suite, options.budget), options)
 
-    def listed() -> Iterable[Cell]:
-        return cells(data_given(options), options.out, budget, options.methods, *more)
+    def list_cells() -> Iterable[Cell]:
+        return cells(data_given(options), options.out, budget, options.methods)
 
-    return rows_of(options, suite, (), listed, how, costs)
+    return rows_of(options, suite, (), list_cells, how)
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:
@@ -164,23 +154,13 @@ def describe_source(trajectories: Trajectories) -> str:
     )
 
 
-def narrowed(budget: Budget, options: argparse.Namespace) -> Budget:
-    """`budget` with the files, seeds, rates and contexts of the options.
+def narrow_budget(budget: Budget, options: argparse.Namespace) -> Budget:
+    """`budget` with the files, seeds and contexts of the options.
 
     Raises:
-        InputError: `--seeds` is below 1, or the file of `--rates` has none of the budget.
+        InputError: `--seeds` is below 1.
     """
-    found = budget.narrowed(
+    budget = budget.narrowed(
         options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
     )
-    found = dataclasses.replace(found, rates=_rates_given(options))
-    return with_contexts(found, dict(options.contexts))
-
-
-def _rates_given(options: argparse.Namespace) -> Mapping[str, float] | None:
-    if options.rates is None:
-        return None
-    found = read_rates(options.rates).get(options.budget)
-    if not found:
-        raise InputError(f"{options.rates} has no rates of budget {options.budget}")
-    return found
+    return set_contexts(budget, dict(options.contexts))

@@ -6,7 +6,6 @@ from ucfrec.benchmark.cells import Cell
 from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.errors import InputError
 from ucfrec.results.rows_file import latest, read_rows
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.reproduce import (
@@ -18,11 +17,11 @@ from ucfrec_control.benchmark.reproduce import (
 from ucfrec_control.commands.benchmark import print_scores
 from ucfrec_control.commands.options import (
     BUDGETS,
-    choices_options,
+    context_option,
     control_grid_options,
     data_given,
     data_option,
-    narrowed,
+    narrow_budget,
 )
 from ucfrec_control.commands.robustness import print_robustness
 
@@ -38,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="number of training seeds (default: set by --budget)",
     )
-    choices_options(parser)
+    context_option(parser)
     control_grid_options(parser, budget=False)
     parser.set_defaults(tasks=[], evaluation_seed=None)
 
@@ -52,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     if options.show_only and part.of_runs:
         raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
     robust = part.table == ROBUSTNESS
-    budget = narrowed(budget_of_part(part, options.budget), options)
+    budget = narrow_budget(budget_of_part(part, options.budget), options)
     cells: list[Cell] = []
     if options.show_only:
         rows = rows_of_part(part, latest(read_rows(results)), options.budget)
@@ -64,18 +63,18 @@ def run(options: argparse.Namespace) -> None:
     else:
         cells += cells_of_part(part, data_given(options), options.out, budget)
         how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-        rows = rows_of(options, "", (), lambda: cells, how, costs, f"reproduce {options.part}")
+        rows = rows_of(options, "", (), lambda: cells, how, f"reproduce {options.part}")
     pictures = options.out / options.part
     with rows_explained(options):
         if robust:
             print_robustness(rows)
         else:
-            print_scores(rows, part.table, budget.rates)
+            print_scores(rows, part.table)
         if part.of_runs:
-            made, _ = make_figures(
+            files, _ = make_figures(
                 [cell.run for cell in cells if cell.run is not None], [], pictures
             )
         else:
-            made = make_row_figures(rows, pictures)
-    print("\n".join(["", *map(str, made)]))
+            files = make_row_figures(rows, pictures)
+    print("\n".join(["", *map(str, files)]))
     print(f"\nrows: {results}")

@@ -21,7 +21,7 @@ from ucfrec_control.benchmark.robustness import (
     screening_rows,
 )
 from ucfrec_control.commands.options import (
-    choices_options,
+    context_option,
     control_grid_options,
     data_option,
     rows_of_suite,
@@ -31,7 +31,7 @@ from ucfrec_control.commands.options import (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
     data_option(parser)
-    choices_options(parser)
+    context_option(parser)
     control_grid_options(parser)
 
 
@@ -52,5 +52,5 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     # A store is screened once, whatever method and seed it is for.
     screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
-    shown = [name for name in SHOWN_SCREENING if name != "training_seed"]
-    print(format_rows(list(screened.values()), shown))
+    columns = [name for name in SHOWN_SCREENING if name != "training_seed"]
+    print(format_rows(list(screened.values()), columns))

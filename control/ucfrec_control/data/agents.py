@@ -27,7 +27,9 @@ from ucfrec.errors import InputError
 
 _MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
 """Sizes beyond which a file is refused before it is unpacked."""
-_ACTIVATIONS: Final = {each.__name__: each for each in (nn.ReLU, nn.Tanh, nn.ELU, nn.LeakyReLU)}
+_ACTIVATIONS: Final = {
+    activation.__name__: activation for activation in (nn.ReLU, nn.Tanh, nn.ELU, nn.LeakyReLU)
+}
 _LAYER: Final = re.compile(r"(.+)\.(\d+)\.(weight|bias)")
 _CLIPPED_MEAN: Final = 2.0
 """Bound of the mean of agents with state-dependent exploration, where the file names no other."""
@@ -101,18 +103,22 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     """
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)
-    known = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
-    if other := sorted(n for n in tensors.keys() - known if n.startswith(("actor.", "features"))):
-        raise _refused(file, f"its network has {other[0]}, which is not a layer of a perceptron")
+    expected = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
+    if unexpected := sorted(
+        n for n in tensors.keys() - expected if n.startswith(("actor.", "features"))
+    ):
+        raise _refusal(
+            file, f"its network has {unexpected[0]}, which is not a layer of a perceptron"
+        )
     for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
         if not _is_plain(tensors[name]):
-            raise _refused(file, f"{name} is not of finite numbers stored one by one")
+            raise _refusal(file, f"{name} is not of finite numbers stored one by one")
     layers = [tensors[f"{name}.weight"] for name in names]
-    for (name, first), (after, second) in pairwise(zip(names, layers, strict=True)):
+    for (name, first), (next_name, second) in pairwise(zip(names, layers, strict=True)):
         if first.shape[0] != second.shape[1]:
-            raise _refused(
+            raise _refusal(
                 file,
-                f"{name} has {first.shape[0]} outputs, but {after} has {second.shape[1]} inputs",
+                f"{name} has {first.shape[0]} outputs, {next_name} {second.shape[1]} inputs",
             )
     sizes = (layers[0].shape[1], layers[-1].shape[0])
     if sizes != (observations, space.shape[0]):
@@ -132,7 +138,7 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     if names[-1] == "actor.mu.0" and kind.last:
         bound = kwargs.get("clip_mean", _CLIPPED_MEAN)
         if not isinstance(bound, int | float) or not bound > 0:
-            raise _refused(file, f"its clip_mean is {bound!r}, not a number above 0")
+            raise _refusal(file, f"its clip_mean is {bound!r}, not a number above 0")
         parts.append(nn.Hardtanh(-float(bound), float(bound)))
     squashed = kind.squashed or kwargs.get("squash_output") is True
     return Agent(nn.Sequential(*parts, *([nn.Tanh()] if squashed else [])), squashed, space, noise,
@@ -145,7 +151,7 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
         raise InputError(f"{file} does not exist; name an agent that Stable-Baselines3 saved")
     try:
         with zipfile.ZipFile(file) as archive:
-            parts = {name: _unpacked(archive, name) for name in _MOST_BYTES}
+            parts = {name: _unpack(archive, name) for name in _MOST_BYTES}
         network = io.BytesIO(parts["policy.pth"])
         if zipfile.is_zipfile(network):
             with zipfile.ZipFile(network) as archive:
@@ -161,11 +167,11 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
             raise ValueError("its parts are not those of an agent")
     except Exception as error:  # zipfile, json and PyTorch's unpickler raise many types
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise _refused(file, f"it cannot be read as data ({reason})") from None
+        raise _refusal(file, f"it cannot be read as data ({reason})") from None
     return tensors, settings
 
 
-def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+def _unpack(archive: zipfile.ZipFile, name: str) -> bytes:
     _require_unpackable(name, archive.getinfo(name).file_size)
     return archive.read(name)
 
@@ -186,7 +192,7 @@ def _kind_of(file: Path, tensors: Mapping[str, Tensor]) -> tuple[_Kind, list[str
             continue
         if all(_is_layer(tensors, name) for name in names):
             return kind, names
-    raise _refused(file, "its tensors are not those of a perceptron with vector actions")
+    raise _refusal(file, "its tensors are not those of a perceptron with vector actions")
 
 
 def _is_layer(tensors: Mapping[str, Tensor], name: str) -> bool:
@@ -207,16 +213,16 @@ def _is_plain(tensor: Tensor) -> bool:
 
 def _activation(file: Path, kwargs: Mapping[str, Any], kind: _Kind) -> type[nn.Module]:
     """What `policy_kwargs` calls the activation, of which JSON keeps the class's name."""
-    named = kwargs.get("activation_fn")
-    if named is None and "activation_fn" not in kwargs:
+    activation = kwargs.get("activation_fn")
+    if activation is None and "activation_fn" not in kwargs:
         return kind.activation
-    title = str(named).removesuffix("'>").rpartition(".")[2]
+    title = str(activation).removesuffix("'>").rpartition(".")[2]
     if title not in _ACTIVATIONS:
-        raise _refused(file, f"its activation is {named!r}")
+        raise _refusal(file, f"its activation is {activation!r}")
     return _ACTIVATIONS[title]
 
 
-def _refused(file: Path, reason: str) -> InputError:
+def _refusal(file: Path, reason: str) -> InputError:
     return InputError(
         f"{file}: {reason}; agents of SAC, TQC, TD3, DDPG, PPO, A2C and TRPO with perceptrons can "
         "be used, whose files keep the network as plain tensors"

@@ -17,7 +17,7 @@ from ucfrec.acting.uniform import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
-from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.locks import lock_path, remove_leftovers_within
 from ucfrec.processes import random_state_kept
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
@@ -85,7 +85,7 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             process, the environment cannot be created or has no step limit, its action space is not
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
-    with claimed(out, "filled"):
+    with lock_path(out, "filled"):
         _require_incomplete(out)
         return _collect(env_id, out, seed, config)
 
@@ -113,14 +113,14 @@ def collect_agent(
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
-    with claimed(out, "filled"):
+    with lock_path(out, "filled"):
         _require_incomplete(out)
         env = make_env(env_id, 1)
-        shown, space = env.single_observation_space.shape or (), env.single_action_space
+        shape, space = env.single_observation_space.shape or (), env.single_action_space
         env.close()
-        if len(shown) != 1 or not isinstance(space, Box) or len(space.shape) != 1:
+        if len(shape) != 1 or not isinstance(space, Box) or len(space.shape) != 1:
             raise InputError(f"{env_id} has no vector observations and actions")
-        actor = read_agent(agent, shown[0], space, noise, seed_all(seed, 5))
+        actor = read_agent(agent, shape[0], space, noise, seed_all(seed, 5))
         trajectories = roll_out(actor, env_id, size, (seed, 6), f"roll out {agent.stem}")
         name = f"{_task(env_id)}_{agent.stem}" + (f"-noise{noise:g}" if noise else "")
         recorded = {"env_id": env_id, "agent": agent.name, "noise": noise, "seed": seed}
@@ -144,7 +144,7 @@ def _collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[d
         "medium-replay": _replay(training, medium, env_id),
         "expert": _roll_out(training, expert, env_id, seed, config.size),
     }
-    parts["medium-expert"] = _joined(parts["medium"], parts["expert"])
+    parts["medium-expert"] = _join(parts["medium"], parts["expert"])
     recorded = {
         "env_id": env_id,
         "algorithm": "SAC",
@@ -330,13 +330,13 @@ def roll_out(
             seed = seed_all(*key, len(rounds))
             steps: list[Step] = []
             rollout(env, actor, env.num_envs, seed, steps.append, describe="episodes")
-            rounds.append(_by_episode(steps, env_id))
+            rounds.append(_sort_by_episode(steps, env_id))
             bar.update(len(rounds[-1].rewards))
     env.close()
-    return _joined(*rounds)
+    return _join(*rounds)
 
 
-def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
+def _sort_by_episode(steps: list[Step], env_id: str) -> Trajectories:
     """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
 
     def column(name: str) -> Array:
@@ -356,7 +356,7 @@ def _by_episode(steps: list[Step], env_id: str) -> Trajectories:
     )
 
 
-def _joined(*parts: Trajectories) -> Trajectories:
+def _join(*parts: Trajectories) -> Trajectories:
     """Concatenate trajectories; the source is that of the first."""
 
     def column(name: str) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, read_json
-from ucfrec_control.data.hdf5 import opened, read_numbers
+from ucfrec_control.data.hdf5 import open_hdf5, read_numbers
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
@@ -37,7 +37,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         InputError: the file is missing, damaged or not of this layout, or its observations and
             actions have other sizes than D4RL's of that environment.
     """
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         missing = [name for name in _REQUIRED if name not in file]
         if missing:
             raise InputError(
@@ -50,8 +50,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
                 steps[name] = read_numbers(file, path, name)
         recorded = file.attrs.get("env_id")
     _require_aligned(steps, path)
-    named = env_id or (recorded if isinstance(recorded, str) else None)
-    task = find_task(named or dataset_name(path))
+    environment = env_id or (recorded if isinstance(recorded, str) else None)
+    task = find_task(environment or dataset_name(path))
     check_sizes(task, _sizes(steps), str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
     ends = np.flatnonzero(terminals | _timeouts(steps, path))
@@ -65,7 +65,7 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
         "where": str(path),
         "format": "d4rl",
         "dataset": dataset_name(path),
-        "env_id": named or (task.d4rl_env(dataset_name(path)) if task else None),
+        "env_id": environment or (task.d4rl_env(dataset_name(path)) if task else None),
         "versions": _made_with(path),
         "dropped": {
             "unfinished_steps": len(terminals) - n,

@@ -86,6 +86,6 @@ def _is_of(folder: Path, path: Path) -> bool:
     if unchanged and store.record.source.others.get("where") == str(path):
         return True
     with TemporaryDirectory() as scratch:
-        made = read_d4rl(path).write_store(Path(scratch) / folder.name)
-    same: bool = made.record.fingerprint == store.record.fingerprint
+        rewritten = read_d4rl(path).write_store(Path(scratch) / folder.name)
+    same: bool = rewritten.record.fingerprint == store.record.fingerprint
     return same

@@ -19,7 +19,7 @@ _FAULTS: Final = (OSError, ValueError, TypeError, RuntimeError, KeyError, Attrib
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_hdf5(path: Path) -> Iterator[Any]:
     """Yield the file, opened for reading, in which no link leads out of it.
 
     Raises:
@@ -74,10 +74,10 @@ def read_numbers(file: Any, path: Path, name: str) -> Array:
         raise InputError(
             f"{path}: {name} cannot be read ({first_line(error)}); fetch the file again"
         ) from None
-    return as_singles(values, str(path), name) if values.dtype.kind == "f" else values
+    return convert_singles(values, str(path), name) if values.dtype.kind == "f" else values
 
 
-def as_singles(values: Array, where: str, name: str) -> Float32Array:
+def convert_singles(values: Array, where: str, name: str) -> Float32Array:
     """Numbers in single precision.
 
     Args:
@@ -105,7 +105,7 @@ def require_inside(path: Path) -> None:
     Raises:
         InputError: one does, or the file is damaged.
     """
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         waiting = [file]
         seen = 0
         while waiting:

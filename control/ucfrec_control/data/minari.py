@@ -20,7 +20,7 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.data.hdf5 import as_singles, require_inside
+from ucfrec_control.data.hdf5 import convert_singles, require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
@@ -78,8 +78,8 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
                 "steps instead of one more"
             )
     spec = dataset.env_spec
-    seen_before = _joined([seen[:-1] for seen in observations], source, "observations")
-    actions = _joined([_vectors(e.actions, source) for e in complete], source, "actions")
+    seen_before = _join([seen[:-1] for seen in observations], source, "observations")
+    actions = _join([_vectors(e.actions, source) for e in complete], source, "actions")
     if complete and not is_antmaze(env_id or ""):
         # Of gymnasium-robotics, newer AntMazes have other sizes than D4RL's.
         sizes = (seen_before.shape[1], actions.shape[1])
@@ -87,10 +87,10 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     return Trajectories(
         observations=seen_before,
         actions=actions,
-        rewards=_joined([e.rewards for e in complete], source, "rewards").reshape(-1),
+        rewards=_join([e.rewards for e in complete], source, "rewards").reshape(-1),
         lengths=np.array([len(e) for e in complete], dtype=np.int64),
         terminated=np.array([bool(e.terminations[-1]) for e in complete]),
-        final_observations=_joined([seen[-1:] for seen in observations], source, "observations"),
+        final_observations=_join([seen[-1:] for seen in observations], source, "observations"),
         source={
             "where": source,
             "format": "minari",
@@ -147,11 +147,11 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
                 + ("" if has_final else " Final observations are unknown and repeat the last one."),
                 requirements=requirements,
             )
-        for about in sorted(datasets.rglob(NAMESPACE_METADATA_FILENAME)):
-            place = _root() / about.relative_to(datasets)
+        for metadata in sorted(datasets.rglob(NAMESPACE_METADATA_FILENAME)):
+            place = _root() / metadata.relative_to(datasets)
             if not place.exists():
                 with atomic_file(place) as half:
-                    shutil.copyfile(about, half)
+                    shutil.copyfile(metadata, half)
         for part in sorted((datasets / identifier).iterdir()):
             part.rename(scratch / part.name)
         shutil.rmtree(datasets)
@@ -218,15 +218,15 @@ def _root() -> Path:
 @contextmanager
 def _root_is(folder: Path) -> Iterator[None]:
     """Have Minari write its datasets to another folder."""
-    before = os.environ.get(_ROOT)
+    previous = os.environ.get(_ROOT)
     folder.mkdir()
     os.environ[_ROOT] = str(folder)
     try:
         yield
     finally:
         del os.environ[_ROOT]
-        if before is not None:
-            os.environ[_ROOT] = before
+        if previous is not None:
+            os.environ[_ROOT] = previous
 
 
 def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
@@ -257,8 +257,8 @@ def _vectors(values: Any, source: str) -> Array:
     return values
 
 
-def _joined(parts: list[Array], source: str, name: str) -> Float32Array:
-    return as_singles(np.concatenate(parts or [np.zeros((0, 0))]), source, name)
+def _join(parts: list[Array], source: str, name: str) -> Float32Array:
+    return convert_singles(np.concatenate(parts or [np.zeros((0, 0))]), source, name)
 
 
 def _made_with(metadata: Mapping[str, Any]) -> dict[str, str]:

@@ -87,14 +87,14 @@ class SacTraining(Memoryless):
         observations, _ = self._env.reset(seed=reset_seed)
         ended = False
         while not ended:
-            before = observations.astype(np.float32)
-            scaled = self._explore(before, generator)
+            state = observations.astype(np.float32)
+            scaled = self._explore(state, generator)
             actions = self._model.policy.unscale_action(scaled)
             observations, rewards, terminated, truncated, info = self._env.step(actions)
             ended = bool(terminated[0] or truncated[0])
-            after = info["final_obs"][0][None] if ended else observations
+            next_state = info["final_obs"][0][None] if ended else observations
             timeout = {"TimeLimit.truncated": bool(truncated[0] and not terminated[0])}
-            self._buffer.add(before, after, scaled, rewards, np.array([ended]), [timeout])
+            self._buffer.add(state, next_state, scaled, rewards, np.array([ended]), [timeout])
             if self.steps > self._config.learning_starts:
                 self._model.train(1, self._config.batch_size)
             bar.update()
@@ -105,8 +105,8 @@ class SacTraining(Memoryless):
         if self.steps < self._config.learning_starts:
             shape = (1, *(self._env.single_action_space.shape or ()))
             return generator.uniform(-1, 1, shape).astype(np.float32)
-        drawn, _ = self._model.predict(observations, deterministic=False)
-        return np.asarray(self._model.policy.scale_action(drawn), dtype=np.float32)
+        action, _ = self._model.predict(observations, deterministic=False)
+        return np.asarray(self._model.policy.scale_action(action), dtype=np.float32)
 
     def replay(self, steps: int) -> dict[str, Array]:
         """Return the first steps taken, with D4RL's column names.

@@ -69,9 +69,9 @@ class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
-        shown = env.observation_space
-        assert isinstance(shown, Dict)
-        sizes = [shown[name].shape or () for name in ("achieved_goal", "observation")]
+        space = env.observation_space
+        assert isinstance(space, Dict)
+        sizes = [space[name].shape or () for name in ("achieved_goal", "observation")]
         self.observation_space = Box(-np.inf, np.inf, (sum(size[0] for size in sizes),))
         self._origin = getattr(env.unwrapped, "origin", np.zeros(2))
         # gymnasium-robotics has finished with this temporary file but does not delete it.

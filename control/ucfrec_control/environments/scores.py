@@ -104,10 +104,10 @@ def require_task(*names: str | None) -> Task:
     """
     task = find_task(*names)
     if task is None:
-        known = ", ".join(task.name for task in TASKS)
+        supported = ", ".join(task.name for task in TASKS)
         raise InputError(
             f"no reference returns are known for {' or '.join(filter(None, names)) or 'it'}; "
-            f"scores are for {known}"
+            f"scores are for {supported}"
         )
     return task
 

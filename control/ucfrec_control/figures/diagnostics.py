@@ -58,7 +58,7 @@ def is_augmented(run: Path) -> bool:
     return (run / _REPORT).exists() and read_augmentation(run / _REPORT).proposals > 0
 
 
-def edited_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
+def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     """Factual states and their edits, (M, S) each, aligned and in standard deviations from the
     training mean; at most 3,000 drawn from a run's counterfactual copies.
 
@@ -110,7 +110,7 @@ class Editing:
         )
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
         rows = np.random.default_rng(seed).permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS]
-        factual = _at(fitted, torch.from_numpy(rows))
+        factual = _select(fitted, torch.from_numpy(rows))
         return cls(crm, _generator(run, fitted, crm, config), factual, report.epsilon_r)
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
@@ -198,10 +198,10 @@ def _generator(
         load_weights(weights, network, load_tensors(weights)[0])
         return network.eval()
     # Nothing of the tangent generator is learned but covariances, the same for the same seed.
-    made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
-    assert isinstance(made, TangentGenerator)
-    return made
+    generator = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+    assert isinstance(generator, TangentGenerator)
+    return generator
 
 
-def _at(steps: Transitions, rows: torch.Tensor) -> Transitions:
+def _select(steps: Transitions, rows: torch.Tensor) -> Transitions:
     return Transitions(*(getattr(steps, f)[rows] for f in steps.__dataclass_fields__))

@@ -53,7 +53,7 @@ class _Plan:
     """A figure that there seems to be data for."""
 
     kind: str
-    about: str
+    task: str
     draw: Callable[[], Figure]
     """Raises InputError where some of the data is missing after all."""
 
@@ -70,11 +70,11 @@ class _Run:
     policy: str
     settings: str
     """Hash of the data and of all settings of a training but the seed."""
-    about: str
+    task: str
 
     @property
     def title(self) -> str:
-        return f"{label(self.method)} on {self.about}"
+        return f"{label(self.method)} on {self.task}"
 
 
 def make_figures(
@@ -94,14 +94,14 @@ def make_figures(
     Raises:
         InputError: a folder or file is missing, or holds something else.
     """
-    found = _distinguished([run for folder in runs for run in _runs(folder)])
+    distinct_runs = _distinguish_runs([run for folder in runs for run in _runs(folder)])
     rows = [row for path in results for row in read_results(path)]
-    plans = list(_of_runs(found))
+    plans = list(_plan_runs(distinct_runs))
     with damage_explained(", ".join(map(str, results)), _REMEDY):
-        plans += _of_rows(rows)
+        plans += _plan_rows(rows)
     missing = [f"{k}: needs {w}" for k, w in NEEDS.items() if k not in {p.kind for p in plans}]
-    made, failed = _drawn(plans, out)
-    return made, [*missing, *failed]
+    files, failed = _drawn(plans, out)
+    return files, [*missing, *failed]
 
 
 def make_row_figures(rows: Sequence[ResultRow], out: Path) -> list[Path]:
@@ -110,22 +110,22 @@ def make_row_figures(rows: Sequence[ResultRow], out: Path) -> list[Path]:
     Args:
         rows: of `benchmark` or `robustness`.
     """
-    return _drawn(list(_of_rows(rows)), out)[0]
+    return _drawn(list(_plan_rows(rows)), out)[0]
 
 
 def _drawn(plans: Sequence[_Plan], out: Path) -> tuple[list[Path], list[str]]:
     """The files written, and a line for each figure that lacks its data."""
-    made: list[Path] = []
+    files: list[Path] = []
     missing: list[str] = []
     for plan in plans:
-        name = f"{plan.kind}-{plan.about}"
+        name = f"{plan.kind}-{plan.task}"
         try:
             # One figure that cannot be drawn does not keep the others from it.
             with damage_explained("what it is drawn from", _REMEDY):
-                made += save(plan.draw(), out, name)
+                files += save(plan.draw(), out, name)
         except InputError as error:
             missing.append(f"{name}: {error}")
-    return made, missing
+    return files, missing
 
 
 def _runs(folder: Path) -> Iterator[_Run]:
@@ -147,11 +147,11 @@ def _run_of(record: RunRecord | RLRecord, file: Path, below: Path) -> _Run:
         method=method_of(record),
         policy=record.config.policy_name,
         settings=config_hash({**record.settings, "seed": None, "data": record.fingerprint}),
-        about=f"{dataset['dataset']}{distracted}",
+        task=f"{dataset['dataset']}{distracted}",
     )
 
 
-def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
+def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
     """The runs, of which those with other settings go by their folder's name, less the seed."""
     settings: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -164,15 +164,15 @@ def _distinguished(runs: Sequence[_Run]) -> list[_Run]:
     ]
 
 
-def _of_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
+def _plan_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
     for run in _first(runs, lambda run: (run.group, run.method)):
         if diagnostics.is_augmented(run.path):
             for kind in ("moves", "states", "acceptance"):
-                yield _Plan(kind, run.name, partial(_of_copies, run, kind))
+                yield _Plan(kind, run.name, partial(_draw_copies, run, kind))
         if run.policy == "ucf":
             yield _Plan("attention", run.name, partial(_attention, run))
     for run in _first(runs, lambda run: run.group):
-        same = [other for other in runs if other.group == run.group]
+        same = [sibling for sibling in runs if sibling.group == run.group]
         yield _Plan("training", run.group, partial(_training, same))
 
 
@@ -183,10 +183,10 @@ def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
     return first.values()
 
 
-def _of_copies(run: _Run, kind: str) -> Figure:
+def _draw_copies(run: _Run, kind: str) -> Figure:
     """A figure of the augmented episodes of a run."""
     if kind == "states":
-        return plots.state_overlay(*diagnostics.edited_states(run.path), run.title)
+        return plots.state_overlay(*diagnostics.edit_states(run.path), run.title)
     if kind == "moves":
         return plots.move_histogram(*diagnostics.move_histogram(run.path), run.title)
     band = diagnostics.move_histogram(run.path)[2]
@@ -209,47 +209,53 @@ def _training(runs: Sequence[_Run]) -> Figure:
     return plots.training_curves(curves, "validation loss of the action", runs[0].group)
 
 
-def _of_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
-    yield from _of_robustness([row for row in rows if row.suite == ROBUSTNESS])
-    yield from _of_tables([row for row in rows if row.suite == SCORES and row.checkpoint == "last"])
-    yield from _of_targets([row for row in rows if _has_target(row)])
-    swept = [row.as_line() for row in rows if _of_lambda(row)]
-    for budget, own in grouped(swept, lambda line: line.get("budget", "rows")).items():
-        if len({line["lambda_mask"] for line in own}) > 1:
-            yield _Plan("lambda", budget, partial(plots.lambda_curves, own))
+def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+    yield from _plan_robustness([row for row in rows if row.suite == ROBUSTNESS])
+    yield from _plan_tables(
+        [row for row in rows if row.suite == SCORES and row.checkpoint == "last"]
+    )
+    yield from _plan_targets([row for row in rows if _has_target(row)])
+    swept = [row.as_line() for row in rows if _is_of_lambda(row)]
+    for budget, budget_rows in grouped(swept, lambda line: line.get("budget", "rows")).items():
+        if len({line["lambda_mask"] for line in budget_rows}) > 1:
+            yield _Plan("lambda", budget, partial(plots.lambda_curves, budget_rows))
 
 
-def _of_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+def _plan_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of several target returns the best, as the printed tables."""
     tables = grouped(rows, lambda row: (row.conditions["budget"], row.table))
-    for (budget, table), own in tables.items():
-        lines = [row.as_line() for row in of_best_target(own)]
+    for (budget, table), table_rows in tables.items():
+        lines = [row.as_line() for row in of_best_target(table_rows)]
         draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
         yield _Plan("scores", f"{budget}-{table}", draw)
 
 
-def _of_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+def _plan_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     groups = grouped(rows, lambda row: (row.conditions["budget"], row.task))
-    for (budget, task), own in groups.items():
-        about, bars = f"{budget}-{task}", plots.robustness_bars
-        lines = [row.as_line() for row in own]
+    for (budget, task), task_rows in groups.items():
+        name, bars = f"{budget}-{task}", plots.robustness_bars
+        lines = [row.as_line() for row in task_rows]
         score = partial(bars, lines, "score", "normalised score", task)
-        yield _Plan("robustness-scores", about, score)
-        if lost := drops(own):
+        yield _Plan("robustness-scores", name, score)
+        if lost := drops(task_rows):
             drop = partial(bars, lost, "drop", "loss (% of the clean score)", task)
-            yield _Plan("robustness-drops", about, drop)
-        if rises := loss_rises(own):
+            yield _Plan("robustness-drops", name, drop)
+        if rises := loss_rises(task_rows):
             rise = partial(bars, rises, "rise", "rise of the action loss (%)", task)
-            yield _Plan("robustness-losses", about, rise)
+            yield _Plan("robustness-losses", name, rise)
 
 
-def _of_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
+def _plan_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of the methods that were given more than one target return."""
     methods = grouped(rows, lambda row: (row.task, row.method))
-    several = {m for m, own in methods.items() if len({row.target_return for row in own}) > 1}
-    kept = [row for row in rows if (row.task, row.method) in several]
-    for task, own in grouped(kept, lambda row: row.task).items():
-        lines = [row.as_line() for row in own]
+    several = {
+        method
+        for method, method_rows in methods.items()
+        if len({row.target_return for row in method_rows}) > 1
+    }
+    rows_with_targets = [row for row in rows if (row.task, row.method) in several]
+    for task, task_rows in grouped(rows_with_targets, lambda row: row.task).items():
+        lines = [row.as_line() for row in task_rows]
         yield _Plan("returns", task, partial(plots.return_curves, lines, task))
 
 
@@ -259,7 +265,7 @@ def _has_target(row: ResultRow) -> bool:
     return whole and not row.details.get("distractors") and row.target_return is not None
 
 
-def _of_lambda(row: ResultRow) -> bool:
+def _is_of_lambda(row: ResultRow) -> bool:
     """Whether `row` is UCF's, complete but for its λ."""
     whole = row.method == "ucf" or row.method.startswith("ucf-lambda")
     of_table = row.table in ("lambda", EVALUATE) and row.checkpoint == "last"

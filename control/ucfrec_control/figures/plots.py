@@ -98,7 +98,7 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
     figure, axes = _figure(COLUMN, 2.9, title)
     centre = factual.mean(axis=0)
     _, spread, directions = np.linalg.svd(factual - centre, full_matrices=False)
-    explained = 100 * spread**2 / (spread**2).sum()
+    variance = 100 * spread**2 / (spread**2).sum()
     for states, name, color, marker in (
         (factual, "logged", FACTUAL, "o"),
         (edited, "edited", EDITED, "x"),
@@ -113,8 +113,8 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
     for handle in legend.legend_handles:
         if handle is not None:
             handle.set_alpha(1)
-    axes.set_xlabel(f"first component ({explained[0]:.0f}% of the variance)")
-    axes.set_ylabel(f"second component ({explained[1]:.0f}%)")
+    axes.set_xlabel(f"first component ({variance[0]:.0f}% of the variance)")
+    axes.set_ylabel(f"second component ({variance[1]:.0f}%)")
     axes.grid(True)
     return figure
 
@@ -128,12 +128,14 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """
     figure, axes = _figure(COLUMN, 2.5, title)
     places = sorted({row["lambda_mask"] for row in rows})
-    scores = _by_seed(rows, ("task", "lambda_mask"), "score")
+    scores = _group_seeds(rows, ("task", "lambda_mask"), "score")
     datasets = sorted({row["task"] for row in rows})
     for dataset, color in colors(datasets).items():
         at = [i for i, value in enumerate(places) if (dataset, value) in scores]
-        found = [summary(scores[dataset, places[i]]) for i in at]
-        mean, sd = (np.array([getattr(each, name) for each in found]) for name in ("mean", "sd"))
+        summaries = [summary(scores[dataset, places[i]]) for i in at]
+        mean, sd = (
+            np.array([getattr(point, name) for point in summaries]) for name in ("mean", "sd")
+        )
         axes.plot(at, mean, "o-", color=color, label=dataset)
         axes.fill_between(at, mean - sd, mean + sd, color=color, alpha=0.2, linewidth=0)
     # Places stand apart evenly: 0 has no place on a logarithmic axis.
@@ -154,14 +156,14 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
         rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
     figure, axes = _figure(COLUMN, 2.5, title)
-    reached = _by_seed(rows, ("method", "target_return"), "return")
+    reached = _group_seeds(rows, ("method", "target_return"), "return")
     for method, color in colors(sorted({row["method"] for row in rows})).items():
-        at = sorted(target for other, target in reached if other == method)
-        found = [reached[method, target] for target in at]
-        means = [summary(values).mean for values in found]
+        at = sorted(target for name, target in reached if name == method)
+        returns = [reached[method, target] for target in at]
+        means = [summary(values).mean for values in returns]
         axes.plot(at, means, "o-", color=color, label=label(method))
         axes.fill_between(
-            at, list(map(min, found)), list(map(max, found)), color=color, alpha=0.2, lw=0
+            at, list(map(min, returns)), list(map(max, returns)), color=color, alpha=0.2, lw=0
         )
     targets, top = [row["target_return"] for row in rows], axes.get_ylim()[1]
     axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
@@ -184,13 +186,13 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
         rows: with `method`, `distractor`, `training_seed` and `value`, in the order to be drawn.
     """
     figure, axes = _figure(PAGE, 2.4, title)
-    found = _by_seed(rows, ("method", "distractor"), value)
+    values_by_bar = _group_seeds(rows, ("method", "distractor"), value)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     kinds = list(dict.fromkeys(row["distractor"] for row in rows))
     width = 0.84 / len(kinds)
     for number, (kind, color) in enumerate(colors(kinds).items()):
-        at = [i for i, method in enumerate(methods) if (method, kind) in found]
-        values = [summary(found[methods[i], kind]) for i in at]
+        at = [i for i, method in enumerate(methods) if (method, kind) in values_by_bar]
+        values = [summary(values_by_bar[methods[i], kind]) for i in at]
         spread, left = [v.sd for v in values], (number - (len(kinds) - 1) / 2) * width
         axes.bar(
             np.array(at) + left, [v.mean for v in values], 0.92 * width, yerr=spread,
@@ -214,7 +216,7 @@ def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
         rows: lines (`ResultRow.as_line`) that differ in `task`, `method` and seed, in the order to
             be drawn.
     """
-    found = _by_seed(rows, ("task", "method"), "score")
+    scores = _group_seeds(rows, ("task", "method"), "score")
     tasks, methods = (list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method"))
     columns = min(_PANELS, len(tasks))
     lines = -(-len(tasks) // columns)
@@ -222,11 +224,11 @@ def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     figure.suptitle(title, fontsize=8)
     panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
     for task, axes in zip(tasks, panels, strict=False):
-        at = [i for i, method in enumerate(methods) if (task, method) in found]
-        values = [summary(found[task, methods[i]]) for i in at]
-        shown = [OURS if methods[i] == "ucf" else PLAIN for i in at]
-        errors = [each.standard_error for each in values]
-        axes.barh(at, [each.mean for each in values], xerr=errors, color=shown, height=0.75)
+        at = [i for i, method in enumerate(methods) if (task, method) in scores]
+        values = [summary(scores[task, methods[i]]) for i in at]
+        bar_colors = [OURS if methods[i] == "ucf" else PLAIN for i in at]
+        errors = [value.standard_error for value in values]
+        axes.barh(at, [value.mean for value in values], xerr=errors, color=bar_colors, height=0.75)
         axes.set_title(task)
         axes.grid(True, axis="x")
     panels[0].set_yticks(range(len(methods)), [label(method) for method in methods])
@@ -281,9 +283,9 @@ def attention_map(weights: Float64Array, title: str = "") -> Figure:
     for number, (axes, name) in enumerate(zip(panels, modalities, strict=True)):
         # What a row cannot see is left white; actions are seen one step late.
         hidden = np.arange(k)[None, :] > np.arange(k)[:, None] - (name == "actions")
-        shown = np.where(hidden, np.nan, weights[:, number])
+        visible = np.where(hidden, np.nan, weights[:, number])
         box = (ago[0] - 0.5, 0.5, 0.5, ago[0] - 0.5)
-        image = axes.imshow(shown, norm=scale, extent=box)
+        image = axes.imshow(visible, norm=scale, extent=box)
         axes.set_title(f"{name}: {100 * weights[-1, number].sum():.0f}% of step 0")
         axes.set_xlabel("step attended to (0 is now)")
     panels[0].set_ylabel("acting step")
@@ -304,7 +306,7 @@ def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     )  # fmt: skip
 
 
-def _by_seed(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
+def _group_seeds(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:
     """Values by their rows' `names`; of a seed that comes twice, the last counts."""
     latest: dict[Any, dict[int, float]] = defaultdict(dict)
     for row in rows:

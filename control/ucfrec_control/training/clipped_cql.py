@@ -25,13 +25,13 @@ class ClippedCQL(CQL):  # type: ignore[misc]
     def inner_create_impl(self, observation_shape: Any, action_size: int) -> None:
         """Make the networks, as CQL does."""
         super().inner_create_impl(observation_shape, action_size)
-        made, config = self._impl, self._config
+        impl, config = self._impl, self._config
         self._impl = ClippedCQLImpl(
             observation_shape=observation_shape,
             action_size=action_size,
-            modules=made.modules,
-            q_func_forwarder=made._q_func_forwarder,
-            targ_q_func_forwarder=made._targ_q_func_forwarder,
+            modules=impl.modules,
+            q_func_forwarder=impl._q_func_forwarder,
+            targ_q_func_forwarder=impl._targ_q_func_forwarder,
             gamma=config.gamma,
             tau=config.tau,
             alpha_threshold=config.alpha_threshold,

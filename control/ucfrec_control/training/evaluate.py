@@ -156,12 +156,12 @@ def open_environment(
     observation_size = int(np.prod(env.single_observation_space.shape or ()))
     sizes = (observation_size, *(env.single_action_space.shape or ()))
     logged = record.sizes["state"] + len(record.dropped_observations)
-    wanted = (logged, record.sizes["action"])
-    if sizes != wanted:
+    expected = (logged, record.sizes["action"])
+    if sizes != expected:
         env.close()
         raise InputError(
             f"observations and actions of {env_id} have sizes {sizes}, the policy was trained "
-            f"on {wanted}"
+            f"on {expected}"
         )
     return env
 
@@ -179,7 +179,7 @@ def takes_target(record: RunRecord | RLRecord) -> bool:
 
 
 def rules_of(
-    trained: Trained, env_id: str, given: Sequence[float | None] = ()
+    trained: Trained, env_id: str, targets: Sequence[float | None] = ()
 ) -> Sequence[DecisionRule | None]:
     """The target returns given, else those of the preset, as rules; (None,) for policies without a
     target return."""
@@ -188,8 +188,8 @@ def rules_of(
         return (None,)
     task = require_task(env_id, dataset["dataset"])
     preset = find_preset(task.name, find_kind(dataset["dataset"]), method).targets
-    own = (None,) if trained.policy.config.max_return else preset
-    return [DecisionRule(target) for target in given or own]
+    default = (None,) if trained.policy.config.max_return else preset
+    return [DecisionRule(target) for target in targets or default]
 
 
 def _row(
@@ -235,7 +235,7 @@ def _row(
         wall_time_s=seconds,
         **provenance(PACKAGES),
     )
-    found = {
+    metrics = {
         "score": float(task.score(rolled_out.returns.mean())),
         "score_std": summary(task.score(rolled_out.returns)).sd if episodes > 1 else None,
         "return": float(rolled_out.returns.mean()),
@@ -249,7 +249,7 @@ def _row(
         "dataset_versions": dataset["versions"],
         "warnings": mismatches(dataset, env_id) or None,
     }
-    return row.extended(found)
+    return row.extended(metrics)
 
 
 _BATCHES, _BATCH = 8, 512
@@ -267,8 +267,9 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
     dropped = trained.dropped
     _, validation = training_views(without_columns(store, dropped))
     generator = np.random.default_rng(0)
-    added = [each["dimension"] for each in trained.record.data.others.get("distractors", [])]
-    dimensions = [d - sum(other < d for other in dropped) for d in added if d not in dropped]
+    sources = trained.record.data.others.get("distractors", [])
+    distractors = [distractor["dimension"] for distractor in sources]
+    dimensions = [d - sum(lower < d for lower in dropped) for d in distractors if d not in dropped]
     losses = []
     for _ in range(_BATCHES):
         steps = validation.draw_steps(generator, _BATCH)
@@ -276,6 +277,6 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
         fixed = windows.states.clone()
         fixed[..., dimensions] = 0.0
         both = (windows, replace(windows, states=fixed))
-        losses.append([float(trained.policy.action_loss(each)) for each in both])
+        losses.append([float(trained.policy.action_loss(batch)) for batch in both])
     loss, at_zero = np.mean(losses, axis=0)
     return {"loss": float(loss), "loss_at_zero": float(at_zero)}

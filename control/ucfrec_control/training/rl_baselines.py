@@ -20,7 +20,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec.files.locks import claimed, remove_leftovers_within
+from ucfrec.files.locks import lock_path, remove_leftovers_within
 from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
@@ -154,7 +154,7 @@ class RLPolicy(Memoryless):
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """The policy's mean actions (N, A)."""
-        return self._algorithm.predict(_normalised(observations, self._mean, self._std)), None
+        return self._algorithm.predict(_normalise(observations, self._mean, self._std)), None
 
 
 def is_rl(record: RunRecord | RLRecord) -> bool:
@@ -172,17 +172,6 @@ def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RL
     task = find_task(dataset["env_id"], dataset["dataset"])
     kind = find_kind(dataset["dataset"])
     return RLConfig(algorithm=algorithm, task=task.name if task else "", kind=kind, **settings)
-
-
-def action_loss(run: Path, store: EpisodeStore) -> float:
-    """Mean squared error of the actor's mean actions at all validation steps of `store`, whose
-    training `run` is."""
-    validation = store.split("validation")
-    steps = validation.all_steps()
-    policy = RLPolicy(run)
-    live = np.ones(len(steps[0]), dtype=bool)
-    taken, _ = policy.act(validation.step_values(schema.OBSERVATION, *steps), live)
-    return float(np.mean((taken - validation.step_values(schema.ACTION, *steps)) ** 2))
 
 
 def plain_config(config: RLConfig, seed: int) -> dict[str, Any]:
@@ -203,7 +192,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLR
         InputError: d3rlpy is not installed, `out` is of another configuration or other data, or
             another process is training in it.
     """
-    with claimed(out, "trained"):
+    with lock_path(out, "trained"):
         remove_leftovers_within(out)
         return _train(store, out, config, seed)
 
@@ -213,8 +202,8 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     d3rlpy = _d3rlpy()
     if (out / RUN).exists():
         existing = RLRecord.read(out)
-        wanted = (plain_config(config, seed), store.record.fingerprint)
-        if (existing.settings, existing.fingerprint) != wanted:
+        expected = (plain_config(config, seed), store.record.fingerprint)
+        if (existing.settings, existing.fingerprint) != expected:
             raise InputError(
                 f"{out} has a run with other settings or data; remove it or name another folder"
             )
@@ -254,35 +243,13 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     log.close()
     actor = algorithm.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
-    record = record.with_entries(
+    record = record.copy_with(
         policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
     )
     if (out / _CHECKPOINT).exists():
-        record.written(out)
+        record.write(out)
         (out / _CHECKPOINT).unlink()
-    return record.sealed(out)
-
-
-@random_state_kept()
-def timed_updates(store: EpisodeStore, config: RLConfig, updates: int) -> float:
-    """Seconds of one update of a training on `store`, by the time of a few.
-
-    Raises:
-        InputError: d3rlpy is not installed.
-    """
-    d3rlpy, train = _d3rlpy(), store.split("train")
-    mean, std = _statistics(train, config)
-    dataset = _dataset(d3rlpy, train, mean.numpy(), std.numpy())
-    algorithm, times = _algorithm(config), [0.0]
-    algorithm.fit(
-        dataset,
-        n_steps=updates + 2,
-        n_steps_per_epoch=updates + 2,
-        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-        show_progress=False,
-        callback=lambda *_: times.append(perf_counter()),
-    )
-    return (times[-1] - times[2]) / updates
+    return record.seal(out)
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
@@ -304,7 +271,7 @@ def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
         "wall_time_s": 0.0,
     }
     with atomic_folder(out) as scratch:
-        RLRecord.of(entries, out / RUN).sealed(scratch)
+        RLRecord.of(entries, out / RUN).seal(scratch)
 
 
 def _resume(path: Path, algorithm: Any, dataset: Any) -> tuple[int, float]:
@@ -337,7 +304,7 @@ def _dataset(d3rlpy: Any, train: EpisodeStore, mean: Array, std: Array) -> Any:
     terminated = train.episode_values(schema.TERMINATED).astype(bool)[episodes]
     observations = train.step_values(schema.OBSERVATION, episodes, steps)
     return d3rlpy.dataset.MDPDataset(
-        _normalised(observations, mean, std),
+        _normalise(observations, mean, std),
         train.step_values(schema.ACTION, episodes, steps),
         train.step_values(schema.REWARD, episodes, steps),
         terminals=(last & terminated).astype(np.float32),
@@ -428,7 +395,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     )
 
 
-def _normalised(states: Array, mean: Array, std: Array) -> Float32Array:
+def _normalise(states: Array, mean: Array, std: Array) -> Float32Array:
     normalised: Float32Array = ((states - mean) / std).astype(np.float32)
     return normalised
 

@@ -59,9 +59,9 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     return Preset(tables, tuple(targets))
 
 
-def _names(given: str | list[str], value: str) -> bool:
+def _names(names: str | list[str], value: str) -> bool:
     """Whether a rule's `given` is `value`, or names it among others."""
-    return value in ([given] if isinstance(given, str) else given)
+    return value in ([names] if isinstance(names, str) else names)
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:
@@ -104,5 +104,5 @@ def train_control(
         InputError: as `train_screened`, or the store is not a control store.
     """
     dataset_of(store)
-    about = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, about, shared, callbacks)
+    package_versions = {"versions": versions(PACKAGES)}
+    return train_screened(store, out, config, screening, package_versions, shared, callbacks)

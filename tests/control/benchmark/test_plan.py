@@ -15,10 +15,10 @@ from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
 from ucfrec.results.rows_file import read_rows
 from ucfrec.runs.config import Config, resolve_config
-from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, TRIED_CONTEXTS, budget_of
-from ucfrec_control.benchmark.measure import CONTEXT, SCORE_MEASUREMENT
+from ucfrec_control.benchmark import plan
+from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of
+from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import (
-    CONTEXTS,
     EQUAL_TIME,
     MAIN,
     METHODS,
@@ -28,10 +28,8 @@ from ucfrec_control.benchmark.methods import (
     ROBUSTNESS,
     SCREENED,
     TABLES,
-    WITH_HISTORY,
 )
-from ucfrec_control.benchmark.plan import context_cells, score_cells, with_contexts
-from ucfrec_control.benchmark.rates import settings_of
+from ucfrec_control.benchmark.plan import SEARCHED, score_cells, set_contexts, settings_of
 from ucfrec_control.commands.options import context_given
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.environments.scores import find_kind, require_task
@@ -139,27 +137,17 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
     assert len(budget_of(ROBUSTNESS, "full").tasks) == 3, "Appendix G.4"
 
 
-def test_contexts_are_chosen_with_other_episodes_in_runs_of_the_main_table(tmp_path: Path) -> None:
+def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8))
-    made = {"tasks": ("hopper_medium-made",), "tasks_of": {}}
-    budget = replace(budget_of(CONTEXTS, "medium"), **made)
-    cells = list(context_cells(tmp_path, tmp_path / "out", budget))
-    assert {cell.method for cell in cells} == set(WITH_HISTORY)
-    assert {cell.conditions[CONTEXT] for cell in cells} == set(TRIED_CONTEXTS)
-    reported = replace(budget_of(MAIN, "medium"), **made)
-    assert {cell.evaluation.seed for cell in cells} != {reported.evaluation.seed}
-    chosen = with_contexts(reported, {"dc-wo-time": 20})
-    runs = {
-        cell.method: (cell.run, cell.config.policy.context)
-        for cell in score_cells(tmp_path, tmp_path / "out", chosen, MAIN)
-        if cell.training_seed == 0
+    medium = replace(budget_of(MAIN, "medium"), tasks=("hopper_medium-made",), tasks_of={})
+    budget = set_contexts(medium, {"dc-wo-time": 20})
+    contexts = {
+        cell.method: cell.config.policy.context
+        for cell in score_cells(tmp_path, tmp_path / "out", budget, MAIN)
     }
-    for cell in cells:
-        assert cell.config.policy.context == cell.conditions[CONTEXT]
-        shared = (cell.run, cell.config.policy.context) == runs[cell.method]
-        assert shared == ((cell.method, cell.conditions[CONTEXT]) == ("dc-wo-time", 20))
-    assert {runs[name][1] for name in ("ucf", "dt-wo-time")} == {8}
-    assert {runs[name][1] for name in ("bc", "bc-10", "bc-25")} == {1}
+    assert contexts.pop("dc-wo-time") == 20
+    assert {contexts[name] for name in ("ucf", "dt-wo-time")} == {8}
+    assert {contexts[name] for name in ("bc", "bc-10", "bc-25")} == {1}
 
 
 @pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
@@ -167,6 +155,33 @@ def test_what_is_no_context_is_refused(given: str) -> None:
     assert context_given("ucf=20") == ("ucf", 20)
     with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
         context_given(given)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_row_is_trained_at_the_rate_of_its_policy(
+    table: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
+    monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
+    for name, method in TABLES[table].items():
+        settings = settings_of(BUDGETS["full"], name, method)
+        searched = next(m for m, row in SEARCHED.items() if row.policy == method.policy)
+        if method.policy in ALGORITHMS:
+            assert settings == ("steps=1000000", f"learning_rate={rates[searched]:g}")
+            continue
+        assert f"train.learning_rate={rates[searched]:g}" in settings, name
+        own = (*method.settings, *BUDGETS["full"].of_methods.get(name, ()))
+        assert settings[-len(own) :] == own if own else True
+
+
+def test_a_method_with_a_rate_of_its_own_is_trained_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    budget, rates = BUDGETS["small"], {"dt": 0.5, "dt-wo-time": 0.25, "ucf": 0.125}
+    monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
+    for name, rate in (("dt", 0.5), ("dt-wo-time", 0.25), ("ucf-w-time", 0.125)):
+        assert f"train.learning_rate={rate:g}" in settings_of(budget, name, METHODS[name])
+    default = [text for text in budget.settings if text.startswith("train.learning_rate")]
+    settings = settings_of(budget, "dc", METHODS["dc"])
+    assert [text for text in settings if text.startswith("train.learning_rate")] == default
 
 
 @pytest.mark.slow

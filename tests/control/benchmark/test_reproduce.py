@@ -8,12 +8,9 @@ import pytest
 from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.result_rows import result_row
 from ucfrec.benchmark.cells import Budget, Evaluation
-from ucfrec.benchmark.suite import estimated_hours
 from ucfrec.results.rows_file import append_rows, read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
-from ucfrec_control.benchmark.costs import costs
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
-from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of_part
 from ucfrec_control.cli import main
 from ucfrec_control.data.distractor import DISTRACTORS
@@ -33,27 +30,7 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     assert part.of_runs == (name in ("figure-5", "figure-6"))
 
 
-def test_the_estimate_grows_with_steps(tmp_path: Path) -> None:
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
-    hours = {}
-    for steps in (1_000, 1_000_000):
-        settings = (*TINY, f"train.steps={steps}")
-        budget = Budget(
-            "tiny",
-            ("hopper_medium-made",),
-            2,
-            Evaluation(1, 1000),
-            settings,
-            of_policies={"iql": (f"steps={steps}",)},
-        )
-        for method in ("dt", "iql"):
-            cells = list(score_cells(tmp_path, tmp_path / "out", budget, MAIN, (method,)))
-            hours[method, steps] = estimated_hours(cells, costs())
-    for method in ("dt", "iql"):
-        assert 0 < 10 * hours[method, 1_000] < hours[method, 1_000_000]
-
-
-def test_one_command_makes_a_figure_and_says_beforehand_how_long(
+def test_one_command_makes_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
@@ -64,7 +41,6 @@ def test_one_command_makes_a_figure_and_says_beforehand_how_long(
     assert main(arguments) == 0
     said = capsys.readouterr().err
     assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
-    assert "reproduce figure-5: about 0.0 hours with --workers 1" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
 
@@ -137,8 +113,6 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(
     ("command", "suite", "conditions", "lacking"),
     [
         ("benchmark", SCORES, {}, "budget"),
-        ("rates", "rates", {}, "budget"),
-        ("rates", "rates", {"budget": "small"}, "steps"),
         ("robustness", ROBUSTNESS, {"budget": "small"}, "distractor"),
     ],
 )
@@ -156,9 +130,8 @@ def test_rows_that_lack_what_is_shown_are_one_clear_error(
     assert main([command, "--show-only", "--results", str(results)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in line
-    if suite != "rates":
-        assert main(["figures", "--results", str(results), "--out", str(tmp_path / "out")]) == 2
-        assert f"{results} is damaged" in capsys.readouterr().err
+    assert main(["figures", "--results", str(results), "--out", str(tmp_path / "out")]) == 2
+    assert f"{results} is damaged" in capsys.readouterr().err
 
 
 def test_names_of_foreign_rows_do_not_steer_the_terminal(

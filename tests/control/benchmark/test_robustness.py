@@ -13,17 +13,15 @@ from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Evaluation, opened
 from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig, screen
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import training_views
-from ucfrec_control.benchmark import plan, robustness
+from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS
 from ucfrec_control.benchmark.methods import METHODS, SCREENED
-from ucfrec_control.benchmark.plan import stores_of
 from ucfrec_control.benchmark.robustness import drops, largest_drops, loss_rises, screening_rows
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
@@ -204,35 +202,6 @@ def test_training_with_screening_records_and_resumes(
     assert len(screening.dimensions) == 11
     assert main(arguments) == 0
     assert RunRecord.read(Path(run)).screening == screening
-
-
-def test_every_file_is_screened_plain_and_distracted_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(robustness, "ScreeningConfig", lambda: QUICKEST)
-    monkeypatch.setattr("ucfrec_control.commands.screen_all.ZOO", ("hopper_medium-made",))
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((20, 30) * 12))
-    results = tmp_path / "rows.jsonl"
-    arguments = ["screen-all", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
-    arguments += ["--results", str(results)]
-    assert main(arguments) == 0
-    rows = {row.conditions["distractor"]: row for row in read_rows(results)}
-    assert rows.keys() == {"none", "deterministic", "stochastic", "early"}
-    for kind, row in rows.items():
-        name = "hopper_medium-made" + ("" if kind == "none" else f"-{kind}")
-        store = EpisodeStore.open(stores_of(tmp_path / "out") / name)
-        report = screen(training_views(store)[0], QUICKEST, seed=0)
-        found = row.details["screening"]
-        assert tuple(d["dimension"] for d in found if d["flagged"]) == report.flagged
-        added = [d["dimension"] for d in found if d["distractor"]]
-        assert row.value == len(set(report.flagged) - set(added))
-        assert added == ([] if kind == "none" else [11])
-    printed, before = capsys.readouterr().out, results.read_text()
-    effect = rows["early"].details["screening"][11]["effect"]
-    # Nothing shows these rewards, so that only measurements of them are tested.
-    assert (NONE if effect is None else f"{effect:#.3g}") in printed
-    assert main(arguments) == 0
-    assert results.read_text() == before
 
 
 @pytest.mark.slow

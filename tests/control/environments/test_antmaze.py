@@ -225,7 +225,7 @@ def test_minari_mazes_are_those_of_the_data(
     policy = load_run(run, "last")
     assert isinstance(policy, TrainedPolicy)
     data = Source.model_validate(source)
-    policy = replace(policy, record=policy.record.with_entries(data=data))
+    policy = replace(policy, record=policy.record.copy_with(data=data))
     environment = open_environment(policy, source["env_id"], 1)
     starts = [environment.reset(seed=seed)[0][0] for seed in range(5)]
     np.testing.assert_array_equal(starts[0], trajectories.observations[0])

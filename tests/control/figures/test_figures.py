@@ -151,7 +151,7 @@ def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
 
 
 def test_the_overlay_shows_the_widest_direction_first(runs: Path) -> None:
-    factual, edited = diagnostics.edited_states(runs / "tangent")
+    factual, edited = diagnostics.edit_states(runs / "tangent")
     assert 0.19 < np.linalg.norm(edited - factual, axis=1).mean() < 0.5
     (axes,) = plots.state_overlay(factual, edited).axes
     points = np.asarray(axes.collections[0].get_offsets())

@@ -5,7 +5,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -18,11 +17,9 @@ from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.processes import random_state_kept
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
-from ucfrec_control.benchmark.budgets import TRIED_RATES
-from ucfrec_control.benchmark.measure import RATE_MEASUREMENT, SCORE_MEASUREMENT
+from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import TABLES
-from ucfrec_control.benchmark.plan import rate_cells, score_cells
-from ucfrec_control.benchmark.rates import best_rates
+from ucfrec_control.benchmark.plan import score_cells
 from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.training import rl_baselines
@@ -211,17 +208,3 @@ def made(episodes: int, *settings: str) -> Budget:
     """A budget of one file with settings of IQL."""
     evaluation = Evaluation(episodes, 1000)
     return Budget("full", ("hopper_medium-made",), 1, evaluation, of_policies={"iql": settings})
-
-
-def test_rates_of_rl_are_searched_on_held_out_actions(tmp_path: Path) -> None:
-    columns = hopper_like((30, 8, 25) * 8)
-    columns["actions"] = np.tanh(columns["observations"][:, :3])
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
-    budget = made(1, "steps=99", "batch_size=64")
-    cells = list(rate_cells(tmp_path, tmp_path / "runs", budget, ("iql",), 60))
-    rows = run_grid(cells, RATE_MEASUREMENT, tmp_path / "rows.jsonl", 1)
-    assert [row.conditions["learning_rate"] for row in rows] == list(TRIED_RATES["full"])
-    assert {row.metrics["steps"] for row in rows} == {60}
-    of_no_action = np.mean(columns["actions"] ** 2)
-    assert rows[-1].value < 0.8 * rows[0].value < 0.8 * of_no_action
-    assert best_rates(rows) == {"iql": TRIED_RATES["full"][-1]}

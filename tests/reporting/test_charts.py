@@ -85,7 +85,7 @@ def test_the_text_says_what_is_drawn() -> None:
     assert interval_chart("t", []).summary == ""
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.dictionaries(st.integers(1, 10**7).map(float), VALUES, min_size=1, max_size=9))
 def test_any_curve_and_any_counts_are_drawn(curve: dict[float, float]) -> None:
     assert "<path" in line_chart("t", "x", [("run", 0, curve)]).svg

@@ -19,7 +19,7 @@ from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.report import _value
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measured, tune
+from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measure_run, tune
 
 FIXED = {
     "train.validate_every": 2,
@@ -73,7 +73,7 @@ def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]
     assert {path.name for path in searched.out.iterdir()} == {BEST, STUDY, "stages"}
     trained = TrainedPolicy.load(best)
     store = EpisodeStore.open(searched.store)
-    assert measured(trained, store, "ndcg", 5) == study.best_value
+    assert measure_run(trained, store, "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
 

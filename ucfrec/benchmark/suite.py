@@ -34,23 +34,23 @@ def announcement(costs: Costs, workers: int) -> Callable[[Sequence[Cell]], str]:
     """What a benchmark of so many processes says of the cells that are left, before it starts."""
 
     def text(cells: Sequence[Cell]) -> str:
-        hours = estimated_hours(cells, costs) / workers
+        hours = estimate_hours(cells, costs) / workers
         return f"about {hours:.1f} hours with --workers {workers}, {costs.note}"
 
     return text
 
 
-def estimated_hours(cells: Sequence[Cell], costs: Costs) -> float:
+def estimate_hours(cells: Sequence[Cell], costs: Costs) -> float:
     """CPU hours of `cells`; what several share is counted once, finished trainings are not."""
     seconds: dict[object, float] = {}
     for cell in cells:
-        if cell.run is not None and not _finished(cell.run):
+        if cell.run is not None and not _is_finished(cell.run):
             seconds[cell.run] = costs.training(cell)
             seconds |= costs.stages(cell)
     return (sum(map(costs.evaluation, cells)) + sum(seconds.values())) / 3600
 
 
-def _finished(run: Path) -> bool:
+def _is_finished(run: Path) -> bool:
     return (run / RUN).exists() and "policy" in read_json(run / RUN)
 
 
@@ -65,6 +65,10 @@ class Shown:
     markdown: Callable[[Rows], str]
     plot: Callable[[Rows, Path], list[Path]]
     """Draws into a folder; returns the files."""
+
+    def show(self, rows: Rows) -> str:
+        """The table below its title, as Markdown."""
+        return f"## {self.title}\n\n{self.markdown(rows)}"
 
 
 class Cells(Protocol):
@@ -137,8 +141,8 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
             of a single environment, or cells failed.
     """
     if request.budget not in suite.budgets:
-        known = ", ".join(suite.budgets)
-        raise InputError(f"unknown budget {request.budget}; choose one of {known}")
+        budgets = ", ".join(suite.budgets)
+        raise InputError(f"unknown budget {request.budget}; choose one of {budgets}")
     budget = suite.budgets[request.budget].narrowed(
         seeds=request.training_seeds, logs=request.logs, evaluation_seed=request.evaluation_seed
     )
@@ -163,7 +167,7 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         rows = run_grid(
             cells, suite.how, request.results, request.workers, table, announce, request.again
         )
-        parts.append(_shown(suite.tables[table], rows))
+        parts.append(suite.tables[table].show(rows))
         suite.tables[table].plot(rows, plots)
     return "\n\n".join([*parts, f"pictures: {plots}"])
 
@@ -171,13 +175,9 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
 def show(suite: Benchmark, tables: Sequence[str], rows: Rows) -> str:
     """The tables that have rows in `rows`, as Markdown; nothing is measured."""
     by_table = {table: [row for row in rows if row.table == table] for table in tables}
-    return "\n\n".join(_shown(suite.tables[t], own) for t, own in by_table.items() if own)
+    return "\n\n".join(suite.tables[t].show(group) for t, group in by_table.items() if group)
 
 
-def _shown(table: Shown, rows: Rows) -> str:
-    return f"## {table.title}\n\n{table.markdown(rows)}"
-
-
-def _require_known(kind: str, given: Sequence[str], known: Collection[str]) -> None:
-    if unknown := [name for name in given if name not in known]:
-        raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(known)}")
+def _require_known(kind: str, names: Sequence[str], choices: Collection[str]) -> None:
+    if unknown := [name for name in names if name not in choices]:
+        raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(choices)}")

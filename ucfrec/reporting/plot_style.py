@@ -103,10 +103,10 @@ def label(name: str) -> str:
 
 def colors(names: Iterable[str]) -> dict[str, str]:
     """Name to color: the fixed color of the name, else an unused color of the palette."""
-    wanted = list(names)
-    taken = {_FIXED.get(name) for name in wanted}
+    listed = list(names)
+    taken = {_FIXED.get(name) for name in listed}
     free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
-    return {name: _FIXED.get(name) or next(free) for name in wanted}
+    return {name: _FIXED.get(name) or next(free) for name in listed}
 
 
 @styled

@@ -13,7 +13,7 @@ from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, announcement, estimated_hours, show
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, announcement, estimate_hours, show
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -286,22 +286,22 @@ def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
     cells = [
         cell for cell in planned(tmp_path, budget).cells("main") if cell.method in ("dt", "ucf")
     ]
-    dt, ucf = (estimated_hours([cell], COSTS) for cell in cells)
+    dt, ucf = (estimate_hours([cell], COSTS) for cell in cells)
     assert 0 < dt < ucf
     again = [replace(cell, table="shared") for cell in cells]
-    shared = estimated_hours([*cells, *again], COSTS) - dt - ucf
+    shared = estimate_hours([*cells, *again], COSTS) - dt - ucf
     assert 0 < shared < ucf
     other = replace(cells[1], run=tmp_path / "other", settings=(*cells[1].settings, "policy.dim=8"))
     assert (
-        ucf < estimated_hours([cells[1], other], COSTS) < 2 * ucf - 20 / 3600
+        ucf < estimate_hours([cells[1], other], COSTS) < 2 * ucf - 20 / 3600
     )  # copies are made once
     assert "about 0.0 hours with --workers 2" in announcement(COSTS, 2)(cells)
     assert cells[1].run is not None
     cells[1].run.mkdir(parents=True)
     (cells[1].run / "run.json").write_text('{"config": {}}')
-    assert estimated_hours([cells[1]], COSTS) == ucf, "a training that was interrupted counts"
+    assert estimate_hours([cells[1]], COSTS) == ucf, "a training that was interrupted counts"
     (cells[1].run / "run.json").write_text('{"config": {}, "policy": {}}')
-    assert 0 < estimated_hours([cells[1]], COSTS) < dt, (
+    assert 0 < estimate_hours([cells[1]], COSTS) < dt, (
         "only the evaluation is left of a finished run"
     )
 

@@ -51,7 +51,6 @@ def run_grid(
     results: Path,
     workers: int,
     describe: str = "benchmark",
-    announce: Callable[[Sequence[Cell]], str] | None = None,
     again: bool = False,
 ) -> list[ResultRow]:
     """Measure every cell that has no row in `results` yet.
@@ -69,7 +68,6 @@ def run_grid(
             fill it (`ucfrec.results.rows_file.benchmarking`).
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
-        announce: what to say of the cells that are left before they are measured.
         again: remove the rows, runs and shared stages of `cells` first. An interrupted call is
             resumed without it.
 
@@ -103,9 +101,6 @@ def run_grid(
     )
     if not missing:
         return [row for group in rows.values() for row in group]
-    if announce is not None:
-        text = announce([tasks[name].cell for name in missing])
-        print(f"{describe}: {text}", file=sys.stderr)
     errors: list[str] = []
     workers = min(workers, len(missing))
     measure = _measure_in_processes if workers > 1 else _measure_here

@@ -1,7 +1,4 @@
-"""A suite of tables: what a package declares as a benchmark, measured and shown in one way.
-
-How long it takes is estimated from what the suite says of the cost of its parts.
-"""
+"""A suite of tables: what a package declares as a benchmark, measured and shown in one way."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,47 +9,7 @@ from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.benchmark.grid import Measurement, run_grid
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
-from ucfrec.files.atomic import read_json
 from ucfrec.results.row import ResultRow
-from ucfrec.runs.record import RUN
-
-
-@dataclass(frozen=True)
-class Costs:
-    """CPU seconds of the parts of a cell."""
-
-    training: Callable[[Cell], float]
-    """Of the updates of the cell's policy."""
-    evaluation: Callable[[Cell], float]
-    note: str
-    """Where these numbers come from, and what they exclude."""
-    stages: Callable[[Cell], Mapping[object, float]] = lambda cell: {}
-    """Of the stages before and after the updates, by a key that cells with a common one share."""
-
-
-def announcement(costs: Costs, workers: int) -> Callable[[Sequence[Cell]], str]:
-    """What a benchmark of so many processes says of the cells that are left, before it starts."""
-
-    def text(cells: Sequence[Cell]) -> str:
-        hours = estimate_hours(cells, costs) / workers
-        return f"about {hours:.1f} hours with --workers {workers}, {costs.note}"
-
-    return text
-
-
-def estimate_hours(cells: Sequence[Cell], costs: Costs) -> float:
-    """CPU hours of `cells`; what several share is counted once, finished trainings are not."""
-    seconds: dict[object, float] = {}
-    for cell in cells:
-        if cell.run is not None and not _is_finished(cell.run):
-            seconds[cell.run] = costs.training(cell)
-            seconds |= costs.stages(cell)
-    return (sum(map(costs.evaluation, cells)) + sum(seconds.values())) / 3600
-
-
-def _is_finished(run: Path) -> bool:
-    return (run / RUN).exists() and "policy" in read_json(run / RUN)
-
 
 Rows = Sequence[ResultRow]
 
@@ -96,7 +53,6 @@ class Benchmark:
     """Names that `BenchmarkRequest.methods` may have."""
     plan: Callable[["BenchmarkRequest", Budget], Cells]
     how: Measurement[Cell]
-    costs: Costs
 
 
 @dataclass(frozen=True)
@@ -163,10 +119,7 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
             for cell in plan.cells(table)
             if not request.methods or cell.run is None or cell.method in request.methods
         ]
-        announce = announcement(suite.costs, request.workers)
-        rows = run_grid(
-            cells, suite.how, request.results, request.workers, table, announce, request.again
-        )
+        rows = run_grid(cells, suite.how, request.results, request.workers, table, request.again)
         parts.append(suite.tables[table].show(rows))
         suite.tables[table].plot(rows, plots)
     return "\n\n".join([*parts, f"pictures: {plots}"])

@@ -109,7 +109,7 @@ def _chart(title: str, columns: list[str], table: str) -> str:
     numbers = "; ".join(
         f"{name}: " + ", ".join("–" if v is None else v[2] for v in values) for name, values in rows
     )
-    svg = str(render(figure, title, numbers).svg)
+    svg = render(figure, title, numbers).svg
     size = f'xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{height}"'
     panel = f'<rect class="panel" x="1" y="1" width="{WIDTH - 2}" height="{height - 2}" rx="8"/>'
     start, _, body = svg.partition(">")

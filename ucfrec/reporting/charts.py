@@ -5,6 +5,7 @@ Colors are variables of the page's style sheet (`--ink`, `--soft`, `--rule`, `--
 a chart is drawn.
 """
 
+import html
 import io
 import re
 import textwrap
@@ -16,7 +17,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from markupsafe import Markup, escape
 
 from ucfrec.errors import one_line
 
@@ -65,8 +65,8 @@ class Chart:
 
     title: str
     summary: str
-    svg: Markup
-    """An element of a page, with the summary as its label."""
+    svg: str
+    """An element of a page, with the summary as its label; its texts are escaped."""
 
 
 @dataclass(frozen=True)
@@ -247,5 +247,5 @@ def render(figure: "Figure", title: str, summary: str) -> Chart:
     body = re.sub(r'<g id="[\w.]+"', "<g", body).replace("xlink:href", "href")
     body = re.sub(r"(?<=: )#01\w\wfe(?=[;\"])", lambda color: f"var(--{_COLORS[color[0]]})", body)
     body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
-    label = escape(_printable(f"{title}. {summary}"))
-    return Chart(title, summary, Markup(f'<svg {box[0]} role="img" aria-label="{label}">{body}'))
+    label = html.escape(_printable(f"{title}. {summary}"))
+    return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')

@@ -51,7 +51,6 @@ def run_grid(
     results: Path,
     workers: int,
     describe: str = "benchmark",
-    announce: Callable[[Sequence[Cell]], str] | None = None,
     again: bool = False,
 ) -> list[ResultRow]:
     """Measure every cell that has no row in `results` yet.
@@ -69,7 +68,6 @@ def run_grid(
             fill it (`ucfrec.results.rows_file.benchmarking`).
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
-        announce: what to say of the cells that are left before they are measured.
         again: remove the rows, runs and shared stages of `cells` first. An interrupted call is
             resumed without it.
 
@@ -93,8 +91,8 @@ def run_grid(
         remove_rows(results, [task.key for task in tasks.values()])
         for folder in {folder for task in tasks.values() for folder in how.made(task.cell)}:
             shutil.rmtree(folder, ignore_errors=True)
-    known = read_rows(results)
-    rows = {name: [row for row in known if t.key.covers(row)] for name, t in tasks.items()}
+    measured = read_rows(results)
+    rows = {name: [row for row in measured if t.key.covers(row)] for name, t in tasks.items()}
     missing = [name for name in tasks if not rows[name]]
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
     missing.sort(key=lambda name: -1 if (seed := tasks[name].key.training_seed) is None else seed)
@@ -102,10 +100,7 @@ def run_grid(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
     )
     if not missing:
-        return [row for own in rows.values() for row in own]
-    if announce is not None:
-        said = announce([tasks[name].cell for name in missing])
-        print(f"{describe}: {said}", file=sys.stderr)
+        return [row for group in rows.values() for row in group]
     errors: list[str] = []
     workers = min(workers, len(missing))
     measure = _measure_in_processes if workers > 1 else _measure_here
@@ -122,7 +117,7 @@ def run_grid(
             f"{len(errors)} of {len(missing)} cells failed; run the command again to retry "
             f"them. The first: {errors[0]}"
         )
-    return [row for own in rows.values() for row in own]
+    return [row for group in rows.values() for row in group]
 
 
 _Outcomes = Generator[tuple[str, list[ResultRow] | BaseException], None, None]
@@ -173,17 +168,19 @@ def _measure(task: _Task[Cell]) -> list[ResultRow]:
     return rows
 
 
-def chosen(known: Iterable[str], wanted: Sequence[str], what: str) -> list[str]:
-    """The names of `known` that are in `wanted`, in the order of `known`.
+def chosen(known: Iterable[str], names: Sequence[str], what: str) -> list[str]:
+    """The names of `known` that are in `names`, in the order of `known`.
 
     Args:
-        wanted: selected names; empty for all.
+        names: selected names; empty for all.
         what: what the names stand for, for the message: "method", "table".
 
     Raises:
-        InputError: `wanted` has a name that `known` lacks.
+        InputError: `names` has a name that `known` lacks.
     """
-    known = list(known)
-    if unknown := [name for name in wanted if name not in known]:
-        raise InputError(f"no {what} is called {', '.join(unknown)}; there are {', '.join(known)}")
-    return [name for name in known if name in wanted or not wanted]
+    choices = list(known)
+    if unknown := [name for name in names if name not in choices]:
+        raise InputError(
+            f"no {what} is called {', '.join(unknown)}; there are {', '.join(choices)}"
+        )
+    return [name for name in choices if name in names or not names]

@@ -5,6 +5,7 @@ Colors are variables of the page's style sheet (`--ink`, `--soft`, `--rule`, `--
 a chart is drawn.
 """
 
+import html
 import io
 import re
 import textwrap
@@ -16,7 +17,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from markupsafe import Markup, escape
 
 from ucfrec.errors import one_line
 
@@ -65,8 +65,8 @@ class Chart:
 
     title: str
     summary: str
-    svg: Markup
-    """An element of a page, with the summary as its label."""
+    svg: str
+    """An element of a page, with the summary as its label; its texts are escaped."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ class Interval:
 
 
 @contextmanager
-def _page_style() -> Iterator[None]:
+def page_style() -> Iterator[None]:
+    """The style of a chart, for the block or function that draws it."""
     from matplotlib import rc_context
 
     with rc_context(_STYLE), warnings.catch_warnings():
@@ -98,7 +99,7 @@ def _page_style() -> Iterator[None]:
         yield
 
 
-@_page_style()
+@page_style()
 def line_chart(
     title: str,
     x_label: str,
@@ -132,10 +133,10 @@ def line_chart(
         summaries.append(f"For comparison, {name}: {value:.4g}")
     for axis in (axes.xaxis, axes.yaxis):
         _format_labels(axis)
-    return _render(figure, title, ". ".join(summaries))
+    return render(figure, title, ". ".join(summaries))
 
 
-@_page_style()
+@page_style()
 def histogram(title: str, x_label: str, counts: Sequence[float], names: Sequence[str]) -> Chart:
     """Draw counts (N,) of N named bins as columns of equal width, whatever the bins' widths."""
     figure, axes = _plot_axes(x_label)
@@ -151,7 +152,7 @@ def histogram(title: str, x_label: str, counts: Sequence[float], names: Sequence
         f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is "
         f"{names[most]}: {counts[most]:,.6g}"
     )
-    return _render(figure, title, summary)
+    return render(figure, title, summary)
 
 
 def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> list[str]:
@@ -161,7 +162,7 @@ def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> 
     return [_short(value) for value in values or ()]
 
 
-@_page_style()
+@page_style()
 def interval_chart(title: str, intervals: Sequence[Interval], logged: float | None = None) -> Chart:
     """Draw values with their intervals one below the other.
 
@@ -201,7 +202,7 @@ def interval_chart(title: str, intervals: Sequence[Interval], logged: float | No
         summaries.append(f"For comparison, logged sessions: {logged:.4g}")
         axes.axvline(logged, color=INK, linestyle="dotted", linewidth=1)
     _format_labels(axes.xaxis)
-    return _render(figure, title, ". ".join(summaries))
+    return render(figure, title, ". ".join(summaries))
 
 
 def _plot_axes(x_label: str) -> "tuple[Figure, Axes]":
@@ -231,7 +232,7 @@ def _printable(text: str) -> str:
     return text if text.isprintable() else one_line(text)
 
 
-def _render(figure: "Figure", title: str, summary: str) -> Chart:
+def render(figure: "Figure", title: str, summary: str) -> Chart:
     """The figure as an `<svg>` of a page, with variables for its colors; matplotlib escapes texts.
 
     Its style sheet, which would be one of the whole page, and names of groups are left out.
@@ -246,5 +247,5 @@ def _render(figure: "Figure", title: str, summary: str) -> Chart:
     body = re.sub(r'<g id="[\w.]+"', "<g", body).replace("xlink:href", "href")
     body = re.sub(r"(?<=: )#01\w\wfe(?=[;\"])", lambda color: f"var(--{_COLORS[color[0]]})", body)
     body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
-    label = escape(_printable(f"{title}. {summary}"))
-    return Chart(title, summary, Markup(f'<svg {box[0]} role="img" aria-label="{label}">{body}'))
+    label = html.escape(_printable(f"{title}. {summary}"))
+    return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')

@@ -57,7 +57,7 @@ def add_measurement(
     how: str,
     of: str,
     values: Mapping[str, object],
-    said: Sequence[str] = (),
+    remarks: Sequence[str] = (),
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 
@@ -70,10 +70,10 @@ def add_measurement(
     if not os.access(run, os.W_OK):
         return
     with claim(run / MEASURED, wait=True):
-        others = [one for one in _read_measured(run) if (one["how"], one["of"]) != (how, of)]
-        known = {name: value for name, value in values.items() if value is not None}
-        measured = {"how": how, "of": of, "values": known, "said": list(said)}
-        write_json(run / MEASURED, [*others, measured])
+        unchanged = [row for row in _read_measured(run) if (row["how"], row["of"]) != (how, of)]
+        present = {name: value for name, value in values.items() if value is not None}
+        measured = {"how": how, "of": of, "values": present, "said": list(remarks)}
+        write_json(run / MEASURED, [*unchanged, measured])
         write_card(run)
 
 
@@ -96,11 +96,14 @@ def add_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -> No
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
     values = _select_values(row, names) | {"logged": rows[LOGGED].value}
-    said = (str(report.verdict), *(w for w in report.warnings if w not in report.verdict.reasons))
-    add_measurement(run, "ucfrec ope", of, values, said)
+    remarks = (
+        str(report.verdict),
+        *(w for w in report.warnings if w not in report.verdict.reasons),
+    )
+    add_measurement(run, "ucfrec ope", of, values, remarks)
 
 
-def add_ranking(run: Path, row: ResultRow, on: str, said: Sequence[str] = ()) -> None:
+def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
     intervals = row.details["intervals"]
     values: dict[str, object] = {}
@@ -110,7 +113,7 @@ def add_ranking(run: Path, row: ResultRow, on: str, said: Sequence[str] = ()) ->
             values[name] = _format_interval(row.metrics[name], intervals[name])
     of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
     of += f", liked: {row.conditions['liked']}"
-    add_measurement(run, "ucfrec rank", of, values, said)
+    add_measurement(run, "ucfrec rank", of, values, remarks)
 
 
 def _format_rule(row: ResultRow) -> str:
@@ -242,10 +245,10 @@ def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
             "here."
         )
     parts = []
-    for one in measured:
-        body = [[name, format_value(value)] for name, value in one["values"].items()]
-        parts += [f"### {one['how']}: {one['of']}", markdown_table(["what", "value"], body)]
-        parts += ["\n".join(f"- {line}" for line in one["said"])] if one["said"] else []
+    for row in measured:
+        body = [[name, format_value(value)] for name, value in row["values"].items()]
+        parts += [f"### {row['how']}: {row['of']}", markdown_table(["what", "value"], body)]
+        parts += ["\n".join(f"- {line}" for line in row["said"])] if row["said"] else []
     return "\n\n".join(parts)
 
 
@@ -264,9 +267,9 @@ def tabulate_user_model(record: RunRecord) -> Table | None:
         "reward: loss of item effects": reward.item_loss,
         "reward: loss of the model": reward.loss,
     }
-    for tried in reward.effects:
-        kept = "" if tried.kept else ", excluded"
-        rows[f"gain by {tried.effect}"] = f"{tried.gain:.5f} ± {tried.gain_error:.5f}{kept}"
+    for effect in reward.effects:
+        excluded = "" if effect.kept else ", excluded"
+        rows[f"gain by {effect.effect}"] = f"{effect.gain:.5f} ± {effect.gain_error:.5f}{excluded}"
     if (end := rule.session_end) is not None:
         rows |= {f"session end: loss, {kind}": loss for kind, loss in end.loss.items()}
         rows["session end: kept"] = end.kept

@@ -23,7 +23,7 @@ from ucfrec.reporting.page_results import (
     draw_frontier,
     read_evidence,
 )
-from ucfrec.reporting.samples import read_features, sample_tables
+from ucfrec.reporting.samples import read_features, tabulate_samples
 from ucfrec.reporting.tables import Table, format_value
 from ucfrec.reporting.training import (
     POINTS,
@@ -141,7 +141,7 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
         augmentation = record.augmentation
         if augmentation is None and (path / AUGMENTATION).exists():
             augmentation = read_augmentation(path / AUGMENTATION)
-        common = os.path.commonpath([other.parent for other in paths])
+        common = os.path.commonpath([folder.parent for folder in paths])
         name = str(path.relative_to(common))
         logged = select_curves(read_metrics(path / "policy"), record.settings)
         runs.append(_Run(path, name, record, augmentation, logged))
@@ -187,7 +187,7 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "moves": draw_moves(edited),
         "user_models": _present(item_runs, tabulate_user_model),
         "frontiers": _present(item_runs, draw_frontier),
-        "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
+        "samples": [(run.name, tabulate_samples(run.folder, features)) for run in item_runs],
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
@@ -195,8 +195,8 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
 
 def _present(runs: Sequence[_Run], make: Callable[[RunRecord], Any]) -> list[tuple[str, Any]]:
     """Name of each run and what is made of its record, where that is not None."""
-    made = [(run.name, make(run.record)) for run in runs]
-    return [(name, part) for name, part in made if part is not None]
+    parts = [(run.name, make(run.record)) for run in runs]
+    return [(name, part) for name, part in parts if part is not None]
 
 
 def _tabulate_data(record: RunRecord) -> Table:
@@ -245,8 +245,8 @@ def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     settings = [
         _flatten(run.record.settings) | _flatten({"version": run.record.versions}) for run in runs
     ]
-    names = dict.fromkeys(name for own in settings for name in own)
-    rows = [(name, [own.get(name) for own in settings]) for name in names]
+    names = dict.fromkeys(name for run_settings in settings for name in run_settings)
+    rows = [(name, [run_settings.get(name) for run_settings in settings]) for name in names]
     rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]
     return _tabulate_runs("Settings that differ", runs, rows) if rows else None
 

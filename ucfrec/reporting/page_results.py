@@ -181,7 +181,7 @@ def draw_forest(results: Results) -> Chart | None:
         for interval, row in zip(_list_intervals(names, rows), rows, strict=True)
     ]
     # The line is of one set of logs; several have a line each in their own charts.
-    logged = {one.logged.value for one in results.estimates if one.logged is not None}
+    logged = {policy.logged.value for policy in results.estimates if policy.logged is not None}
     title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
     return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
 
@@ -206,7 +206,7 @@ def _name_rows(rows: Sequence[ResultRow]) -> list[str]:
     """Policy of each row, with the fields that differ if a policy has several rows."""
     names, lines = [], [evaluation_line(row) for row in rows]
     for line in lines:
-        same = [other for other in lines if other["policy"] == line["policy"]]
+        same = [row for row in lines if row["policy"] == line["policy"]]
         fields = ("run", "checkpoint", *_SEEDS)
         differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
         parts = [line["policy"], *(f"{key} {_format_cell(line, key)}" for key in differing)]
@@ -226,7 +226,7 @@ def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
     """
     if record.rule is None:
         return None
-    known = [
+    evidence = [
         (candidate.evidence.effective_users, candidate.value, candidate.rule,
          candidate.evidence.interval)
         for candidate in record.rule.candidates
@@ -235,7 +235,7 @@ def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
         and candidate.evidence.effective_users is not None
     ]  # fmt: skip
     highest, curve, body = -math.inf, dict[float, float](), []
-    for users, value, rule, ends in sorted(known, key=lambda one: (-one[0], -one[1])):
+    for users, value, rule, ends in sorted(evidence, key=lambda rule: (-rule[0], -rule[1])):
         if value > highest:
             highest = curve[users] = value
             between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
@@ -243,7 +243,7 @@ def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
     if not curve:
         return None
     curves = [("best rule", 0, curve)]
-    chosen = [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]
+    chosen = [(users, value) for users, value, rule, _ in evidence if rule == record.rule.rule]
     if chosen:
         curves.append(("chosen rule", 1, dict(chosen[:1])))
     title = "Value in the search for a rule, against evidence"

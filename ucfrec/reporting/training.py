@@ -58,14 +58,14 @@ _REASONS: Final = {
 
 def tabulate_rows(source: Source) -> list[Table]:
     """Tables of the rows that `prepare` read and dropped; none of a store that it did not make."""
-    read = source.rows_read
-    if read is None:
+    total = source.rows_read
+    if total is None:
         return []
     counts = [(name, getattr(source, key)) for key, name in _COUNTS.items()]
     dropped = [
         (
             f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}",
-            [format_value(rows), f"{rows / read:.2%}" if read else "–"],
+            [format_value(rows), f"{rows / total:.2%}" if total else "–"],
         )
         for reason, rows in source.dropped.items()
     ]
@@ -125,8 +125,8 @@ def draw_curves(
         title = _TITLES.get(name, name)
         levels = {}
         if name in ("validation_loss", "action_loss"):
-            first, *others = (references[style] for style in curves)
-            if all(other == first for other in others):
+            first, *further = (references[style] for style in curves)
+            if all(losses == first for losses in further):
                 levels = {REFERENCES[key]: first[key] for key in REFERENCES if key in first}
         lines = [(names[style], style, curve) for style, curve in curves.items()]
         steps = sorted({step for curve in curves.values() for step in curve})

@@ -35,9 +35,9 @@ class _Return:
     high: float
     """Highest end of the rows' 95% intervals."""
 
-    def above(self, other: "_Return") -> bool:
-        """Whether all intervals are above all intervals of `other`."""
-        return self.low > other.high
+    def above(self, reference: "_Return") -> bool:
+        """Whether all intervals are above all intervals of `reference`."""
+        return self.low > reference.high
 
     def __str__(self) -> str:
         return f"{self.policy} ({format_value(self.value)})"
@@ -75,27 +75,27 @@ def _conclude(environment: str, returns: Sequence[_Return]) -> str:
     references = [policy for policy in returns if not policy.trained]
     if not trained:
         return f"In {environment}, only built-in policies were evaluated: {_join(references)}."
-    best, *others = trained
+    best, *lower = trained
     ends = f"{format_value(best.low)} to {format_value(best.high)}"
     value = f"{format_value(best.value)} (95% interval {ends})"
     if best.trainings > 1:
         value = f"{format_value(best.value)} in the mean of {best.trainings} trainings "
         value += f"(their 95% intervals span {ends})"
-    if others:
+    if lower:
         text = (
             f"In {environment}, {best.policy} has the highest return of {len(trained)} trained "
             f"policies: {value} per episode."
         )
-        if close := [policy for policy in others if not best.above(policy)]:
+        if close := [policy for policy in lower if not best.above(policy)]:
             text += f" Its interval overlaps that of {_join(close)}:"
             text += " which of them has the higher return is open."
         else:
-            text += f" Its interval lies above those of the others, the next being {others[0]}."
+            text += f" Its interval lies above those of the others, the next being {lower[0]}."
     else:
         text = f"In {environment}, {best.policy} has a return of {value} per episode."
     text += _compare(best, references)
     if max(policy.trainings for policy in trained) < 2:
-        once = "Each policy was" if others else "It was"
+        once = "Each policy was" if lower else "It was"
         text += f" {once} trained once; the spread over training seeds is unknown."
     return text
 

@@ -59,9 +59,9 @@ class ResultTable:
         from matplotlib import pyplot
 
         metric, frame = metric or self.rows[0].metric, self.to_frame()
-        known = dict.fromkeys(name for row in self.rows for name in row.metrics)
-        if metric not in known:
-            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(known)}")
+        names = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        if metric not in names:
+            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(names)}")
         frame = frame[frame[metric].notna()].iloc[::-1]
         axes = pyplot.subplots()[1] if ax is None else ax
         low, high = (
@@ -98,8 +98,8 @@ def _line(row: ResultRow) -> dict[str, Any]:
         line[name] = value
         if name in ends:
             line[f"{name}_low"], line[f"{name}_high"] = ends[name]
-    others = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
-    return {**line, **{name: value for name, value in others.items() if name not in line}}
+    fields = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
+    return {**line, **{name: value for name, value in fields.items() if name not in line}}
 
 
 @dataclass(frozen=True, repr=False)

@@ -119,7 +119,8 @@ class _ManyRules(PolicyActor):
             together = sessions.at(slice(begin, end))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
             for rule, part in batch:
-                scorer, rows_of_rule = self._scorers[rule], slice(part.start - begin, part.stop - begin)
+                scorer = self._scorers[rule]
+                rows_of_rule = slice(part.start - begin, part.stop - begin)
                 of_rule = None if excluded is None else excluded[part]
                 scores = scorer.scores_of(query.at(rows_of_rule), excluded=of_rule)
                 decisions.append(scorer.rule.choose(scores, self._generators[rule]))

@@ -25,7 +25,7 @@ from ucfrec.reporting.page_results import environments, estimates, frontier, res
 from ucfrec.reporting.samples import read_features, sample_tables
 from ucfrec.reporting.tables import Table, shown
 from ucfrec.reporting.verdict import verdict
-from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_record
+from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_candidates, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
 
 _REMEDY = "restore it or train again"
@@ -173,7 +173,11 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "copies": augmentation_table(edited) if edited else None,
         "moves": moves_chart(edited),
         "user_models": _named(item_runs, user_model_table),
-        "frontiers": _named(item_runs, frontier),
+        "frontiers": [
+            (run.name, chart)
+            for run in item_runs
+            if (chart := frontier(run.record, read_candidates(run.folder))) is not None
+        ],
         "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
         "differences": _differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],

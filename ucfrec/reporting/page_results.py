@@ -13,7 +13,7 @@ from ucfrec.reporting.charts import BarChart, LineChart, bar_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, shown
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
-from ucfrec.runs.record import RunRecord
+from ucfrec.runs.record import Candidate, RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
@@ -180,7 +180,7 @@ def _cell(line: Mapping[str, Any], column: str) -> str:
     return str(value) if column in _SEEDS and value is not None else shown(value)
 
 
-def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
+def frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[LineChart, Table] | None:
     """The highest estimated value of the rules that leave so many effective users of the log.
 
     None where the log has no propensities.
@@ -189,7 +189,7 @@ def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
         return None
     known = [
         (each.evidence.effective_users, each.value, each.rule, each.evidence.interval)
-        for each in record.rule.candidates
+        for each in candidates
         if each.value is not None and each.evidence and each.evidence.effective_users is not None
     ]
     highest, curve, body = -math.inf, dict[float, float](), []

@@ -65,7 +65,7 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
     episodes, steps = validation.all_steps()
     liked = liked_rewards(validation, validation.column("reward"))
     items = validation.step_values("item", episodes, steps)
-    candidates = read_json(folder / "run" / "run.json")["rule"]["candidates"]
+    candidates = read_json(folder / "run" / "candidates.json")
     assert len({each["rule"]["reward_weight"] for each in candidates}) == len(candidates) > 2
     for each in candidates:
         scorer = trained.scorer(replace(trained.rule, reward_weight=each["rule"]["reward_weight"]))

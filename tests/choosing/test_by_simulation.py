@@ -23,7 +23,7 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
-from ucfrec.runs.record import RuleRecord, read_record
+from ucfrec.runs.record import RuleRecord, read_candidates, read_record
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
@@ -87,8 +87,9 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     assert trained.rule == DecisionRule.from_dict(rule["rule"], "the record")
     assert "validation" in rule["chosen_by"]
     assert record["reward_model"]["loss"] < record["reward_model"]["base_loss"]
-    best = max(rule["candidates"], key=lambda each: each["value"])
-    own = next(each for each in rule["candidates"] if each["rule"] == rule["rule"])
+    candidates = read_json(folder / "run" / "candidates.json")
+    best = max(candidates, key=lambda each: each["value"])
+    own = next(each for each in candidates if each["rule"] == rule["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
     found = read_record(folder / "run")
     assert found.rule is not None
@@ -318,7 +319,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     # The chosen rule was simulated again in four times the sessions.
     more = search_of(tmp_path, trained, replace(config.rule, sessions=60))
     (simulated,) = more.simulate([trained.rule])
-    own = next(each for each in record.rule.candidates if each.rule == trained.rule)
+    own = next(each for each in read_candidates(trained.folder) if each.rule == trained.rule)
     assert (own.value, own.error) == (simulated.value, simulated.error)
 
 

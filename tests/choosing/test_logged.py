@@ -19,7 +19,7 @@ from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.reporting.model_card import tabulate_user_model
 from ucfrec.reporting.page_results import draw_frontier
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.record import RunRecord
+from ucfrec.runs.record import RunRecord, read_candidates
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import REWARD_MODEL, TrainedPolicy
@@ -103,16 +103,16 @@ def test_only_rules_that_the_log_can_evaluate_are_chosen(folder: Path) -> None:
 
 
 def test_the_report_draws_what_a_bolder_rule_would_gain(folder: Path) -> None:
-    record = RunRecord.read(folder / "run")
+    record, candidates = RunRecord.read(folder / "run"), read_candidates(folder / "run")
     assert record.rule is not None
-    found, table = draw_frontier(record), tabulate_user_model(record)
+    found, table = draw_frontier(record, candidates), tabulate_user_model(record)
     assert found is not None
     assert table is not None
     values = [float(cells[0]) for _, cells in found[1].rows]
     users = [float(cells[1]) for _, cells in found[1].rows]
     assert values == sorted(values)
     assert users == sorted(users, reverse=True)
-    best = max(each.value or 0.0 for each in record.rule.candidates)
+    best = max(each.value or 0.0 for each in candidates)
     assert values[-1] == pytest.approx(best, rel=1e-3)
     parts = dict(table.rows)
     estimate_of_run = record.rule.estimate

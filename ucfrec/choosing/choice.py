@@ -1,7 +1,7 @@
 """The choice of a decision rule: its settings, what is chosen by, and what was chosen, and why."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Final
 
 from pydantic import Field
@@ -203,7 +203,11 @@ class RuleChoice:
     """What else the choice rests on, as a JSON object."""
 
     def as_dict(self) -> dict[str, Any]:
-        """As a JSON object; `details` are entries like the others."""
-        values = asdict(self)
-        details: dict[str, Any] = values.pop("details")
-        return {**values, **details, "candidates": [*values["candidates"]]}
+        """As a JSON object, without the candidates; `details` are entries like the others."""
+        values = asdict(replace(self, candidates=()))
+        del values["candidates"]
+        return {**values, **values.pop("details"), "tried": len(self.candidates)}
+
+    def list_candidates(self) -> list[dict[str, Any]]:
+        """The candidates as JSON objects."""
+        return [{**asdict(each), "rule": each.rule.as_dict()} for each in self.candidates]

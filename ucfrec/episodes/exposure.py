@@ -280,7 +280,8 @@ class ExposureTerm(nn.Module):
         super().__init__()
         self.likeness = likeness
         self.lags = lags
-        self.register_buffer("knots", torch.linspace(0, 1, knots))
+        # On the device "meta", torch would import sympy.
+        self.register_buffer("knots", torch.linspace(0, 1, knots, device="cpu"))
         self.register_buffer("reward_low", torch.zeros(()))
         self.register_buffer("reward_high", torch.ones(()))
         self.common = nn.Parameter(torch.zeros(4, knots, 1))

@@ -1,7 +1,7 @@
 """Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -10,7 +10,6 @@ import xxhash
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
 
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file
@@ -188,65 +187,32 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
     Raises:
         InputError: they are the weights of another architecture.
     """
-    shapes = _shapes(build)
-    for name in sorted(shapes.keys() & tensors.keys()):
-        if shapes[name] != tensors[name].shape:
-            raise InputError(
-                f"{path} holds weights of another architecture ({name} is "
-                f"{list(tensors[name].shape)}, the run's record names {list(shapes[name])}); "
-                "restore both, or train again"
-            )
-    if shapes and shapes.keys() != tensors.keys():
-        name = min(shapes.keys() ^ tensors.keys())
-        raise InputError(
-            f"{path} holds weights of another architecture ({name} is only in "
-            f"{'the file' if name in tensors else 'the architecture'}); restore it or train again"
-        )
+    try:
+        with torch.device("meta"):
+            unfilled: nn.Module | None = build()
+    except Exception:  # a constructor that needs memory, or one whose error shows below
+        unfilled = None
+    if unfilled is not None:
+        load_weights(path, unfilled, tensors, assign=True)
     with damage_explained(path, REMEDY):
         module = build()
     load_weights(path, module, tensors)
     return module
 
 
-def _shapes(build: Callable[[], nn.Module]) -> dict[str, torch.Size]:
-    """Shapes of a module's weights, without memory for them; none if its constructor needs some.
-
-    What else is wrong with the constructor shows when the module is built with memory.
-    """
-    try:
-        with torch.device("meta"), _Unfilled():
-            return {name: tensor.shape for name, tensor in build().state_dict().items()}
-    except Exception:  # as many kinds as there are uses of a value
-        return {}
-
-
-class _Unfilled(TorchFunctionMode):
-    """Fills no weights: where they have no memory, torch imports its compiler to draw normal
-    numbers, and sympy to space numbers evenly, which takes as long as importing torch itself."""
-
-    def __torch_function__(
-        self,
-        func: Callable[..., Any],
-        types: Sequence[type],
-        args: tuple[Any, ...] = (),
-        kwargs: dict[str, Any] | None = None,
-    ) -> Any:
-        given = kwargs or {}
-        if func in (nn.init.normal_, Tensor.normal_):
-            return args[0] if args else given["tensor"]
-        if func is torch.linspace:
-            return torch.empty(given["steps"] if "steps" in given else args[2])
-        return func(*args, **given)
-
-
-def load_weights(path: Path, module: nn.Module, tensors: dict[str, Tensor]) -> None:
+def load_weights(
+    path: Path, module: nn.Module, tensors: dict[str, Tensor], assign: bool = False
+) -> None:
     """Load `tensors` into `module`; `path`, where they were read from, is for the message.
+
+    Args:
+        assign: whether the tensors become those of the module; otherwise they are copied.
 
     Raises:
         InputError: they are the weights of another architecture.
     """
     try:
-        module.load_state_dict(tensors)
+        module.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:
         first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
         raise InputError(

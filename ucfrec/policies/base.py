@@ -17,7 +17,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
-from ucfrec.policies.layers import some_padding
+from ucfrec.policies.layers import embedding, some_padding
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
@@ -289,7 +289,7 @@ class TokenEmbedding(nn.Module):
         super().__init__()
         self.embed_return: nn.Module = nn.Linear(1, config.dim)
         self.embed_state = nn.Linear(state_size, config.dim)
-        self.embed_timestep = nn.Embedding(config.max_timestep, config.dim)
+        self.embed_timestep = embedding(config.max_timestep, config.dim)
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,6 +12,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
 from ucfrec.policies.heads import ItemHead
+from ucfrec.policies.layers import draw_normal, embedding
 from ucfrec.settings import settings_table
 
 
@@ -37,8 +38,8 @@ class BPRPolicy(SequencePolicy):
     def __init__(self, config: BPRConfig, sizes: Mapping[str, int]) -> None:
         require_items("bpr", sizes)
         super().__init__(config, sizes)
-        self.of_history = torch.nn.Embedding(sizes["items"], config.dim)
-        torch.nn.init.normal_(self.of_history.weight, std=0.1)
+        self.of_history = embedding(sizes["items"], config.dim)
+        draw_normal(self.of_history.weight, std=0.1)
         for name in ("reward_low", "reward_high"):
             self.register_buffer(name, torch.zeros(()))
 

@@ -144,7 +144,7 @@ class RewardPrompt(nn.Module):
 
     def __init__(self, config: DT4RecConfig) -> None:
         super().__init__()
-        self.register_buffer("centres", torch.linspace(0, 1, config.buckets))
+        self.register_buffer("centres", torch.linspace(0, 1, config.buckets, device="cpu"))
         self.weight = nn.Linear(1, config.buckets, bias=False)
         self.mix = nn.Linear(config.buckets, config.buckets, bias=False)
         self.embed_centre = nn.Linear(1, config.dim)

@@ -79,11 +79,24 @@ def some_padding(mask: Tensor) -> Tensor | None:
     return None if known and bool(mask.all()) else mask
 
 
+def draw_normal(weight: Tensor, std: float = 1.0) -> Tensor:
+    """Fill `weight` from N(0, std²), unless it has no memory, as where sizes are compared with
+    those of a file: torch would import its compiler, which takes longer than torch itself."""
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
+    return weight
+
+
+def embedding(rows: int, size: int) -> nn.Embedding:
+    """`nn.Embedding(rows, size)`, with `draw_normal`."""
+    return nn.Embedding(rows, size, _weight=draw_normal(torch.empty(rows, size)))
+
+
 def init_linear(module: nn.Module) -> None:
     """Initialise all linear layers as GPT-2 does: weights from N(0, 0.02²), biases 0."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
-            nn.init.normal_(layer.weight, std=0.02)
+            draw_normal(layer.weight, std=0.02)
             nn.init.zeros_(layer.bias)
 
 

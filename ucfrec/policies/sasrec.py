@@ -14,7 +14,7 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy, require_items
 from ucfrec.policies.dt import Block, DTConfig, rows_through
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.layers import Dropout, visible_tokens
+from ucfrec.policies.layers import Dropout, embedding, visible_tokens
 from ucfrec.settings import Share, settings_table
 
 
@@ -38,7 +38,7 @@ class SASRecPolicy(SequencePolicy):
 
     def __init__(self, config: SASRecConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
-        self.embed_timestep = nn.Embedding(config.max_timestep, config.dim)
+        self.embed_timestep = embedding(config.max_timestep, config.dim)
         self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.final_norm = nn.LayerNorm(config.dim)

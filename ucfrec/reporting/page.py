@@ -37,7 +37,7 @@ from ucfrec.reporting.training import (
     tabulate_rows,
 )
 from ucfrec.reporting.verdict import verdict
-from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_record
+from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_candidates, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
 
 _REMEDY = "restore it or train again"
@@ -186,7 +186,11 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "augmentation": tabulate_augmentation(edited) if edited else None,
         "moves": draw_moves(edited),
         "user_models": _present(item_runs, tabulate_user_model),
-        "frontiers": _present(item_runs, draw_frontier),
+        "frontiers": [
+            (run.name, chart)
+            for run in item_runs
+            if (chart := draw_frontier(run.record, read_candidates(run.folder))) is not None
+        ],
         "samples": [(run.name, tabulate_samples(run.folder, features)) for run in item_runs],
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],

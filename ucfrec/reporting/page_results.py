@@ -13,7 +13,7 @@ from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, format_value
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
-from ucfrec.runs.record import RunRecord
+from ucfrec.runs.record import Candidate, RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
@@ -219,7 +219,9 @@ def _format_cell(line: Mapping[str, Any], column: str) -> str:
     return str(value) if column in _SEEDS and value is not None else format_value(value)
 
 
-def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
+def draw_frontier(
+    record: RunRecord, candidates: Sequence[Candidate]
+) -> tuple[Chart, Table] | None:
     """The highest estimated value of the rules that leave so many effective users of the log.
 
     None where the log has no propensities.
@@ -229,7 +231,7 @@ def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
     evidence = [
         (candidate.evidence.effective_users, candidate.value, candidate.rule,
          candidate.evidence.interval)
-        for candidate in record.rule.candidates
+        for candidate in candidates
         if candidate.value is not None
         and candidate.evidence
         and candidate.evidence.effective_users is not None

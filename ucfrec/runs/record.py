@@ -38,6 +38,8 @@ from ucfrec.user_model.session_end import SessionEndReport
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
+CANDIDATES: Final = "candidates.json"
+"""File of the decision rules that the choice tried."""
 
 
 def _complete(sizes: dict[str, int]) -> dict[str, int]:
@@ -129,14 +131,15 @@ class Candidate(Entry):
 
 
 class RuleRecord(Entry):
-    """The decision rule that was chosen, and all candidates (see `ucfrec.choosing`)."""
+    """The decision rule that was chosen, and why (see `ucfrec.choosing`)."""
 
     model_config = ConfigDict(extra="allow")
 
     rule: SavedRule
     chosen_by: Text
     warning: Text = ""
-    candidates: tuple[Candidate, ...] = ()
+    tried: Count = 0
+    """Number of rules in the file `CANDIDATES`."""
     estimate: ValueEstimate | None = None
     halves_agree: tuple[bool, bool] | None = None
     """Whether the sessions of either half of the users would choose the rule, too."""
@@ -382,6 +385,19 @@ def read_training(run: Path) -> TrainingRecord:
     return RunRecord.read(run) if record.library == "ucfrec" else record
 
 
+def read_candidates(run: Path) -> tuple[Candidate, ...]:
+    """The decision rules that the choice of a run tried; none if it did not choose.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = run / CANDIDATES
+    if not path.exists():
+        return ()
+    with damage_explained(path, RunRecord.REMEDY):
+        return TypeAdapter(tuple[Candidate, ...]).validate_python(read_json(path))
+
+
 def read_augmentation(path: Path) -> AugmentationReport:
     """The report of an augmentation that is made, of a run that may still be in training.
 
@@ -464,7 +480,7 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
 
 
 def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
-    estimate, tried = choice.estimate, len(choice.candidates)
+    estimate, tried = choice.estimate, choice.tried
     if estimate is None:
         how = (
             f"It ranked best of {tried} rules in the validation period.\n"

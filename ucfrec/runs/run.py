@@ -34,6 +34,7 @@ from ucfrec.progress import phase
 from ucfrec.runs.config import Config
 from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
+    CANDIDATES,
     RUN,
     RuleRecord,
     RunRecord,
@@ -277,6 +278,7 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking
     choice = choose(Problem(scorer, users, *given))
     write_json(run.out / RULE, choice.rule.as_dict())
+    write_json(run.out / CANDIDATES, choice.list_candidates())
     return RuleRecord.model_validate(choice.as_dict())
 
 

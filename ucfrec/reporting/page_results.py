@@ -219,9 +219,7 @@ def _format_cell(line: Mapping[str, Any], column: str) -> str:
     return str(value) if column in _SEEDS and value is not None else format_value(value)
 
 
-def draw_frontier(
-    record: RunRecord, candidates: Sequence[Candidate]
-) -> tuple[Chart, Table] | None:
+def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
     """The highest estimated value of the rules that leave so many effective users of the log.
 
     None where the log has no propensities.

@@ -1,7 +1,6 @@
 """Messages are one line, whatever text they quote."""
 
 import errno
-import os
 from pathlib import Path
 
 import pytest
@@ -26,17 +25,11 @@ def test_a_terminal_is_not_steered() -> None:
     assert one_line("a\n\x1b[31mred\x07\r\nb") == "a \\x1b[31mred\\x07  b"
 
 
-@pytest.mark.parametrize("number", sorted(errno.errorcode))
-def test_every_error_of_the_system_is_one_line_with_its_file(number: int) -> None:
-    error = OSError(number, os.strerror(number), "some\nfile")
-    said = explain_os_error(error)
-    assert said.startswith("some file: ")
-    assert said.isprintable()
-
-
-def test_what_is_no_system_error_is_said_as_it_is() -> None:
+def test_an_error_of_the_system_is_one_line_with_its_file() -> None:
+    full = explain_os_error(OSError(errno.ENOSPC, "No space left", "some\nfile"))
+    assert full == "some file: No space left; nothing was written; free space and run again"
     assert explain_os_error(OSError("it broke\nbadly")) == "it broke badly"
-    assert explain_os_error(OSError(errno.EXDEV, "x", "a", None, "b")).startswith("a → b: ")
+    assert explain_os_error(OSError(errno.EXDEV, "x", "a", None, "b")) == "a → b: x"
 
 
 def test_damage_names_the_file() -> None:

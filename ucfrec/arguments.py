@@ -18,9 +18,9 @@ Check = Callable[[str, Any], Any]
 """Takes the name of an argument and its value, and returns the value to use in its place."""
 LARGEST_SEED: Final = 2**32 - 1
 """scikit-learn accepts no larger one."""
-_Given = ParamSpec("_Given")
+_Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
-_One = TypeVar("_One")
+_Value = TypeVar("_Value")
 _WRITTEN: Final = (str, bytes, int, float, np.generic, list, tuple, set, dict, type(None))
 """Kinds of values that messages write out."""
 
@@ -31,37 +31,29 @@ def shown(value: object) -> str:
     return reprlib.repr(value) if written else f"a value of type {type(value).__name__}"
 
 
-def require_whole(name: str, value: object, least: int = 1) -> int:
+def require_whole(name: str, value: object, least: int = 1, most: int | None = None) -> int:
     """The whole number that `value` is; NumPy's count too.
 
     Raises:
-        InputError: it is not a whole number, or below `least`.
+        InputError: it is not a whole number, below `least` or above `most`.
     """
-    whole = _whole(value)
-    if whole is None or whole < least:
-        raise InputError(f"{name} is {shown(value)}; give a whole number, {least} or more")
+    try:
+        whole = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        whole = None
+    if whole is None or whole < least or (most is not None and whole > most):
+        limits = f", {least} or more" if most is None else f" from {least} to {most:,}"
+        raise InputError(f"{name} is {shown(value)}; give a whole number{limits}")
     return whole
 
 
 def require_seed(name: str, value: object) -> int:
-    """The seed that `value` is; NumPy's integers count too.
+    """The seed that `value` is: a whole number from 0 to `LARGEST_SEED`.
 
     Raises:
-        InputError: it is not a whole number, or out of range.
+        InputError: it is something else.
     """
-    whole = _whole(value)
-    if whole is None or not 0 <= whole <= LARGEST_SEED:
-        raise InputError(
-            f"{name} is {shown(value)}; give a whole number from 0 to {LARGEST_SEED:,}"
-        )
-    return whole
-
-
-def _whole(value: object) -> int | None:
-    try:
-        return None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        return None
+    return require_whole(name, value, 0, LARGEST_SEED)
 
 
 def require_number(name: str, value: object) -> float:
@@ -111,8 +103,8 @@ def require_kind(what: str, *kinds: Any) -> Check:
     return check
 
 
-def several(name: str, given: object, what: str, *kinds: type[_One]) -> list[_One]:
-    """The values that are given: one, or any number of them.
+def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -> list[_Value]:
+    """The values of an argument that is one of them, or any number.
 
     Args:
         what: one of them in words, e.g. "a Recommender".
@@ -121,16 +113,17 @@ def several(name: str, given: object, what: str, *kinds: type[_One]) -> list[_On
     Raises:
         InputError: one has another type.
     """
-    alone = isinstance(given, kinds) or not _is_list(given)
-    values = [given] if alone else list(cast("Iterable[object]", given))
-    if wrong := [value for value in values if not isinstance(value, kinds)]:
-        raise InputError(f"{name} has {shown(wrong[0])}; give {what}")
-    return cast("list[_One]", values)
+    alone = isinstance(argument, kinds) or not _is_list(argument)
+    values = [argument] if alone else list(cast("Iterable[object]", argument))
+    for value in values:
+        if not isinstance(value, kinds):
+            raise InputError(f"{name} has {shown(value)}; give {what}")
+    return cast("list[_Value]", values)
 
 
-def checked(
+def check_arguments(
     checks: Mapping[str, Check],
-) -> Callable[[Callable[_Given, _Result]], Callable[_Given, _Result]]:
+) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
     """A decorator that checks arguments by their names, before anything else happens.
 
     None is not checked where it is the default.
@@ -139,21 +132,21 @@ def checked(
         checks: name of an argument to its check.
     """
 
-    def decorate(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+    def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         signature = inspect.signature(function)
-        own = {name: checks[name] for name in signature.parameters if name in checks}
 
         @wraps(function)
-        def call(*args: _Given.args, **named: _Given.kwargs) -> _Result:
+        def call(*args: _Parameters.args, **named: _Parameters.kwargs) -> _Result:
             try:
-                given = signature.bind(*args, **named)
+                bound = signature.bind(*args, **named)
             except TypeError:
                 return function(*args, **named)  # raises the same with the function's name
-            for name, check in own.items():
-                value, default = given.arguments.get(name), signature.parameters[name].default
-                if name in given.arguments and not (value is None and default is None):
-                    given.arguments[name] = check(name, value)
-            return function(*given.args, **given.kwargs)
+            for name, value in bound.arguments.items():
+                if name in checks and not (
+                    value is None and signature.parameters[name].default is None
+                ):
+                    bound.arguments[name] = checks[name](name, value)
+            return function(*bound.args, **bound.kwargs)
 
         return call
 

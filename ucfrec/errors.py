@@ -72,47 +72,10 @@ def _visible(character: str) -> str:
 
 def explain_os_error(error: OSError) -> str:
     """What went wrong and what to do, on one line, for an error of the operating system."""
-    what, remedy = _OS_ERRORS.get(
-        error.errno or 0, (error.strerror or str(error) or "input or output failed", "")
-    )
-    named = [
+    names = [
         os.fsdecode(f) for f in (error.filename, error.filename2) if isinstance(f, str | bytes)
     ]
-    where = " → ".join(named)
-    parts = f"{where}: {what}" if where else what
-    return one_line(f"{parts}; {remedy}" if remedy else parts)
-
-
-_DISK = "no space is left on its disk; nothing was written", "free space and run again"
-_OS_ERRORS = {
-    errno.ENOSPC: _DISK,
-    errno.EDQUOT: ("the disk quota is used up; nothing was written", "free space and run again"),
-    errno.EROFS: ("the file system is read-only", "write elsewhere"),
-    errno.EACCES: ("no permission", "change its permissions or name another path"),
-    errno.EPERM: ("not permitted", "change its permissions or name another path"),
-    errno.ENOENT: (
-        "does not exist, or was removed meanwhile",
-        "check the path and run again",
-    ),
-    errno.ENOTDIR: ("a part of the path is a file, not a folder", "check the path"),
-    errno.EISDIR: ("is a folder, a file is needed", "name a file"),
-    errno.EEXIST: ("exists already", "remove it or name another path"),
-    errno.ENOTEMPTY: (
-        "another process has written it meanwhile; nothing was overwritten",
-        "name another path",
-    ),
-    errno.ENAMETOOLONG: ("the name is too long for the file system", "shorten it"),
-    errno.EFBIG: (
-        "the file would be larger than this system or process may write",
-        "raise the limit (ulimit -f) or write elsewhere",
-    ),
-    errno.ELOOP: ("too many symbolic links", "check the path"),
-    errno.EMFILE: ("too many files are open in this process", "raise the limit (ulimit -n)"),
-    errno.ENFILE: ("too many files are open on this machine", "close other programs"),
-    errno.ENOMEM: ("out of memory", "close other programs or use smaller settings"),
-    errno.EIO: ("the disk reports an input or output error", "check the disk"),
-    errno.ESTALE: ("the network file system lost the file", "run again"),
-    errno.ENOLCK: ("the file system offers no locks", "write to another file system"),
-    errno.EXDEV: ("the folder lies on another file system", "write elsewhere"),
-}
-"""Error number to (what is wrong, what to do)."""
+    what = error.strerror or str(error) or "input or output failed"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        what += "; nothing was written; free space and run again"
+    return one_line(f"{' → '.join(names)}: {what}" if names else what)

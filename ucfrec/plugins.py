@@ -37,40 +37,35 @@ def load_plugin(group: str, name: str) -> Any:
     entry = _entry(group, name)
     kind, module, title = _ONE_OF[group]
     try:
-        found = entry.load()
+        plugin = entry.load()
     except Exception as error:  # the module of a plug-in may raise anything
         raise InputError(
             f"the {kind} {name!r} is installed as {entry.value}, which cannot be imported "
             f"({type(error).__name__}: {error}); correct or reinstall its package"
         ) from error
-    if not isinstance(found, getattr(import_module(module), title)):
+    if not isinstance(plugin, getattr(import_module(module), title)):
         raise InputError(
             f"the {kind} {name!r} is installed as {entry.value}, which is of type "
-            f"{type(found).__name__}; it must be a {module}.{title}"
+            f"{type(plugin).__name__}; it must be a {module}.{title}"
         )
-    return found
+    return plugin
 
 
 def plugin_package(group: str, name: str) -> str:
-    """Name of the distribution that the plugin `name` is installed from; empty if it is unknown.
-
-    Raises:
-        InputError: as `load_plugin`.
-    """
+    """Name of the distribution that the plugin `name` is installed from; empty if it is unknown."""
     return _package(_entry(group, name))
 
 
 def _entry(group: str, name: str) -> EntryPoint:
-    found = [each for each in entry_points(group=f"ucfrec.{group}") if each.name == name]
-    if not found:
-        known = ", ".join(plugin_names(group)) or "none"
-        raise InputError(f"no {_ONE_OF[group][0]} is called {name!r}; installed: {known}")
-    if len({each.value for each in found}) > 1:
-        packages = " and ".join(sorted(_package(each) for each in found))
-        raise InputError(
-            f"the packages {packages} both have a {_ONE_OF[group][0]} {name!r}; uninstall one"
-        )
-    return found[0]
+    entries = [entry for entry in entry_points(group=f"ucfrec.{group}") if entry.name == name]
+    kind, *_ = _ONE_OF[group]
+    if not entries:
+        installed = ", ".join(plugin_names(group)) or "none"
+        raise InputError(f"no {kind} is called {name!r}; installed: {installed}")
+    if len({entry.value for entry in entries}) > 1:
+        packages = " and ".join(sorted(map(_package, entries)))
+        raise InputError(f"the packages {packages} both have a {kind} {name!r}; uninstall one")
+    return entries[0]
 
 
 def _package(entry: EntryPoint) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
@@ -24,65 +24,41 @@ _BLAS: Final = 128 * 2**20
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised in the main thread by Ctrl-C or TERM."""
+    """Raised in the main thread by Ctrl-C or TERM, which have the number `number`."""
 
     def __init__(self, number: int) -> None:
-        """
-        Args:
-            number: of the signal.
-        """
         super().__init__(number)
         self.status = 128 + number
         """Exit status of a process that ends by this signal."""
 
 
-def end_at_once_when_interrupted() -> None:
-    """From now on Ctrl-C and TERM end this process with one line and status 130 or 143.
-
-    For the time in which nothing that needs an orderly end has begun, such as imports.
-    """
-    for number in ENDING:
-        signal.signal(number, _end)
-
-
-def print_anywhere() -> None:
-    """From now on stdout and stderr replace characters that their encoding lacks.
-
-    An ASCII terminal, as PYTHONIOENCODING=ascii makes one, or a file name that is not Unicode must
-    not end a command whose work is done.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-
-
-def ignore_interruptions() -> None:
-    """From now on Ctrl-C and TERM change nothing: for a process whose work is done.
-
-    Its status says so, too; without this, Python gives the signals back to the operating system
-    while it ends, and the process would count as killed.
-    """
-    for number in ENDING:
-        signal.signal(number, signal.SIG_IGN)
-
-
 def run_program(module: str) -> int:
     """Run the `main` of a module with the arguments of this process; returns its exit status.
 
-    It is imported once Ctrl-C and TERM end the process with one line.
+    Until it is imported, Ctrl-C and TERM end the process with one line and status 130 or 143; once
+    it has ended, they change nothing: without this, Python would give the signals back to the
+    operating system while it ends, and the process would count as killed. Characters that the
+    encoding of stdout lacks are replaced: a file name that is not Unicode must not end a command.
     """
-    end_at_once_when_interrupted()
-    print_anywhere()
+    _handle_signals(_end)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     main: Callable[[], int] = import_module(module).main
     try:
         return main()
     finally:
-        ignore_interruptions()
+        _handle_signals(signal.SIG_IGN)
 
 
 def _end(number: int, _: FrameType | None) -> NoReturn:
     os.write(2, b"interrupted\n")
     os._exit(128 + number)
+
+
+def _handle_signals(handler: Any) -> dict[signal.Signals, Any]:
+    """Set the handler of Ctrl-C and TERM; returns those that they had."""
+    return {number: signal.signal(number, handler) for number in ENDING}
 
 
 @contextmanager
@@ -111,7 +87,7 @@ def interruptions_raised() -> Iterator[None]:
         elif not came:
             reported(unraised)
 
-    before = {number: signal.signal(number, interrupt) for number in ENDING}
+    handlers = _handle_signals(interrupt)
     reported, sys.unraisablehook = sys.unraisablehook, unraisable
     try:
         yield
@@ -121,25 +97,25 @@ def interruptions_raised() -> Iterator[None]:
         raise
     finally:
         sys.unraisablehook = reported
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
 @contextmanager
 def block_ctrl_c() -> Iterator[None]:
     """Processes that are started in the block are not reached by Ctrl-C; their parent ends them."""
-    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+    if sys.platform == "win32":
         yield
         return
     from multiprocessing import resource_tracker
 
     # Starting the first process starts the tracker, too, which lets Ctrl-C through again.
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def end_with_parent() -> None:

@@ -1,7 +1,6 @@
 """Progress of long jobs on stderr: a bar on a terminal, plain lines at intervals elsewhere."""
 
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -35,119 +34,67 @@ def progress(total: float | None, job: str, unit: str, done: float = 0) -> Itera
         done: units that were finished before this process resumed the job; they do not count
             towards the rate.
     """
+    from tqdm import tqdm
+
     label = _LABEL.get()
     # Bars of several processes would overwrite each other.
-    display_class = _Bar if sys.stderr.isatty() and not label else _Lines
+    layout: dict[str, Any] = {}
+    if label or not sys.stderr.isatty():
+        tqdm.monitor_interval = 0  # no thread: every update looks at the clock
+        layout = {"delay": FIRST_LINE, "mininterval": NEXT_LINE, "miniters": 1}
+        layout |= {"ncols": 0, "file": _Lines()}
     name = ": ".join(part for part in (label, _PHASE.get(), job) if part)
-    display = display_class(total, name, unit, done)
-    try:
-        yield display
-    finally:
-        display.close()
+    scale = total is None or total >= 100_000
+    with tqdm(
+        total=total, desc=name, unit=f" {unit}", initial=done, unit_scale=scale, **layout
+    ) as bar:
+        yield _Bar(bar)
 
 
 @contextmanager
 def label_progress(name: str) -> Iterator[None]:
     """Name this job in the progress of all that it does, as one of several at the same time."""
-    before = _LABEL.set(name)
+    token = _LABEL.set(name)
     try:
         yield
     finally:
-        _LABEL.reset(before)
+        _LABEL.reset(token)
 
 
 @contextmanager
 def phase(doing: str, number: int, of: int) -> Iterator[None]:
     """Name the phase of a long job, e.g. `Fitting the reward model (2 of 5)`, in its progress."""
-    before = _PHASE.set(f"{doing} ({number} of {of})")
+    token = _PHASE.set(f"{doing} ({number} of {of})")
     try:
         yield
     finally:
-        _PHASE.reset(before)
+        _PHASE.reset(token)
 
 
 @contextmanager
 def no_progress(total: float | None, job: str, unit: str, done: float = 0) -> Iterator[Progress]:
     """As `progress`, and display nothing: another process does."""
-    yield _Nothing()
-
-
-class _Nothing:
-    def update(self, n: float = 1, **metrics: float) -> None:
-        pass
+    yield _Bar(None)
 
 
 class _Bar:
-    """On a terminal: a tqdm bar."""
-
-    def __init__(self, total: float | None, job: str, unit: str, done: float) -> None:
-        from tqdm import tqdm
-
-        scale = total is None or total >= 100_000
-        self._bar: tqdm[Any] = tqdm(
-            total=total, desc=job, unit=f" {unit}", initial=done, unit_scale=scale
-        )
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
 
     def update(self, n: float = 1, **metrics: float) -> None:
+        if self._bar is None:
+            return
         if metrics:
             self._bar.set_postfix(metrics, refresh=False)
         self._bar.update(n)
 
-    def close(self) -> None:
-        self._bar.close()
-
 
 class _Lines:
-    """Without a terminal: plain lines, so that a long job can be followed in a log file."""
+    """Stderr of a job without a terminal: every state of tqdm's bar is a line of its own."""
 
-    def __init__(self, total: float | None, job: str, unit: str, done: float) -> None:
-        self._total, self._job, self._unit = total, job, unit
-        self._initial = self._done = done
-        self._start = time.monotonic()
-        self._next = self._start + FIRST_LINE
-        self._metrics: dict[str, float] = {}
+    def write(self, text: str) -> None:
+        if text := text.strip("\r\n "):
+            print(text, file=sys.stderr)
 
-    def update(self, n: float = 1, **metrics: float) -> None:
-        self._done += n
-        self._metrics |= metrics
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + NEXT_LINE
-            self._print(now - self._start)
-
-    def close(self) -> None:
-        seconds = time.monotonic() - self._start
-        if seconds >= FIRST_LINE:
-            line = f"{self._job}: {self._done:,.0f} {self._unit} done, {_duration(seconds)}"
-            print(line, file=sys.stderr, flush=True)
-
-    def _print(self, seconds: float) -> None:
-        rate = (self._done - self._initial) / seconds
-        if self._total:
-            share = self._done / self._total
-            parts = [f"{self._done:,.0f} of {self._total:,.0f} {self._unit} ({share:.0%})"]
-        else:
-            parts = [f"{self._done:,.0f} {self._unit}"]
-        parts.append(_rate(rate, self._unit))
-        if self._total and rate > 0:
-            parts.append(f"{_duration(max(self._total - self._done, 0) / rate)} left")
-        parts += [f"{name} {value:.4g}" for name, value in self._metrics.items()]
-        print(f"{self._job}: {', '.join(parts)}", file=sys.stderr, flush=True)
-
-
-def _rate(per_second: float, unit: str) -> str:
-    """A rate in the shortest time unit in which it is at least 1, at most hours: `3 steps/min`."""
-    for span, seconds in (("s", 1), ("min", 60), ("h", 3600)):
-        rate = per_second * seconds
-        if rate >= 1 or span == "h":
-            break
-    return f"{rate:,.0f} {unit}/{span}" if rate >= 100 else f"{rate:.3g} {unit}/{span}"
-
-
-def _duration(seconds: float) -> str:
-    """A duration in its two largest units: `42 s`, `3 min 20 s`, `5 h 12 min`."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    def flush(self) -> None:
+        sys.stderr.flush()

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -16,17 +17,12 @@ def versions(packages: Sequence[str] = ()) -> dict[str, str]:
     """Installed versions of Python and of the packages that results depend on.
 
     Args:
-        packages: further distributions to include, e.g. those of a simulator.
-
-    Returns:
-        {name: version}; packages that are not installed are excluded.
+        packages: further distributions to include if they are installed, e.g. of a simulator.
     """
     installed = {"python": sys.version.split()[0]}
     for name in (*_PACKAGES, *packages):
-        try:
+        with suppress(PackageNotFoundError):
             installed[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return installed
 
 
@@ -69,10 +65,8 @@ def config_hash(config: Mapping[str, Any]) -> str:
 
 def reset_peak_memory() -> None:
     """Make `peak_memory_mib` measure from now on; has no effect on systems other than Linux."""
-    try:
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
 
 
 def peak_memory_mib() -> float:

@@ -23,12 +23,12 @@ from typing import (
 
 import pydantic
 from pydantic import ConfigDict, Field, ValidationError
-from pydantic.dataclasses import dataclass as checked_dataclass
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from ucfrec.errors import InputError
 
 Table = TypeVar("Table")
-_CHECKED: Final = ConfigDict(
+_CONFIG: Final = ConfigDict(
     # Strict: `true` and "1" are not accepted as numbers; an int is accepted as a float.
     strict=True,
     extra="forbid",
@@ -84,8 +84,7 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
 
     Ranges are annotated for pydantic (`Annotated[int, Field(ge=1)]`); constraints between fields
     are checked in `__post_init__`, with `require`. A list is accepted for a tuple.
-    `dataclasses.fields`, `asdict` and `replace`
-    work as on any dataclass. Constructing the class with an invalid value raises `SettingError`.
+    Constructing the class with an invalid value raises `SettingError`.
 
     Args:
         name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
@@ -93,24 +92,20 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     """
 
     def decorate(cls: type[Table]) -> type[Table]:
-        table: Any = checked_dataclass(frozen=True, config=_CHECKED)(cls)
+        table: Any = pydantic_dataclass(frozen=True, config=_CONFIG)(cls)
         build, names = table.__init__, [f.name for f in fields(table)]
-        tuples = {name for name, info in _fields(table).items() if _takes_tuple(info.annotation)}
-
-        def taken(name: str, value: Any) -> Any:
-            return _as_tuple(value) if name in tuples else value
+        tuples = {key for key, info in _fields(table).items() if _takes_tuple(info.annotation)}
 
         @wraps(build)
-        def checked(self: Any, *args: Any, **values: Any) -> None:
-            by_position = [taken(*each) for each in zip(names, args, strict=False)]
-            by_name = {name: taken(name, value) for name, value in values.items()}
+        def check(self: Any, *args: Any, **values: Any) -> None:
+            values |= dict(zip(names, args, strict=False))
+            converted = {key: _convert_lists(values[key]) for key in tuples & values.keys()}
             try:
-                build(self, *by_position, *args[len(names) :], **by_name)
+                build(self, *args[len(names) :], **{**values, **converted})
             except ValidationError as error:
-                given = dict(zip(names, args, strict=False)) | values
-                raise _setting_error(table, name, error, given) from None
+                raise _setting_error(table, name, error, values) from None
 
-        table.__init__ = checked
+        table.__init__ = check
         result: type[Table] = table
         return result
 
@@ -140,14 +135,8 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
         name: of the table, the prefix of the keys.
     """
     for key, info in _fields(type(table)).items():
-        meaning = next(
-            (
-                base_fields[key].description
-                for base in type(table).__mro__
-                if key in (base_fields := _fields(base)) and base_fields[key].description
-            ),
-            "",
-        )
+        infos = [_fields(base).get(key) for base in type(table).__mro__]
+        meaning = next((i.description for i in infos if i is not None and i.description), "")
         allowed = _allowed(info.annotation, info.metadata)
         yield Setting(f"{name}.{key}", getattr(table, key), allowed, " ".join(meaning.split()))
 
@@ -157,10 +146,10 @@ def is_table(cls: type) -> bool:
     return bool(_fields(cls))
 
 
-def nearest(name: str, known: Sequence[str]) -> str:
-    """The end of a message about an unknown `name`: the most similar known name, else all."""
-    matches = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {matches[0]!r}?" if matches else f"there are {', '.join(known)}"
+def nearest(name: str, names: Sequence[str]) -> str:
+    """The end of a message about an unknown `name`: the most similar of `names`, else all."""
+    matches = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {matches[0]!r}?" if matches else f"there are {', '.join(names)}"
 
 
 def _fields(table: type) -> Mapping[str, Any]:
@@ -178,37 +167,29 @@ def _takes_tuple(annotation: Any) -> bool:
     return tuple in (origin, annotation)
 
 
-def _as_tuple(value: Any) -> Any:
+def _convert_lists(value: Any) -> Any:
     """A list, and lists in it, as tuples, because TOML and JSON have lists only."""
-    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+    return tuple(map(_convert_lists, value)) if isinstance(value, list) else value
 
 
 def _setting_error(
-    table: Any, name: str, error: ValidationError, given: Mapping[str, Any]
+    table: Any, name: str, error: ValidationError, values: Mapping[str, Any]
 ) -> SettingError:
     """The first of pydantic's errors, as one line."""
-    first = error.errors(include_url=False)[0]
-    known = list(_fields(table))
+    first, infos = error.errors(include_url=False)[0], _fields(table)
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):
         # Not the same one: it would hold `error`, which holds it, and Python finds no cycles there.
         return SettingError(str(cause), *cause.keys)
-    # Pydantic locates positional arguments by their index.
-    at = first["loc"][0]
-    key = known[at] if isinstance(at, int) and at < len(known) else str(at)
-    if key not in known:
-        message = f"{name or table.__name__} has no field {key!r}; {nearest(key, known)}"
-        return SettingError(message, _key(name, key))
-    info = _fields(table)[key]
-    allowed = _allowed(info.annotation, info.metadata)
-    value = _shortened(repr(given[key])) if key in given else "missing"
-    key = _key(name, key)
+    field_name = str(first["loc"][0])
+    key = f"{name}.{field_name}" if name else field_name
+    if field_name not in infos:
+        hint = nearest(field_name, list(infos))
+        return SettingError(f"{name or table.__name__} has no field {field_name!r}; {hint}", key)
+    allowed = _allowed(infos[field_name].annotation, infos[field_name].metadata)
+    value = " ".join(repr(values[field_name]).split()) if field_name in values else "missing"
+    value = value if len(value) <= 60 else f"{value[:57]}…"
     return SettingError(f"{key} is {value}; it must be {allowed}", key)
-
-
-def _shortened(text: str) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= 60 else f"{text[:57]}…"
 
 
 def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
@@ -220,8 +201,8 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         kinds = [_allowed(kind, metadata) for kind in get_args(annotation) if kind is not NoneType]
         return f"{' or '.join(kinds)}, or unset"
     if get_origin(annotation) is Literal:
-        *others, last = map(repr, get_args(annotation))
-        return f"{', '.join(others)} or {last}" if others else last
+        *choices, last = map(repr, get_args(annotation))
+        return f"{', '.join(choices)} or {last}" if choices else last
     if get_origin(annotation) is tuple:
         inner = get_args(annotation)
         count = "one or more" if inner[-1] is Ellipsis else len(inner)
@@ -251,7 +232,3 @@ def _range(metadata: Sequence[Any]) -> str:
 def _number(value: float) -> str:
     written = f"{value:,.0f}" if value == round(value) else f"{value:g}"
     return written if len(written) < 10 else f"{value:g}".replace("e+0", "e").replace("e+", "e")
-
-
-def _key(table: str, name: str) -> str:
-    return f"{table}.{name}" if table else name

@@ -1,6 +1,5 @@
 """Outputs appear whole or not at all."""
 
-import errno
 import json
 import math
 import os
@@ -17,7 +16,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.errors import InputError, explain_os_error
+from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder, read_json, write_json, write_sealed_json
 from ucfrec.fitting.checkpoint import save_tensors
 
@@ -36,18 +35,6 @@ def test_a_folder_appears_when_its_block_ends(tmp_path: Path) -> None:
         assert scratch.parent == target.parent
     assert (target / "inner" / "a").read_text() == "1"
     assert names(target.parent) == ["out"]
-
-
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
-def test_a_folder_whose_block_raises_never_was(tmp_path: Path, error: type[BaseException]) -> None:
-    def write() -> None:
-        with atomic_folder(tmp_path / "out") as scratch:
-            (scratch / "a").write_text("1")
-            raise error
-
-    with pytest.raises(error):
-        write()
-    assert names(tmp_path) == []
 
 
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
@@ -82,38 +69,25 @@ def test_a_file_is_replaced_when_its_block_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_file_whose_block_raises_stays_as_it_was(
-    tmp_path: Path, error: type[BaseException]
-) -> None:
-    target = tmp_path / "a.txt"
-    target.write_text("old")
+def test_a_block_that_raises_changes_nothing(tmp_path: Path, error: type[BaseException]) -> None:
+    (tmp_path / "a.txt").write_text("old")
 
-    def write() -> None:
-        with atomic_file(target) as scratch:
-            scratch.write_text("half of the n")
+    def write(open_scratch: Any, name: str) -> None:
+        with open_scratch(tmp_path / name) as scratch:
+            (scratch / "a" if scratch.is_dir() else scratch).write_text("half of the n")
             raise error
 
-    with pytest.raises(error):
-        write()
-    assert target.read_text() == "old"
+    for open_scratch, name in ((atomic_file, "a.txt"), (atomic_folder, "out")):
+        with pytest.raises(error):
+            write(open_scratch, name)
+    assert (tmp_path / "a.txt").read_text() == "old"
     assert names(tmp_path) == ["a.txt"]
-
-
-@pytest.mark.parametrize("write", [atomic_file, atomic_folder])
-def test_an_error_of_a_full_disk_names_what_was_written(tmp_path: Path, write: Any) -> None:
-    for code in (errno.ENOSPC, errno.EDQUOT):
-        with pytest.raises(OSError, match=r"No space|quota") as raised, write(tmp_path / "out"):
-            raise OSError(code, os.strerror(code))
-        assert explain_os_error(raised.value).startswith(f"{tmp_path / 'out'}: ")
-    with pytest.raises(OSError, match="Input/output") as raised, write(tmp_path / "out"):
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-    assert raised.value.filename is None
 
 
 def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:
     target = tmp_path / "a.json"
     write_json(target, {"numbers": list(range(2000))})
-    for attempt in range(12):
+    for attempt in range(6):
         child = os.fork()
         if child == 0:
             try:

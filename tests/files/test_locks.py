@@ -41,7 +41,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("how", ["lock", "folder", "file"])
+@pytest.mark.parametrize("how", ["folder", "file"])
 def test_the_holder_is_named_and_death_frees_its_claim_and_scratch(
     tmp_path: Path, how: str
 ) -> None:
@@ -51,7 +51,7 @@ def test_the_holder_is_named_and_death_frees_its_claim_and_scratch(
     with pytest.raises(InputError, match=said), lock_path(path, "trained"):
         raise AssertionError("the block must not run")
     remove_leftovers(tmp_path)
-    assert scratch_of(path).exists() == (how != "lock")
+    assert scratch_of(path).exists()
     assert other.poll() is None
     other.kill()
     other.wait()
@@ -87,11 +87,11 @@ def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:
     path = tmp_path / "count"
     path.write_text("0")
     children = []
-    for _ in range(4):
+    for _ in range(3):
         child = os.fork()
         if child == 0:
             try:
-                for _ in range(25):
+                for _ in range(15):
                     with claim(path, wait=True):
                         count = int(path.read_text())
                         with atomic_file(path) as scratch:
@@ -100,13 +100,13 @@ def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:
             finally:
                 os._exit(1)
         children.append(child)
-    assert [os.waitpid(child, 0)[1] for child in children] == [0] * 4
-    assert path.read_text() == "100"
+    assert [os.waitpid(child, 0)[1] for child in children] == [0] * 3
+    assert path.read_text() == "45"
     assert names(tmp_path) == ["count"]
 
 
 def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_path: Path) -> None:
-    for attempt in range(20):
+    for attempt in range(10):
         child = os.fork()
         if child == 0:
             try:
@@ -116,7 +116,7 @@ def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_p
                 os._exit(0)
             finally:
                 os._exit(1)
-        time.sleep(0.001 * attempt)
+        time.sleep(0.002 * attempt)
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         if (tmp_path / "out").exists():
@@ -129,11 +129,11 @@ def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_p
 
 def test_a_lock_file_of_a_stranger_says_nothing_but_is_respected(tmp_path: Path) -> None:
     lock = tmp_path / ".out.ucfrec-lock"
-    lock.write_bytes(b'{"pid": "\xff')
+    lock.write_bytes(b"\xff")
     with lock_path(tmp_path / "out"):
-        assert b"pid" in lock.read_bytes()
+        assert b"process" in lock.read_bytes()
     other = holder("lock", tmp_path / "out")
-    lock.write_bytes(b"[" * 5000)
+    lock.write_bytes(b"\xff" * 5000)
     with (
         pytest.raises(InputError, match="is being written by another process; wait"),
         lock_path(tmp_path / "out"),

@@ -78,7 +78,7 @@ def three_files(tmp_path: Path) -> Path:
     """A folder with three files and their record."""
     folder = tmp_path / "sealed"
     (folder / "inner").mkdir(parents=True)
-    for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(3_000_000))):
+    for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(30_000))):
         (folder / name).write_bytes(content)
     Example(files={}, version=1, numbers=(0.1, float("nan"))).seal(folder)
     return folder
@@ -99,7 +99,7 @@ def test_what_was_sealed_comes_back_and_holds(three_files: Path) -> None:
 def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_path: Path) -> None:
     generator, before = random.Random(0), Example.read(three_files)
     found = 0
-    for number in range(300):
+    for number in range(90):
         copy = tmp_path / "copy"
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(three_files, copy)
@@ -118,19 +118,19 @@ def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_pa
         # The flip was in the layout of the record, or in the name of its entry "checksum".
         assert path.name == "record.json"
         assert repr(record) == repr(before)
-    assert found > 270
+    assert found > 80
 
 
 def test_each_kind_of_fault_is_named(three_files: Path) -> None:
     (three_files / "a").unlink()
     (three_files / "a").mkdir()
     (three_files / "b").write_bytes(b"word")
-    (three_files / "inner" / "c").write_bytes(bytes(3_000_001))
+    (three_files / "inner" / "c").write_bytes(bytes(30_001))
     (three_files / "foreign").write_bytes(b"")
     files = read(three_files)
     faults = dict(files.faults())
     assert faults["b"] == "is truncated: 4 of 5 bytes"
-    assert faults["inner/c"] == "is grown: 3,000,001 of 3,000,000 bytes"
+    assert faults["inner/c"] == "is grown: 30,001 of 30,000 bytes"
     assert "a" in faults
     assert files.strangers() == ["foreign", "record.json"]
     with pytest.raises(InputError, match="restore the file, or make it again"):

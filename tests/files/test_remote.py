@@ -13,7 +13,7 @@ import pytest
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.remote import Input, Output, _opened, local_paths, uri_or_path
+from ucfrec.files.remote import Input, Output, _open, local_paths, uri_or_path
 from ucfrec.logs.mapping import read_mapping
 from ucfrec.logs.prepare import prepare
 
@@ -141,7 +141,7 @@ def test_an_unknown_kind_of_place_is_one_line(capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("name", ["a\\b.parquet", "..\\b.parquet", "c:b.parquet"])
 def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, name: str) -> None:
-    system, folder = _opened("memory://names-that-lead-out")
+    system, folder = _open("memory://names-that-lead-out")
     with system.open(f"{folder}/{name}", "wb") as out:
         out.write(b"1")
     with pytest.raises(InputError, match="has a file named"):  # noqa: SIM117
@@ -151,7 +151,7 @@ def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, nam
 
 
 def test_whole_files_are_copied_both_ways(tmp_path: Path, place: str) -> None:
-    n = 30_000
+    n = 3_000
     rewards = np.random.default_rng(0).normal(size=n).astype(np.float32)
     steps = {"reward": rewards, "item": np.zeros(n), "timestamp": np.arange(n)}
     EpisodeStore.write(tmp_path / "store", steps, np.full(n // 10, 10), shard_steps=n // 2)
@@ -168,7 +168,7 @@ def test_a_file_that_changes_meanwhile_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(write_log(tmp_path / "log.parquet"), "memory://changing/log.parquet")
-    system, _ = _opened("memory://changing")
+    system, _ = _open("memory://changing")
     found = system.find("/changing", detail=True)
     grown = {name: {**about, "size": about["size"] + 1} for name, about in found.items()}
     monkeypatch.setattr(type(system), "find", lambda *_, **__: grown)

@@ -59,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser,
         "--scored",
         False,
-        "LOGS are what `ucfrec score` wrote for RUN with the same decision rule; of any size: "
+        "LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: "
         "one row per session is in memory, and there are no reward models (DM, FQE, DR)",
     )
     group = parser.add_argument_group("what is estimated")

@@ -1,18 +1,17 @@
 """Atomic files and folders, and JSON."""
 
-import errno
 import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import xxhash
 
-from ucfrec.errors import InputError, explain_os_error
+from ucfrec.errors import InputError
 from ucfrec.files.locks import claim, lock_path, remove, remove_leftovers, scratch_of
 
 CHECKSUM: Final = "checksum"
@@ -39,39 +38,15 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         remove(scratch)
         scratch.mkdir()
         try:
-            with _named_where_full(path):
-                yield scratch
-            _rename(scratch, path)
+            yield scratch
+            scratch.rename(path)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
-
-
-@contextmanager
-def _named_where_full(path: Path) -> Iterator[None]:
-    """Name `path` in an error of a full disk, which names no file where an open one is written."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT) and error.filename is None:
-            error.filename = str(path)
-        raise
 
 
 def _require_absent(path: Path) -> None:
     if os.path.lexists(path):
         raise InputError(f"{path} exists already; remove it or name another output folder")
-
-
-def _rename(scratch: Path, path: Path) -> None:
-    try:
-        scratch.rename(path)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-            raise
-        raise InputError(
-            f"{path} was made by another program meanwhile and stays as it is; name another output "
-            "folder"
-        ) from None
 
 
 def require_other_files(written: Iterable[Path], read: Iterable[Path]) -> None:
@@ -105,23 +80,14 @@ def atomic_file(path: Path) -> Iterator[Path]:
         scratch = scratch_of(path)
         remove(scratch)
         try:
-            with _named_where_full(path):
-                yield scratch
-            os.replace(scratch, path)
+            yield scratch
+            scratch.replace(path)
         finally:
             remove(scratch)
 
 
 def json_text(value: Any, **layout: Any) -> str:
-    """`value` as JSON that every reader takes: NaN and ±∞, which JSON lacks, become null.
-
-    Args:
-        value: what `json.dumps` takes.
-        layout: further arguments of `json.dumps`.
-
-    Raises:
-        TypeError: `value` holds an object that JSON cannot represent.
-    """
+    """`json.dumps` for every reader: NaN and ±∞, which JSON lacks, become null."""
     try:
         return json.dumps(value, allow_nan=False, **layout)
     except ValueError:
@@ -130,18 +96,14 @@ def json_text(value: Any, **layout: Any) -> str:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
+        return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
-    """Write `value` as indented JSON, atomically; see `json_text`.
-
-    Raises:
-        TypeError: `value` holds an object that JSON cannot represent.
-    """
+    """Write `value` as indented JSON, atomically; see `json_text`."""
     with atomic_file(path) as scratch:
         scratch.write_text(json_text(value, indent=2) + "\n", encoding="utf-8")
 
@@ -157,12 +119,7 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: the file is missing, is not JSON, or was changed after it was sealed.
     """
-    try:
-        value = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is not JSON: {_reason(error)}") from None
+    value = _parse(path, _LARGEST_JSON, "JSON", json.loads)
     if isinstance(value, dict) and isinstance(value.get(CHECKSUM), str):
         stated = value.pop(CHECKSUM)
         if stated != content_checksum(value):
@@ -173,29 +130,6 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def read_text(path: Path, largest: int = _LARGEST_JSON) -> str:
-    """Read a text file that a person or a program wrote.
-
-    Args:
-        path: a regular file, as reading a pipe or a device might never end.
-        largest: size in bytes beyond which the file is refused.
-
-    Raises:
-        InputError: the file is missing, cannot be read, is too large, or is not UTF-8.
-    """
-    try:
-        if not path.is_file():
-            kind = "is not a regular file" if path.exists() else "does not exist"
-            raise InputError(f"{path} {kind}; check the path")
-        if path.stat().st_size > largest:
-            raise InputError(f"{path} has more than {largest:,} bytes; name another file")
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text: {_reason(error)}") from None
-    except OSError as error:
-        raise InputError(explain_os_error(error)) from None
-
-
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file of at most 16 MiB.
 
@@ -204,19 +138,30 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     import tomllib  # only a few commands read TOML
 
+    value: dict[str, Any] = _parse(path, _LARGEST_TOML, "TOML", tomllib.loads)
+    return value
+
+
+def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
+    """Read a text file; reading a pipe or a device might never end, so it must be a regular one.
+
+    Args:
+        largest: size in bytes beyond which the file is refused.
+    """
+    if not path.is_file():
+        what = "is not a regular file" if path.exists() else "does not exist"
+        raise InputError(f"{path} {what}; check the path")
+    if path.stat().st_size > largest:
+        raise InputError(f"{path} has more than {largest:,} bytes; name another file")
     try:
-        return tomllib.loads(read_text(path, _LARGEST_TOML))
+        return parse(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not UTF-8 text: {error}") from None
     except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is not TOML: {_reason(error)}") from None
+        raise InputError(f"{path} is not {kind}: {error}") from None
 
 
 def content_checksum(value: Mapping[str, Any]) -> str:
     """XXH3 (64 bits, hexadecimal) of a JSON object, in whatever order and layout it is written."""
     text = json_text(value, sort_keys=True, separators=(",", ":"))
     return xxhash.xxh3_64_hexdigest(text.encode())
-
-
-def _reason(error: Exception) -> str:
-    return str(error) or type(error).__name__

@@ -6,7 +6,6 @@ the lock when the process ends, also when it is killed; whoever gets the lock ne
 scratch is dead.
 """
 
-import json
 import os
 import secrets
 import shutil
@@ -15,13 +14,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from errno import ENOTDIR
 from pathlib import Path
 from typing import Final
 
 from filelock import BaseFileLock, FileLock, Timeout
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, one_line
 
 LOCK: Final = ".ucfrec-lock"
 SCRATCH: Final = ".ucfrec-partial"
@@ -56,30 +54,25 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
     Yields:
         Whether the claim is held; always true if `wait` is.
     """
-    held = (os.getpid(), _plain(path))
-    if held in _held:
+    key = (os.getpid(), _plain(path))
+    if key in _held:
         yield True
         return
-    made = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
-    lock = _lock_of(path)
-    _make_folder(path.parent)
-    opened = None
-    seconds = _FOREVER if wait else _PATIENCE
+    new_folders = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = _acquire(_lock_of(path), _FOREVER if wait else _PATIENCE)
+    if lock is None:
+        yield False
+        return
+    _held.add(key)
     try:
-        try:
-            opened = _acquire(lock, seconds)
-        except FileNotFoundError:
-            # Another process that had made the folder for nothing has removed it meanwhile.
-            _make_folder(path.parent)
-            opened = _acquire(lock, seconds)
-        if opened is not None:
-            _held.add(held)
-        yield opened is not None
+        yield True
     finally:
-        if opened is not None:
-            _held.discard(held)
-            _release(lock, opened)
-            _remove_empty(made)
+        _held.discard(key)
+        _release(lock)
+        with suppress(OSError):  # those that are empty go; the inner ones come first
+            for folder in new_folders:
+                folder.rmdir()
 
 
 @contextmanager
@@ -94,42 +87,32 @@ def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None
     Raises:
         InputError: another process holds it; the message names that process.
     """
-    claimed_path = path.with_name(f"{path.name}.{part}") if part else path
-    with claim(claimed_path) as held:
+    part_path = path.with_name(f"{path.name}.{part}") if part else path
+    with claim(part_path) as held:
         if not held:
             raise InputError(
-                f"{path} is being {use} by {_holder(_lock_of(claimed_path))}; wait for it to end, "
-                "or name another path"
+                f"{path} is being {use} by {_holder(_lock_of(part_path))}; wait for it to end, or "
+                "name another path"
             )
         yield
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the scratch and locks of processes that were killed while they wrote in `folder`."""
-    try:
-        names = [entry.name for entry in os.scandir(folder)]
-    except OSError:
-        return
-    for name in names:
-        if not (name.startswith(".") and name.endswith(LOCK)):
+    for file in folder.glob(f".?*{LOCK}"):
+        path = folder / file.name[1 : -len(LOCK)]
+        if (os.getpid(), _plain(path)) in _held:
             continue
-        path = folder / name[1 : -len(LOCK)]
-        if not path.name or (os.getpid(), _plain(path)) in _held:
-            continue
-        try:
-            opened = _acquire(folder / name, 0.0)
-        except OSError:  # of another user
-            continue
-        if opened is not None:
-            remove(scratch_of(path))
-            _release(folder / name, opened)
+        with suppress(OSError):  # of another user
+            if (lock := _acquire(file, 0.0)) is not None:
+                remove(scratch_of(path))
+                _release(lock)
 
 
 def remove_leftovers_within(folder: Path) -> None:
     """`remove_leftovers` of `folder` and of every folder in it."""
-    if folder.is_dir():
-        for each, _, _ in os.walk(folder):
-            remove_leftovers(Path(each))
+    for name, _, _ in os.walk(folder):
+        remove_leftovers(Path(name))
 
 
 @contextmanager
@@ -153,27 +136,9 @@ def remove(path: Path) -> None:
     """Remove a file, or a folder with all it holds, if it exists and can be removed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
-        return
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise NotADirectoryError(ENOTDIR, os.strerror(ENOTDIR), str(folder)) from None
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Remove folders that were made for nothing: the inner ones come first."""
-    try:
-        for folder in folders:
-            folder.rmdir()
-    except OSError:
-        return
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _plain(path: Path) -> Path:
@@ -185,52 +150,44 @@ def _lock_of(path: Path) -> Path:
     return path.with_name(f".{path.name}{LOCK}")
 
 
-def _acquire(lock: Path, seconds: float) -> BaseFileLock | None:
+def _acquire(file: Path, seconds: float) -> BaseFileLock | None:
     """The held lock; None if another process holds it for longer than `seconds`."""
     # A generator that holds a claim may be closed by another thread.
-    opened = FileLock(lock, thread_local=False, poll_interval=0.01)
+    lock = FileLock(file, thread_local=False, poll_interval=0.01)
     try:
-        opened.acquire(timeout=seconds)
-        with lock.open("r+b") as file:
-            # On Windows no one else can read the first byte, which is what is locked.
-            file.seek(1)
-            file.write(json.dumps(_this_process()).encode())
-            file.truncate()
+        lock.acquire(timeout=seconds)
+        # On Windows no one else can read the first byte, which is what is locked.
+        with file.open("r+b") as content:
+            content.write(b" " + _this_process().encode())
+            content.truncate()
     except Timeout:
         return None
     except BaseException:
-        _release(lock, opened)
+        _release(lock)
         raise
-    return opened
+    return lock
 
 
-def _release(lock: Path, opened: BaseFileLock) -> None:
+def _release(lock: BaseFileLock) -> None:
     # Whoever waits finds out that the file is gone. Windows removes it after the release.
-    if opened.is_locked:
+    if lock.is_locked:
         with suppress(OSError):
-            lock.unlink()
-    opened.release()
+            Path(lock.lock_file).unlink()
+    lock.release()
 
 
-def _this_process() -> dict[str, str | int]:
-    command = " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
-    return {
-        "pid": os.getpid(),
-        "host": socket.gethostname(),
-        "command": command[:_COMMAND_LENGTH],
-        "since": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
-    }
+def _this_process() -> str:
+    command = " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])[:_COMMAND_LENGTH]
+    since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    return f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
 
 
-def _holder(lock: Path) -> str:
+def _holder(file: Path) -> str:
     """The process that holds a lock, in words."""
     try:
-        with lock.open("rb") as file:
-            file.seek(1)
-            stated = json.loads(file.read(4096))
-        return (
-            f"process {stated['pid']} on {stated['host']} ({stated['command']}) since "
-            f"{stated['since']}"
-        )
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return "another process"
+        with file.open("rb") as content:
+            content.seek(1)
+            words = content.read(1024).decode(errors="replace")
+    except OSError:
+        words = ""
+    return one_line(words) if words.startswith("process ") else "another process"

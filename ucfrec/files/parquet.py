@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ucfrec.arrays import Array
-from ucfrec.errors import InputError, explain_os_error, one_line
+from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_file
 
 if TYPE_CHECKING:
@@ -56,18 +56,18 @@ def read_ids(path: Path, column: str) -> Array:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    require_regular(path)
+    if not path.is_file():
+        what = "is not a regular file" if path.exists() else "does not exist"
+        raise InputError(f"{path} {what}; restore it, or make the store or run again")
     try:
         with pq.ParquetFile(path) as file:
             require_plausible_rows(path, file.metadata.num_rows)
             ids = file.read([column]).column(column)
     except InputError:
         raise
-    except FileNotFoundError as error:
-        raise InputError(explain_os_error(error)) from None
     except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
         if _NO_THREAD in str(error):
-            raise MemoryError(one_line(str(error))) from None
+            raise MemoryError(str(error)) from None
         raise InputError(
             f"{path} is damaged or has no column {column!r} ({one_line(str(error)):.200}); restore "
             "it, or make the store or run again"
@@ -100,9 +100,8 @@ def write_frames(
     with atomic_file(out) as scratch:
         for frame in frames:
             table = pa.Table.from_pandas(frame, preserve_index=False)
-            table = table.replace_schema_metadata(
-                {**(table.schema.metadata or {}), **(about or {})}
-            )
+            metadata = {**(table.schema.metadata or {}), **(about or {})}
+            table = table.replace_schema_metadata(metadata)
             writer = writer or pq.ParquetWriter(scratch, table.schema)
             writer.write_table(table)
             rows += len(frame)

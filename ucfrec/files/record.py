@@ -48,22 +48,6 @@ Undefinable = Annotated[float, BeforeValidator(lambda value: math.nan if value i
 """A number that may be NaN, which JSON has as null."""
 
 
-def files_of(
-    folder: Path, record: str, known: Mapping[str, tuple[int, str]]
-) -> dict[str, tuple[int, str]]:
-    """Size and checksum of every file of a complete folder, but its record.
-
-    Args:
-        record: name of the record in it, e.g. `meta.json`.
-        known: files that keep the entry that they have.
-    """
-    return {
-        name: known.get(name) or ((folder / name).stat().st_size, file_checksum(folder / name))
-        for name in sorted(_names(folder))
-        if name != record
-    }
-
-
 def file_checksum(path: Path) -> str:
     """XXH3 (64 bits, hexadecimal) of the content of a file."""
     digest, block = xxhash.xxh3_64(), bytearray(_BLOCK)
@@ -90,9 +74,8 @@ class Sealed:
         Raises:
             InputError: the first file that is missing, or has another size.
         """
-        for name, (size, _) in self.files.items():
-            if fault := _size_fault(self.folder / name, size):
-                raise self._error(name, fault)
+        for name in self.files:
+            self._refuse(name, self._size_fault(name))
 
     def require(self, name: str) -> None:
         """Read a file and check its size and checksum; a file that is not listed passes.
@@ -100,8 +83,8 @@ class Sealed:
         Raises:
             InputError: the file is missing or has another content.
         """
-        if name in self.files and (fault := self._fault(name)):
-            raise self._error(name, fault)
+        if name in self.files:
+            self._refuse(name, self._fault(name))
 
     def require_small(self) -> None:
         """Check the sizes of all files, and the content of small ones.
@@ -131,31 +114,27 @@ class Sealed:
         return sorted(set(_names(self.folder)) - self.files.keys())
 
     def _fault(self, name: str) -> str:
-        size, stated = self.files[name]
-        path = self.folder / name
         try:
-            return _size_fault(path, size) or (
-                "" if file_checksum(path) == stated else "has another content than was written"
+            return self._size_fault(name) or (
+                ""
+                if file_checksum(self.folder / name) == self.files[name][1]
+                else "has another content than was written"
             )
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
-        except ValueError as error:  # a name that no file can have
-            return f"cannot be read ({error})"
 
-    def _error(self, name: str, fault: str) -> InputError:
-        return InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
+    def _size_fault(self, name: str) -> str:
+        path, stated = self.folder / name, self.files[name][0]
+        if not path.is_file():
+            return "is not a regular file" if path.exists() else "is missing"
+        size = path.stat().st_size
+        if size == stated:
+            return ""
+        return f"is {'truncated' if size < stated else 'grown'}: {size:,} of {stated:,} bytes"
 
-
-def _size_fault(path: Path, size: int) -> str:
-    try:
-        found = path.stat().st_size
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileNotFoundError):
-            return "is missing"
-        return f"cannot be read ({error})"
-    if found == size:
-        return "" if path.is_file() else "is not a regular file"
-    return f"is {'truncated' if found < size else 'grown'}: {found:,} of {size:,} bytes"
+    def _refuse(self, name: str, fault: str) -> None:
+        if fault:
+            raise InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
 
 
 def _names(folder: Path) -> Iterator[str]:
@@ -169,7 +148,7 @@ def _names(folder: Path) -> Iterator[str]:
 
 def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
     for name in files:
-        if Path(name).is_absolute() or ".." in Path(name).parts:
+        if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
             raise ValueError("a file lies outside the folder")
     return files
 
@@ -180,7 +159,7 @@ class Entry(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     @model_serializer(mode="wrap")
-    def _without_absent(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialize(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields = type(self).model_fields
         return {
             name: value
@@ -231,12 +210,10 @@ class Record(Entry):
         try:
             _require_bounded(value)
             return cls.model_validate(value)
-        except RecursionError:
-            raise InputError(f"{path} is damaged: it is nested too deep; {cls.REMEDY}") from None
-        except OverflowError as error:
-            raise InputError(f"{path} is damaged: {error}; {cls.REMEDY}") from None
         except ValidationError as error:
             raise _first_fault(error, path, cls.REMEDY) from None
+        except (RecursionError, OverflowError) as error:
+            raise InputError(f"{path} is damaged: {error}; {cls.REMEDY}") from None
 
     def copy_with(self, **entries: Any) -> Self:
         """A copy with other entries."""
@@ -247,17 +224,23 @@ class Record(Entry):
 
         A file that is listed already keeps its checksum, so that damage since is not signed off.
         """
-        return self.copy_with(files=files_of(folder, self.FILE, self.files)).write(folder)
+        files = {
+            name: self.files.get(name)
+            or ((folder / name).stat().st_size, file_checksum(folder / name))
+            for name in sorted(_names(folder))
+            if name != self.FILE
+        }
+        return self.copy_with(files=files).write(folder)
 
-    def reopen(self, folder: Path, kept: Container[str]) -> Self:
+    def reopen(self, folder: Path, unchanged: Container[str]) -> Self:
         """Write the record before files of the folder change.
 
         Args:
-            folder: sealed by `sealed`.
-            kept: files that will not change; the others are no longer listed.
+            folder: as `seal` left it.
+            unchanged: files that will not change; the others are no longer listed.
         """
-        listed = {name: entry for name, entry in self.files.items() if name in kept}
-        return self if listed == self.files else self.copy_with(files=listed).write(folder)
+        files = {name: entry for name, entry in self.files.items() if name in unchanged}
+        return self if files == self.files else self.copy_with(files=files).write(folder)
 
     def write(self, folder: Path) -> Self:
         """Write the record as it is; returns it."""
@@ -286,9 +269,7 @@ def _require_bounded(value: object, name: str = "") -> None:
     """Raise OverflowError for an integer that does not fit 64 bits."""
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise OverflowError(f"its {name} is a number with more than 18 digits")
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            _require_bounded(each, f"{name}.{key}" if name else str(key))
-    elif isinstance(value, list | tuple):
-        for each in value:
-            _require_bounded(each, name)
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    for key, entry in value.items() if isinstance(value, Mapping) else ():
+        _require_bounded(entry, f"{name}.{key}" if name else str(key))

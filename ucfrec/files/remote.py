@@ -10,7 +10,6 @@ connects for: a URI in a file, such as a mapping or a run's record, is a path th
 
 import argparse
 import fnmatch
-import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -50,8 +49,8 @@ def uri_or_path(
         local: type of the argument if it is a path.
     """
 
-    def read(given: str) -> Any:
-        return kind(given) if _URI.fullmatch(given) else local(given)
+    def read(argument: str) -> Any:
+        return kind(argument) if _URI.fullmatch(argument) else local(argument)
 
     read.__name__ = "path or URI"
     return read
@@ -65,17 +64,18 @@ def local_paths(options: argparse.Namespace) -> Iterator[argparse.Namespace]:
         InputError: an input cannot be read or has no place on the disk, an output cannot be
             written, or a store exists already.
     """
-    given = vars(options)
-    uris = [each for value in given.values() for each in _each(value) if _is_remote(each)]
+    values = vars(options)
+    lists = [value if isinstance(value, list) else [value] for value in values.values()]
+    uris = [argument for arguments in lists for argument in arguments if _is_remote(argument)]
     if not uris:
         yield options
         return
     with scratch_folder(Path(gettempdir()), "remote") as scratch:
         try:
             places = {
-                uri: _place(uri, scratch / str(n)) for n, uri in enumerate(dict.fromkeys(uris))
+                uri: _make_place(uri, scratch / str(n)) for n, uri in enumerate(dict.fromkeys(uris))
             }
-            yield argparse.Namespace(**{name: _local(v, places) for name, v in given.items()})
+            yield argparse.Namespace(**{name: _local(v, places) for name, v in values.items()})
             for uri, place in places.items():
                 if isinstance(uri, Output) and place.exists():
                     _send(place, uri)
@@ -85,10 +85,11 @@ def local_paths(options: argparse.Namespace) -> Iterator[argparse.Namespace]:
             _origins.clear()
 
 
-def _place(uri: str, folder: Path) -> Path:
+def _make_place(uri: str, folder: Path) -> Path:
     """Where the copy of an input is, and that of an output will be."""
     folder.mkdir()
-    relative = _fetched(uri, folder) if isinstance(uri, Input) else _require_new(uri)
+    with _errors_of(uri):
+        relative = _fetch(uri, folder) if isinstance(uri, Input) else _require_new(uri)
     # Of a glob, every file has its own address.
     _origins[str(folder)] = uri.rstrip("/").removesuffix(relative).rstrip("/")
     return folder / relative
@@ -98,13 +99,9 @@ def _is_remote(value: object) -> bool:
     return isinstance(value, Input | Output)
 
 
-def _each(value: object) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
 def _local(value: Any, places: Mapping[str, Path]) -> Any:
     if isinstance(value, list):
-        return [_local(each, places) for each in value]
+        return [_local(argument, places) for argument in value]
     return places[value] if _is_remote(value) else value
 
 
@@ -116,42 +113,44 @@ def origin(text: str | Path) -> str:
     return text
 
 
-def _opened(uri: str) -> tuple[Any, str]:
+@contextmanager
+def _errors_of(uri: str) -> Iterator[None]:
+    """Name the address in errors of a file system."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (ImportError, ValueError, OSError) as error:
+        what = one_line(str(error))
+        raise InputError(f"{uri} cannot be used ({what:.300}); check the address") from None
+
+
+def _open(uri: str) -> tuple[Any, str]:
     """The fsspec file system of a URI, and the path in it; pyarrow's own kinds need no package."""
-    import pyarrow as pa
     from fsspec.core import url_to_fs
     from fsspec.implementations.arrow import ArrowFSWrapper
     from pyarrow import fs
 
     try:
-        try:
-            system, path = fs.FileSystem.from_uri(uri)
-            return ArrowFSWrapper(system), str(path).rstrip("/")
-        except pa.ArrowInvalid as error:
-            if "Unrecognized filesystem" not in str(error):
-                raise
-        opened, path = url_to_fs(uri)
-        return opened, str(path).rstrip("/")
-    except (ImportError, ValueError, OSError) as error:
-        raise _unusable(uri, error) from None
+        system, path = fs.FileSystem.from_uri(uri)
+        system = ArrowFSWrapper(system)
+    except ValueError as error:
+        if "Unrecognized filesystem" not in str(error):
+            raise
+        system, path = url_to_fs(uri)
+    return system, str(path).rstrip("/")
 
 
-def _unusable(uri: str, error: Exception) -> InputError:
-    return InputError(f"{uri} cannot be used ({one_line(str(error)):.300}); check the address")
-
-
-def _fetched(uri: str, folder: Path) -> str:
+def _fetch(uri: str, folder: Path) -> str:
     """Copy the files at a URI to a folder; returns their path or glob in it."""
-    system, pattern = _opened(uri)
+    system, pattern = _open(uri)
     magic = re.search(r"[*?[]", pattern)
     root = pattern[: magic.start()].rpartition("/")[0] if magic else pattern
-    try:
-        found = system.find(root, detail=True)
-        sizes = {name: int(about["size"]) for name, about in found.items()}
-    except (OSError, ValueError) as error:
-        raise _unusable(uri, error) from None
-    if magic:
-        sizes = {name: n for name, n in sizes.items() if fnmatch.fnmatchcase(name, pattern)}
+    sizes = {
+        name: int(info["size"])
+        for name, info in system.find(root, detail=True).items()
+        if not magic or fnmatch.fnmatchcase(name, pattern)
+    }
     if not sizes:
         raise InputError(f"{uri} has no file; check the address")
     free = shutil.disk_usage(folder).free
@@ -162,59 +161,41 @@ def _fetched(uri: str, folder: Path) -> str:
         )
     base = PurePosixPath(root).parent
     for name, size in sizes.items():
-        target = _target(uri, folder, name, base)
-        try:
-            system.get_file(name, str(target))
-        except (OSError, ValueError) as error:
-            raise _unusable(uri, error) from None
+        target = folder / _require_inside(uri, PurePosixPath(name).relative_to(base))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        system.get_file(name, str(target))
         if target.stat().st_size != size:
             raise InputError(f"{uri}: {name} changed while it was read; run it again")
     return PurePosixPath(pattern).relative_to(base).as_posix()
 
 
-def _target(uri: str, folder: Path, name: str, base: PurePosixPath) -> Path:
-    """Where the copy of a file goes, in a folder that is made.
-
-    Raises:
-        InputError: its name leads out of `folder`.
-    """
-    relative = PurePosixPath(name).relative_to(base)
-    parts = relative.parts
-    if relative.is_absolute() or ".." in parts or re.search(r"[\\\0]|(^|/)\w:", str(relative)):
+def _require_inside(uri: str, relative: PurePosixPath) -> PurePosixPath:
+    """Refuse a name that leads out of the folder of the copies, on whatever system."""
+    if ".." in relative.parts or re.search(r"[\\\0]|^/|(^|/)\w:", str(relative)):
+        name = str(relative)
         raise InputError(f"{uri} has a file named {name!r:.200}; copy it here under a new name")
-    target = folder / relative
-    target.parent.mkdir(parents=True, exist_ok=True)
-    return target
+    return relative
 
 
 def _require_new(uri: str) -> str:
     """Check that no store is at a URI, and that it can be reached; returns the output's name."""
-    system, path = _opened(uri)
-    try:
-        exists = any(system.exists(f"{path}/{name}") for name in RECORDS)
-    except (OSError, ValueError) as error:
-        raise _unusable(uri, error) from None
-    if exists:
+    system, path = _open(uri)
+    if any(system.exists(f"{path}/{name}") for name in RECORDS):
         raise InputError(f"{uri} exists already; remove it or name another output")
     return PurePosixPath(path).name
 
 
 def _send(place: Path, uri: str) -> None:
     """Copy a file or folder to a URI, its record last: without it, a folder is not a store."""
-    system, path = _opened(uri)
-    files = [place]
-    if place.is_dir():
-        files = [Path(where) / name for where, _, names in os.walk(place) for name in names]
+    files = [file for file in place.rglob("*") if file.is_file()] if place.is_dir() else [place]
     files.sort(key=lambda file: (file.name in RECORDS, str(file)))
-    # Object stores have no folders, and making one may be forbidden.
-    has_folders = not {"s3", "gcs", "abfs"}.intersection([system.protocol])
-    try:
+    with _errors_of(uri):
+        system, path = _open(uri)
+        # Object stores have no folders, and making one may be forbidden.
+        has_folders = not {"s3", "gcs", "abfs"}.intersection([system.protocol])
         for file in files:
-            relative = file.relative_to(place).as_posix()
-            target = path if file == place else f"{path}/{relative}"
+            target = path if file == place else f"{path}/{file.relative_to(place).as_posix()}"
             if has_folders:
                 system.makedirs(target.rpartition("/")[0], exist_ok=True)
             with file.open("rb") as source, system.open(target, "wb") as copy:
                 shutil.copyfileobj(source, copy, _BLOCK)
-    except (OSError, ValueError) as error:
-        raise _unusable(uri, error) from None

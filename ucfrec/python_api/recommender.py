@@ -15,12 +15,12 @@ import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arguments import (
-    checked,
+    check_arguments,
     require_kind,
+    require_list,
     require_number,
     require_seed,
     require_whole,
-    several,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
@@ -67,7 +67,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")
-_checked: Final = checked(
+_checked: Final = check_arguments(
     {
         **dict.fromkeys(("k", "episodes"), require_whole),
         "seed": require_seed,
@@ -382,7 +382,7 @@ class Recommender:
             InputError: the recommender is not trained, the logs cannot be used, or another policy
                 has another catalogue.
         """
-        beside = several("others", others, "a Recommender", Recommender)
+        beside = require_list("others", others, "a Recommender", Recommender)
         trained, *rest = (policy._evaluated(logs) for policy in (self, *beside))
         require_one_catalogue([trained, *rest])
         candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
@@ -460,7 +460,7 @@ class Recommender:
             InputError: the recommender is not trained, or the environment does not fit it.
         """
         trained = self.trained
-        beside = several("behaviors", behaviors, "the name of a behavior", str)
+        beside = require_list("behaviors", behaviors, "the name of a behavior", str)
         simulated = Environment(environment) if isinstance(environment, str) else environment
         return evaluate_in(
             simulated,
@@ -579,7 +579,7 @@ class Recommender:
         what = "what evaluate or ope returned, or files of it"
         kinds = (Evaluation, OffPolicyReport, Path, str)
         listed = [results] if isinstance(results, ResultTable) else results
-        given: list[ResultTable | Path | str] = several("results", listed, what, *kinds)
+        given: list[ResultTable | Path | str] = require_list("results", listed, what, *kinds)
         with tempfile.TemporaryDirectory() as scratch:
             files = []
             for number, result in enumerate(given):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ucfrec.arguments import LARGEST_SEED, require_seed, several, shown
+from ucfrec.arguments import LARGEST_SEED, require_list, require_seed, shown
 from ucfrec.choosing.choice import RuleConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
@@ -140,7 +140,7 @@ def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> "Iterator[_
 def _from_texts(texts: Sequence[str]) -> Iterator[_Setting]:
     if isinstance(texts, str) or not isinstance(texts, Iterable):
         raise InputError(f"settings is {shown(texts)}; give a list of texts, or a mapping")
-    for text in several("settings", texts, "texts table.field=value", str):
+    for text in require_list("settings", texts, "texts table.field=value", str):
         name, separator, value = text.partition("=")
         table, dot, key = name.strip().partition(".")
         source = f"--set {text}"

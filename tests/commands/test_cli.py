@@ -78,6 +78,21 @@ def test_help_answers_at_once() -> None:
     assert min(seconds() for _ in range(3)) < 0.5
 
 
+@pytest.mark.parametrize("command", UCFREC.commands)
+def test_help_fits_one_screen_and_the_rest_is_a_word_away(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    printed = {}
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            main([command, word])
+        printed[word] = capsys.readouterr().out
+    assert len(printed["--help"].splitlines()) <= 30
+    listed, described = (set(re.findall(r"--[a-z-]+[a-z]", text)) for text in printed.values())
+    assert listed <= described | {"--help-all"}
+
+
 @pytest.mark.parametrize(
     "environment", [pytest.param("synthetic-taobao", marks=pytest.mark.slow), "synthetic-catalog"]
 )

@@ -99,7 +99,7 @@ def _line(text: str, at: int) -> str:
 )
 def test_help_uses_them(program: Program, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        build_parser(program, [command]).parse_args([command, "--help"])
+        build_parser(program, [command]).parse_args([command, "--help-all"])
     assert _hits(" ".join(capsys.readouterr().out.split())) == []
 
 

@@ -12,7 +12,7 @@ from ucfrec.commands.grid_options import (
     rows_explained,
     rows_given,
 )
-from ucfrec.commands.options import env_options, environment_given
+from ucfrec.commands.options import env_options, environment_given, option
 from ucfrec.plugins import load_plugin
 from ucfrec.results.rows_file import benchmarking
 
@@ -22,32 +22,26 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec benchmark`."""
-    parser.add_argument(
+    option(
+        parser,
         "suite",
-        metavar="SUITE",
-        help="recommendation, or a suite of another installed package (entry point "
-        "ucfrec.benchmarks)",
+        str,
+        "recommendation, or a suite of another installed package (entry point ucfrec.benchmarks)",
+        "SUITE",
     )
-    parser.add_argument(
-        "--table",
-        action="append",
-        default=[],
-        help="measure and print only this table; repeatable (default: all tables)",
-    )
+    text = "measure and print only this table; repeatable (default: all tables)"
+    option(parser, "--table", str, text, action="append", default=[])
     budget_options(parser)
-    parser.add_argument(
+    logs = parser.add_argument_group("logs")
+    option(
+        logs,
         "--logs",
-        type=int,
-        metavar="N",
-        help="logs of each task: simulated with N seeds, or N parts of a given log, 1 for all "
+        int,
+        "logs of each task; simulated with N seeds, or N parts of a given log, 1 for all "
         "of it (default: set by --budget)",
+        "N",
     )
-    parser.add_argument(
-        "--log-seed",
-        type=int,
-        default=0,
-        help="seed of the first simulated log; the others have the seeds after it (default: 0)",
-    )
+    option(logs, "--log-seed", 0, "seed of the first simulated log; the others follow it")
     env_options(
         parser,
         required=False,

@@ -5,17 +5,20 @@ command loads what only another one needs.
 """
 
 import argparse
+import copy
 import os
 import re
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module, metadata
 from typing import Any, Final, Protocol, cast
 
 from ucfrec import __version__
+from ucfrec.commands.options import FieldHelp
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
 from ucfrec.files.remote import local_paths
 from ucfrec.processes import Interrupted, interruptions_raised
@@ -31,6 +34,8 @@ class Program:
     """Package with one module per command, each with `add_options(parser)` and `run(options)`."""
     commands: Mapping[str, str]
     """Command name to its one-line summary in `--help`."""
+    sections: Mapping[str, str] = field(default_factory=dict)
+    """First command of each section of `--help` to the title of the section."""
 
 
 UCFREC = Program(
@@ -38,30 +43,31 @@ UCFREC = Program(
     "Train recommendation policies from logs and estimate their value.",
     "ucfrec.commands",
     {
-        "demo": "run every step on simulated logs and write a report; resumes",
-        "datasets": "list public data sets, or download one",
-        "collect": "simulate sessions and write them as Parquet logs",
         "prepare": "turn logs into an episode store",
-        "screen": "find logged observation columns that have no effect",
         "train": "train a policy on an episode store; resumes",
-        "tune": "search the settings of a training; resumes",
-        "update": "train on from a run with new logs, and compare both; resumes",
-        "promote": "make a run the one that `serve RUNS` uses",
-        "settings": "list every training setting: default, range, meaning",
-        "evaluate": "measure the return of policies in a simulator",
         "rank": "measure how well policies rank items shown and clicked later",
+        "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
         "recommend": "recommend the next items to the users of a log",
         "serve": "answer requests for recommendations over HTTP",
-        "explore": "try out one or two policies in the browser",
-        "join": "join exposures with their feedback into a log",
-        "compare": "compare two runs that shared the traffic (A/B test)",
-        "export": "write the policy with its rule as an ONNX graph",
-        "score": "write a policy's probability of every logged choice",
-        "ope": "estimate a policy's return from logs alone (off-policy evaluation)",
-        "verify": "compare every file of stores and runs with its checksum",
         "report": "write one HTML page about training runs",
+        "join": "join exposures with their feedback into a log",
+        "update": "train on from a run with new logs, and compare both; resumes",
+        "compare": "compare two runs that shared the traffic (A/B test)",
+        "promote": "make a run the one that `serve RUNS` uses",
+        "demo": "run every step on simulated logs and write a report; resumes",
+        "settings": "list every training setting: default, range, meaning",
+        "tune": "search the settings of a training; resumes",
+        "evaluate": "measure the return of policies in a simulator",
+        "score": "write a policy's probability of every logged choice",
+        "explore": "try out one or two policies in the browser",
+        "export": "write the policy with its rule as an ONNX graph",
+        "verify": "compare every file of stores and runs with its checksum",
+        "datasets": "list public data sets, or download one",
+        "collect": "simulate sessions and write them as Parquet logs",
+        "screen": "find logged observation columns that have no effect",
         "benchmark": "measure every method and print tables; resumes",
     },
+    {"prepare": "from logs to recommendations", "join": "every day", "demo": "advanced"},
 )
 
 
@@ -175,28 +181,68 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
 
     Options of the other commands would need their modules, whose imports take seconds.
     """
-    parser = argparse.ArgumentParser(prog=program.name, description=program.summary)
+    parser = argparse.ArgumentParser(
+        prog=program.name,
+        description=f"{program.summary}\n{_list_commands(program)}",
+        epilog=f"{program.name} COMMAND --help describes a command.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage="%(prog)s [options] COMMAND …",
+    )
     parser.add_argument("--version", action="version", version=f"ucfrec {__version__}")
     parser.add_argument("--debug", action="store_true", help="show tracebacks of input errors")
     commands = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND", parser_class=_AnyOrder
+        dest="command", required=True, metavar="COMMAND", parser_class=_CommandParser
     )
     called = next((word for word in arguments if word in program.commands), None)
     for name, summary in program.commands.items():
-        command = commands.add_parser(name, help=summary, description=summary)
+        command = commands.add_parser(name, description=summary, prog=f"{program.name} {name}")
         if name == called:
             _module(program, name).add_options(command)
+            command.usage = command.usage or command.describe_usage()
     return parser
 
 
-class _AnyOrder(argparse.ArgumentParser):
-    """Takes options before, between and after runs and logs: `ope RUN --json FILE LOGS`.
+def _list_commands(program: Program) -> str:
+    lines = []
+    for name, summary in program.commands.items():
+        if title := program.sections.get(name):
+            lines.append(f"\n{title}:")
+        lines.append(f"  {name:<12}{summary}")
+    return "\n".join(lines)
+
+
+class _ShowAll(argparse.Action):
+    """`--help-all`."""
+
+    def __call__(self, parser: Any, *_: object) -> None:
+        print(parser.format_help(everything=True), end="")
+        parser.exit()
+
+
+class _Formatter(argparse.HelpFormatter):
+    """Reads the help of an option from the docstring of a field where it is shown."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help.read() if isinstance(action.help, FieldHelp) else action.help
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+
+class _CommandParser(argparse.ArgumentParser):
+    """Options before, between and after runs and logs (`ope RUN --json FILE LOGS`); help that fits
+    one screen.
 
     A plain parser gives all that a list of files may take to its first words, and does not know
     those after an option.
     """
 
     _intermixed = False
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(formatter_class=_Formatter, **settings)
+        text = "describe all options"
+        self.add_argument("--help-all", action=_ShowAll, nargs=0, help=text)
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         # It calls this method: once for the options, once for the rest.
@@ -207,6 +253,51 @@ class _AnyOrder(argparse.ArgumentParser):
             return self.parse_known_intermixed_args(args, namespace)
         finally:
             self._intermixed = False
+
+    def describe_usage(self) -> str:
+        """The positional arguments and the options that are required."""
+        words = []
+        for action in self._actions:
+            name = str(action.metavar or action.dest.upper())
+            if not action.option_strings:
+                name += "..." if action.nargs in ("+", "*") else ""
+                words.append(f"[{name}]" if action.nargs in ("?", "*") else name)
+            elif action.required:
+                words.append(f"{action.option_strings[0]} {name}")
+        return " ".join(["%(prog)s", *words, "[options]"])
+
+    def format_help(self, everything: bool = False) -> str:
+        """The help; without `everything`, options of titled groups by name only, and of the others
+        what comes before a semicolon."""
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, [])
+        formatter.add_text(self.description)
+        titled: list[argparse.Action] = []
+        for group in self._action_groups:
+            actions = group._group_actions
+            if everything or group in (self._positionals, self._optionals):
+                formatter.start_section(group.title)
+                formatter.add_text(group.description if everything else None)
+                formatter.add_arguments(actions if everything else _shorten(actions))
+                formatter.end_section()
+            elif actions:
+                names = ", ".join(action.option_strings[0] for action in actions)
+                titled.append(argparse.Action([], str(group.title), help=names))
+        if titled:
+            formatter.start_section("more, described by --help-all")
+            formatter.add_arguments(titled)
+            formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+
+def _shorten(actions: list[argparse.Action]) -> Iterator[argparse.Action]:
+    """The actions, those for help apart, with the part of their help before a semicolon."""
+    for action in actions:
+        if "--help" not in action.option_strings:
+            short = copy.copy(action)
+            short.help = (action.help or "").partition(";")[0]
+            yield short
 
 
 class _Command(Protocol):

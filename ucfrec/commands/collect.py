@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ucfrec.commands.options import environment_given, environment_options
+from ucfrec.commands.options import environment_given, environment_options, option
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,15 +14,10 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec collect`."""
     environment_options(parser)
-    parser.add_argument(
-        "--behavior",
-        help="built-in policy that acts in the sessions (default: mixture if there is one, else "
-        "random)",
-    )
-    parser.add_argument(
-        "--sessions", type=int, default=20_000, help="number of sessions (default: 20000)"
-    )
-    parser.add_argument("--out", type=Path, required=True, help="new folder for the logs")
+    text = "built-in policy that acts in the sessions (default: mixture if any, else random)"
+    option(parser, "--behavior", str, text)
+    option(parser, "--sessions", 20_000, "number of sessions")
+    option(parser, "--out", Path, "new folder for the logs", required=True)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -54,11 +49,11 @@ def run(options: argparse.Namespace) -> None:
     print(
         f"{options.out}: {options.sessions} sessions of {behavior}, {int(played.lengths.sum())} "
         f"steps, mean return {played.returns.mean():.3f}; reward column {simulator.feedback}; "
-        f"{_observed(env.single_observation_space)}"
+        f"{_describe_observation(env.single_observation_space)}"
     )
 
 
-def _observed(space: "Space[Any]") -> str:
+def _describe_observation(space: "Space[Any]") -> str:
     """What the logs say about a step besides its action and reward."""
     if not space.shape or not space.shape[0]:
         return "no observation: states come from the items shown and their rewards"

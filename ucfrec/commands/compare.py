@@ -3,36 +3,26 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import memory_option
+from ucfrec.commands.options import INPUT, memory_option, option
 from ucfrec.errors import InputError
-from ucfrec.files.remote import Input, uri_or_path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec compare`."""
-    parser.add_argument(
-        "logs",
-        nargs="+",
-        type=uri_or_path(Input, str),
-        metavar="LOGS",
-        help="logs of `ucfrec join`, whose exposures `serve --split` wrote",
-    )
-    parser.add_argument(
-        "--column",
-        default="feedback",
-        help="feedback that counts, a number of each shown item (default: feedback, its rows)",
-    )
-    parser.add_argument(
-        "--arms", metavar="A,B", help="compare B with A (default: the two arms that there are)"
-    )
-    parser.add_argument(
+    text = "logs of `ucfrec join`, whose exposures `serve --split` wrote"
+    option(parser, "logs", INPUT, text, "LOGS", nargs="+")
+    option(parser, "--column", "feedback", "feedback that counts, a number of each shown item")
+    text = "compare B with A (default: the two arms that there are)"
+    option(parser, "--arms", str, text, "A,B")
+    option(
+        parser,
         "--expected",
-        type=float,
-        metavar="DIFFERENCE",
-        help="difference per shown item for which the always-valid interval is shortest; fix it "
+        float,
+        "difference per shown item for which the always-valid interval is shortest; fix it "
         "before the test (default: 5%% of the value of A)",
+        "DIFFERENCE",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers as JSON")
+    option(parser, "--json", Path, "also write the numbers as JSON", "FILE")
     memory_option(parser)
 
 
@@ -56,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     if options.expected is not None and not options.expected > 0:
         raise InputError(f"--expected is {options.expected}; give a difference above 0")
     limit = options.memory_limit
-    found = compare_arms(options.logs, options.column, arms, options.expected, limit)
-    print(f"{found}\n\n{found.conclusion}")
+    result = compare_arms(options.logs, options.column, arms, options.expected, limit)
+    print(f"{result}\n\n{result.conclusion}")
     if options.json is not None:
-        write_json(options.json, asdict(found))
+        write_json(options.json, asdict(result))

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError, InputNote
 
 if TYPE_CHECKING:
@@ -13,18 +14,11 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec datasets`."""
-    parser.add_argument(
-        "name", nargs="?", metavar="NAME", help="data set to load (default: list them)"
-    )
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        metavar="DIR",
-        help="where its archive lies or is downloaded to, and is unpacked",
-    )
-    parser.add_argument(
-        "--part", help="of open-bandit: logging policy and campaign (default: random/all)"
-    )
+    option(parser, "name", str, "data set to load (default: list them)", "NAME", nargs="?")
+    text = "where its archive lies or is downloaded to, and is unpacked"
+    option(parser, "--folder", Path, text, "DIR")
+    text = "of open-bandit: logging policy and campaign (default: random/all)"
+    option(parser, "--part", str, text)
     parser.epilog = "Downloads need ucfrec[datasets] (pooch). Mind the licence of each data set."
 
 
@@ -37,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.releases import find_release, load_release
     from ucfrec.reporting.tables import text_table
 
-    adapters = _adapters()
+    adapters = _load_adapters()
     if options.name is None:
         lines = [
             (name, adapter, f"{release.size / 1e6:,.0f} MB", release.licence, release.homepage)
@@ -60,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
-def _adapters() -> "dict[str, Dataset]":
+def _load_adapters() -> "dict[str, Dataset]":
     """All installed datasets by name; warns of those that cannot be loaded."""
     from ucfrec.plugins import load_plugin, plugin_names
 

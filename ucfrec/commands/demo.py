@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.commands.options import option
 from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress, progress
 
@@ -71,21 +72,16 @@ FULL = DemoConfig(
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec demo`."""
-    parser.add_argument(
+    option(
+        parser,
         "--out",
-        type=Path,
-        help="folder for logs, stores, runs and the report; resumed (default: demo-out, or "
+        Path,
+        "folder for logs, stores, runs and the report; resumed (default: demo-out, or "
         "demo-out-full with --full)",
     )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the logs and trainings (default: 0)"
-    )
-    parser.add_argument(
-        "--full",
-        action="store_true",
-        help="four times the sessions, five times the training steps and all methods "
-        "(default: two minutes of one core)",
-    )
+    option(parser, "--seed", 0, "seed of the logs and trainings")
+    text = "four times the sessions, five times the training steps and all methods"
+    option(parser, "--full", False, f"{text} (default: two minutes of one core)")
 
 
 def run(options: argparse.Namespace) -> None:

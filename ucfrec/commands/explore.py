@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ucfrec.commands.options import option
 from ucfrec.processes import Interrupted
 
 _OWN_NAMES = ("localhost", "127.0.0.1", "[::1]")
@@ -11,31 +12,28 @@ _OWN_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec explore`."""
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUN",
-        help="run folder of `ucfrec train`; two are shown side by side",
-    )
-    parser.add_argument(
+    text = "run folder of `ucfrec train`; two are shown side by side"
+    option(parser, "runs", Path, text, "RUN", nargs="+")
+    option(
+        parser,
         "--items",
-        type=Path,
-        metavar="FILE",
-        help="item features to show: Parquet or CSV with a column item_id; title (or name) and "
+        Path,
+        "item features to show: Parquet or CSV with a column item_id; title (or name) and "
         "image_url (or image) are shown as such (default: none)",
+        "FILE",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--results",
+        Path,
+        "results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict "
+        "(default: none)",
+        "FILE",
         nargs="+",
         action="extend",
-        type=Path,
         default=[],
-        metavar="FILE",
-        help="results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict "
-        "(default: none)",
     )
-    parser.add_argument("--port", type=int, default=8081, help="0 for a free one (default: 8081)")
+    option(parser, "--port", 8081, "0 for a free one")
     parser.epilog = "Answers this machine only. Needs ucfrec[serve]."
 
 

@@ -3,18 +3,14 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.options import rule_given, rule_options
+from ucfrec.commands.options import option, rule_given, rule_options, run_option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec export`."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
-    parser.add_argument(
-        "--onnx", type=Path, required=True, metavar="OUT", help="folder to make, with the graph"
-    )
-    parser.add_argument(
-        "--k", type=int, help="items that the graph chooses (default: 100, or all if fewer)"
-    )
+    run_option(parser)
+    option(parser, "--onnx", Path, "folder to make, with the graph", "OUT", required=True)
+    option(parser, "--k", int, "items that the graph chooses (default: 100, or all if fewer)")
     rule_options(parser)
 
 

@@ -4,9 +4,10 @@ import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ucfrec.benchmark.grid import run_grid
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import benchmarking, latest, read_rows
@@ -25,35 +26,21 @@ BUDGETS: Final = {
 
 def grid_options(parser: argparse.ArgumentParser, out: str, workers: int) -> None:
     """Add --out, --results, --workers, --again and --show-only."""
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path(out),
-        help=f"folder for logs, stores, runs and result rows; resumed (default: {out})",
-    )
-    parser.add_argument(
+    text = "folder for logs, stores, runs and result rows; resumed"
+    option(parser, "--out", Path, f"{text} (default: {out})", default=Path(out))
+    option(
+        parser,
         "--results",
-        type=Path,
-        metavar="JSONL",
-        help="file of result rows: measured cells are read from it, new ones appended to it "
+        Path,
+        "file of result rows; measured cells are read from it, new ones appended to it "
         "(default: results.jsonl in --out)",
+        "JSONL",
     )
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=workers,
-        help=f"parallel processes, one thread each (default: {workers})",
-    )
-    parser.add_argument(
-        "--again",
-        action="store_true",
-        help="remove the rows and runs of the chosen cells first; resume without it",
-    )
-    parser.add_argument(
-        "--show-only",
-        action="store_true",
-        help="print the tables from the rows in --results without measuring anything",
-    )
+    option(parser, "--workers", workers, "parallel processes, one thread each")
+    text = "remove the rows and runs of the chosen cells first; resume without it"
+    option(parser, "--again", False, text)
+    text = "print the tables from the rows in --results without measuring anything"
+    option(parser, "--show-only", False, text)
 
 
 def budget_options(
@@ -69,36 +56,23 @@ def budget_options(
         seeds: name of the option for the number of training seeds, kept as `training_seeds`.
         budgets: what each budget is, by name; the first is the default.
     """
-    parser.add_argument(
-        "--budget",
-        choices=list(budgets),
-        default=next(iter(budgets)),
-        help=f"{', '.join(f'{name} ({what})' for name, what in budgets.items())} "
-        "(default: %(default)s)",
-    )
-    for name, kept in ((task, "tasks"), ("--method", "methods")):
-        parser.add_argument(
-            name,
-            dest=kept,
-            action="append",
-            default=[],
-            metavar="NAME",
-            help=f"measure only this {name.removeprefix('--')}; repeatable (default: all of the "
-            "budget)",
-        )
-    parser.add_argument(
-        seeds,
-        dest="training_seeds",
-        type=int,
-        metavar="N",
-        help="training seeds of every method, from 0 (default: set by --budget)",
-    )
-    parser.add_argument(
+    meanings = ", ".join(f"{name} ({meaning})" for name, meaning in budgets.items())
+    text, first = f"{meanings} (default: %(default)s)", next(iter(budgets))
+    option(parser, "--budget", list(budgets), text, default=first)
+    for name, dest in ((task, "tasks"), ("--method", "methods")):
+        text = f"measure only this {name.removeprefix('--')}; repeatable (default: all of the"
+        how: dict[str, Any] = {"dest": dest, "action": "append", "default": []}
+        option(parser, name, str, f"{text} budget)", "NAME", **how)
+    group = parser.add_argument_group("seeds")
+    text = "training seeds of every method, from 0 (default: set by --budget)"
+    option(group, seeds, int, text, "N", dest="training_seeds")
+    option(
+        group,
         "--evaluation-seed",
-        type=seed_given,
-        metavar="SEED",
-        help="seed of the evaluated episodes, the same for every training seed (default: set by "
+        seed_given,
+        "seed of the evaluated episodes, the same for every training seed (default: set by "
         "--budget)",
+        "SEED",
     )
 
 

@@ -4,119 +4,81 @@ import argparse
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Final
 
 from ucfrec.commands.options import (
-    filter_seen_option,
     log_options,
     logs_given,
     memory_option,
+    option,
     rule_given,
     rule_options,
     runs_given,
+    table_options,
+    table_values,
 )
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
+    from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
+    from ucfrec.off_policy.selection import Choice
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.row import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
+_TABLE: Final = "ucfrec.off_policy.evaluate:EstimateOptions"
+_FIELDS: Final = {
+    "discount": float,
+    "pages": bool,
+    "reward_range": tuple,
+    "wanted_lift": float,
+    "item_groups": int,
+    "estimate_propensities": bool,
+    "filter_seen": bool,
+}
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec ope`."""
-    log_options(parser)
-    memory_option(parser)
+    memory_option(log_options(parser))
     rule_options(parser)
-    filter_seen_option(parser)
-    parser.add_argument(
+    option(
+        parser,
         "--targets",
-        metavar="RETURN,…",
-        help="compare these target returns, or quantiles of the training returns: 5,10 or q0.5,q1",
+        str,
+        "compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1",
+        "RETURN,…",
     )
-    parser.add_argument(
-        "--temperatures",
-        metavar="T,…",
-        help="compare drawing items at these temperatures; 0 takes the best: 0,0.5,1",
-    )
-    parser.add_argument(
+    text = "compare drawing items at these temperatures; 0 takes the best: 0,0.5,1"
+    option(parser, "--temperatures", str, text, "T,…")
+    option(
+        parser,
         "--scored",
-        action="store_true",
-        help="LOGS are what `ucfrec score` wrote for RUN with the same decision rule, of any size: "
+        False,
+        "LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: "
         "one row per session is in memory, and there are no reward models (DM, FQE, DR)",
     )
+    group = parser.add_argument_group("what is estimated")
+    fields = {"discount": float, "pages": bool, "reward_range": tuple}
+    fields |= {
+        "filter_seen": bool,
+        "wanted_lift": float,
+        "item_groups": int,
+        "estimate_propensities": bool,
+    }
+    table_options(group, _TABLE, fields, wanted_lift="lift")
+    text = "treat each session as one of another user, for logs without user ids (as in obd)"
+    option(group, "--anonymous", False, text)
+    option(parser, "--seed", 0, "of folds and bootstrap")
+    option(parser, "--json", Path, "write the result rows here")
     parser.usage = "%(prog)s RUN... [LOGS...] [options]"
     parser.epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
         "targets or rules are ranked, with a band that holds all at once."
-    )
-    _estimate_options(parser)
-    parser.add_argument("--seed", type=int, default=0, help="of folds and bootstrap (default: 0)")
-    parser.add_argument("--json", type=Path, help="write the result rows here")
-
-
-def _estimate_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--discount", type=float, default=1.0, help="of the returns that are estimated (default: 1)"
-    )
-    parser.add_argument(
-        "--pages",
-        action="store_true",
-        help="estimate the return of a page: rows of one user within 10 ms are its positions, each "
-        "row a session",
-    )
-    parser.add_argument(
-        "--anonymous",
-        action="store_true",
-        help="treat each session as one of another user, for logs without user ids (as in obd)",
-    )
-    parser.add_argument(
-        "--reward-range",
-        type=float,
-        nargs=2,
-        metavar=("LEAST", "MOST"),
-        help="lowest and highest reward of a step, to bound the value of choices that the log "
-        "lacks (default: as observed)",
-    )
-    parser.add_argument(
-        "--lift",
-        type=float,
-        metavar="RETURN",
-        help="return per session that a launch should gain; the verdict says how many "
-        "sessions would show it (default: 5%% of the mean logged return)",
-    )
-    parser.add_argument(
-        "--item-groups",
-        type=int,
-        default=0,
-        metavar="N",
-        help="number of item groups (k-means of embeddings), for MIPS and the tests by group; 1 "
-        "for neither (default: square root of the number of items, up to 32)",
-    )
-    parser.add_argument(
-        "--estimate-propensities",
-        action="store_true",
-        help="estimate the propensities that the logs lack; the verdict says so",
-    )
-
-
-def _estimates_given(options: argparse.Namespace) -> "EstimateOptions":
-    from ucfrec.off_policy.evaluate import EstimateOptions
-
-    return EstimateOptions(
-        discount=options.discount,
-        pages=options.pages,
-        users_known=not options.anonymous,
-        reward_range=None if options.reward_range is None else tuple(options.reward_range),
-        wanted_lift=options.lift,
-        item_groups=options.item_groups,
-        estimate_propensities=options.estimate_propensities,
-        filter_seen=options.filter_seen,
     )
 
 
@@ -126,104 +88,108 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: no run or no log is named, or one of them cannot be used.
     """
+    from ucfrec.off_policy.evaluate import EstimateOptions
     from ucfrec.off_policy.selection import choose, names_of
-    from ucfrec.reporting.tables import text_table
+    from ucfrec.python_api.measuring import TEST_SPLIT, estimate_return
+    from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    runs = dict.fromkeys(runs_given(options))
+    runs = runs_given(options)
+    estimates = EstimateOptions(
+        users_known=not options.anonymous, **table_values(options, "EstimateOptions")
+    )
     if options.scored and not options.logs:
         raise InputError("--scored needs what ucfrec score wrote; name it after the run")
-    if options.scored and options.filter_seen:
+    if options.scored and estimates.filter_seen:
         raise InputError("--scored takes probabilities as they are; give --filter-seen to score")
-    given = _estimates_given(options)
     # On the test split, the weights that have not learned from it.
     split = not options.logs
     policies = [TrainedPolicy.load(run, options.checkpoint, split=split) for run in runs]
-    candidates = [
-        _Candidate(trained, rule) for trained in policies for rule in _rules(options, trained)
-    ]
-    reports = {}
-    names = names_of([one.parts for one in candidates])
-    for name, candidate in zip(names, candidates, strict=True):
-        if len(candidates) > 1:
-            print(f"\n{name}:")
-        reports[name] = _evaluated(options, candidate, given)
-    if len(candidates) == 1:
-        _write(options, reports, {})
-        return
-    choice = choose(reports, options.seed)
-    if choice.selection is not None:
-        print("\nvalue per session, with a 95% band that holds all of them at once:")
-        head = ("candidate", "value [band]", "P(best)", "rank")
-        body = [
-            (one.name, f"{one.value:.4g} [{one.low:.4g}, {one.high:.4g}]",
-             f"{one.probability_best:.2f}", str(one.rank))
-            for one in choice.selection.standings
-        ]  # fmt: skip
-        print(text_table(head, body))
-    for name, reasons in choice.excluded.items():
-        print(f"not ranked: {name}: {reasons}")
-    print(f"choice: {choice.headline}")
-    _write(options, reports, {name: choice.columns(name) for name in reports})
+    rules = [_rules(options, policy) for policy in policies]
+    pairs = [(policy, rule) for policy, own in zip(policies, rules, strict=True) for rule in own]
+    names = iter(names_of([_distinguish(policy, rule) for policy, rule in pairs]))
+    reports: dict[str, OffPolicyReport] = {}
+    for policy, own in zip(policies, rules, strict=True):
+        with _read_logs(options, policy) as logged:
+            for rule in own:
+                name = next(names)
+                if len(pairs) > 1:
+                    print(f"\n{name}:")
+                reports[name] = estimate_return(
+                    (policy, rule),
+                    logged,
+                    options.logs or [TEST_SPLIT],
+                    options=estimates,
+                    seed=options.seed,
+                    checkpoint=options.checkpoint,
+                )
+                print(_describe(reports[name]))
+    choice = choose(reports, options.seed) if len(reports) > 1 else None
+    if choice is not None:
+        print(_describe_choice(choice))
+    if options.json is not None:
+        rows = [
+            row.extended({"candidate": name, **({} if choice is None else choice.columns(name))})
+            for name, report in reports.items()
+            for row in (*report.rows, *report.step_rows)
+        ]
+        write_results(options.json, rows)
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    """One run under one decision rule."""
-
-    trained: "TrainedPolicy"
-    rule: "DecisionRule"
-
-    @property
-    def parts(self) -> dict[str, object]:
-        """What may differ from other candidates, by name."""
-        return {
-            "run": str(self.trained.folder),
-            "target return": self.rule.target,
-            "temperature": self.rule.temperature,
-        }
+def _distinguish(trained: "TrainedPolicy", rule: "DecisionRule") -> dict[str, object]:
+    """What may differ from other candidates, by name."""
+    return {
+        "run": str(trained.folder),
+        "target return": rule.target,
+        "temperature": rule.temperature,
+    }
 
 
-def _evaluated(
-    options: argparse.Namespace, candidate: _Candidate, given: "EstimateOptions"
-) -> "OffPolicyReport":
-    """Print and return what the logs say of one candidate."""
-    from ucfrec.off_policy.evaluate import evaluate_off_policy
-    from ucfrec.off_policy.scored import evaluate_scored
-    from ucfrec.reporting.model_card import add_estimates
-
-    trained = candidate.trained
-    arguments = {"rule": candidate.rule, "seed": options.seed, "options": given}
-    if options.scored:
-        found = evaluate_scored(trained, options.logs, **arguments)
-    else:
-        with _logged(options, trained) as logged:
-            found = evaluate_off_policy(trained, logged, **arguments)
-    print(f"\n{_table(found.rows, ('R_cum', 'effective_sessions', 'sessions'))}")
-    if found.per_step is not None:
+def _describe(report: "OffPolicyReport") -> str:
+    """The estimates, what to know of them, the verdict and what to do next."""
+    lines = ["", _table(report.rows, ("R_cum", "effective_sessions", "sessions"))]
+    if report.per_step is not None:
         columns = ("R_step", "effective_steps", "steps")
-        table = _table(found.step_rows, columns, steps=found.per_step.steps)
-        print(f"\n{table}\n{found.per_step}\n")
-    print("R_cum: return per session, with a 95% interval where an estimator has one")
-    if found.models is not None:
-        print(f"models: {found.models}")
-    for warning in found.warnings:
-        print(f"warning: {warning}")
-    print(f"verdict: {found.verdict.headline}")
-    print(_next_step(found.verdict))
-    add_estimates(trained.folder, options.logs or ["the test split"], found)
-    return found
+        table = _table(report.step_rows, columns, steps=report.per_step.steps)
+        lines += ["", table, f"{report.per_step}", ""]
+    lines.append("R_cum: return per session, with a 95% interval where an estimator has one")
+    if report.models is not None:
+        lines.append(f"models: {report.models}")
+    lines += [f"warning: {warning}" for warning in report.warnings]
+    lines += [f"verdict: {report.verdict.headline}", _next_step(report.verdict)]
+    return "\n".join(lines)
 
 
 def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object) -> str:
     """The rows of estimators, with the columns and what is the same in all of them."""
     from ucfrec.reporting.tables import format_rows
 
-    shown = ("estimator", "policy", "choice", *columns)
+    columns = ("estimator", "policy", "choice", *columns)
     lines = [
-        {**dict.fromkeys(shown), **row.as_line(), "estimator": row.method, **more} for row in rows
+        {**dict.fromkeys(columns), **row.as_line(), "estimator": row.method, **more} for row in rows
     ]
-    return format_rows(lines, shown)
+    return format_rows(lines, columns)
+
+
+def _describe_choice(choice: "Choice") -> str:
+    """The candidates in order, and which comes first."""
+    from ucfrec.reporting.tables import text_table
+
+    lines = []
+    if choice.selection is not None:
+        rows = [
+            (
+                standing.name,
+                f"{standing.value:.4g} [{standing.low:.4g}, {standing.high:.4g}]",
+                f"{standing.probability_best:.2f}",
+                str(standing.rank),
+            )
+            for standing in choice.selection.standings
+        ]
+        lines.append("\nvalue per session, with a 95% band that holds all of them at once:")
+        lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))
+    lines += [f"not ranked: {name}: {reasons}" for name, reasons in choice.excluded.items()]
+    return "\n".join([*lines, f"choice: {choice.headline}"])
 
 
 def _next_step(verdict: "Verdict") -> str:
@@ -238,11 +204,16 @@ def _next_step(verdict: "Verdict") -> str:
 
 
 @contextmanager
-def _logged(options: argparse.Namespace, trained: "TrainedPolicy") -> "Iterator[LoggedSessions]":
+def _read_logs(
+    options: argparse.Namespace, trained: "TrainedPolicy"
+) -> "Iterator[LoggedSessions | Sequence[Path]]":
     """What the policy is evaluated on: the logs, or else the test split of its store."""
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
 
+    if options.scored:
+        yield options.logs
+        return
     if not options.logs:
         logged = held_out_sessions([trained])
         store = logged.store
@@ -263,11 +234,11 @@ def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[Decis
         InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
             number.
     """
-    own = rule_given(options, trained)
-    targets: list[float | None] = [own.target]
+    base = rule_given(options, trained)
+    targets: list[float | None] = [base.target]
     if options.targets is not None:
-        targets = [_target(part.strip(), trained) for part in options.targets.split(",")]
-    temperatures = [own.temperature]
+        targets = [_read_target(part.strip(), trained) for part in options.targets.split(",")]
+    temperatures = [base.temperature]
     if options.temperatures is not None:
         try:
             temperatures = [float(part) for part in options.temperatures.split(",")]
@@ -276,14 +247,14 @@ def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[Decis
                 f"--temperatures {options.temperatures} are not numbers; write e.g. 0,0.5,1"
             ) from None
     rules = [
-        replace(own, target=target, temperature=temperature)
+        replace(base, target=target, temperature=temperature)
         for target in targets
         for temperature in temperatures
     ]
     return list({rule.hash: rule for rule in rules}.values())
 
 
-def _target(part: str, trained: "TrainedPolicy") -> float:
+def _read_target(part: str, trained: "TrainedPolicy") -> float:
     """A target return: a number in units of the reward, or `q` and a quantile."""
     quantile = part.startswith("q")
     try:
@@ -296,21 +267,3 @@ def _target(part: str, trained: "TrainedPolicy") -> float:
             "write e.g. 5,10 or q0.5,q0.9"
         )
     return trained.target_return(value) if quantile else value
-
-
-def _write(
-    options: argparse.Namespace,
-    reports: "dict[str, OffPolicyReport]",
-    more: "dict[str, dict[str, Any]]",
-) -> None:
-    """Write the rows of all candidates, if asked to."""
-    if options.json is None:
-        return
-    from ucfrec.results.rows_file import write_results
-
-    rows = [
-        row.extended({"candidate": name, **more.get(name, {})}, checkpoint=options.checkpoint)
-        for name, report in reports.items()
-        for row in (*report.rows, *report.step_rows)
-    ]
-    write_results(options.json, rows)

@@ -1,15 +1,21 @@
-"""Options that several commands share, and the objects made from them."""
+"""Options of commands: one maker of single options, one for fields of settings tables, and the
+options that several commands share with the objects that they stand for.
+
+Options in a titled group are listed by name in `--help`, and described in `--help-all`.
+"""
 
 import argparse
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
-from ucfrec.files.remote import Input, uri_or_path
+from ucfrec.files.remote import Input, Output, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
@@ -19,102 +25,217 @@ if TYPE_CHECKING:
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
 
+Options = argparse._ActionsContainer
+"""A parser or a group of its options."""
+INPUT: Final = uri_or_path(Input, str)
+INPUT_FOLDER: Final = uri_or_path(Input, Path)
+OUTPUT: Final = uri_or_path(Output, Path)
+RULE: Final = {
+    "minimum_target": float,
+    "reward_weight": float,
+    "policy_weight": float,
+    "lookahead": float,
+    "temperature": float,
+    "top_k": int,
+    "explore": float,
+    "explore_top": int,
+    "exclude_seen": bool,
+    "tag_window": int,
+    "tag_run": int,
+}
+"""Fields of `DecisionRule` that are options of their names."""
+_UNITS_MS: Final = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
+
+
+class FieldHelp(str):
+    """`MODULE:TABLE.FIELD`, whose docstring is the help: imported only if it is shown."""
+
+    def read(self) -> str:
+        """The meaning of the field, with its default if that is a value."""
+        module, _, name = self.partition(":")
+        table, _, field = name.partition(".")
+        info = getattr(import_module(module), table).__pydantic_fields__[field]
+        text, default = " ".join(info.description.split()).rstrip("."), info.default
+        # A rule's fields are those of the run by default.
+        if table != "DecisionRule" and default is not None and default is not False:
+            text = f"{text} (default: {default})"
+        return text.replace("%", "%%")
+
+
+def option(
+    parser: Options, name: str, kind: Any, text: str, metavar: str | None = None, **more: Any
+) -> argparse.Action:
+    """Add one option or positional argument.
+
+    Args:
+        kind: its type, or its default, of which it has the type; False for a flag; a list of
+            choices.
+        text: its help; a default is added.
+        more: as for `add_argument`.
+    """
+    if kind is False:
+        return parser.add_argument(name, action="store_true", help=text, **more)
+    if metavar is not None:
+        more["metavar"] = metavar
+    if isinstance(kind, list):
+        return parser.add_argument(name, choices=kind, help=text, **more)
+    if callable(kind):
+        return parser.add_argument(name, type=kind, help=text, **more)
+    text = f"{text} (default: {kind})"
+    return parser.add_argument(name, type=type(kind), default=kind, help=text, **more)
+
+
+def table_options(
+    parser: Options, table: str, fields: Mapping[str, Any], prefix: str = "", **names: str
+) -> None:
+    """Add an option for each of some fields of a settings table; unset ones stay unset.
+
+    Args:
+        table: `MODULE:TABLE`.
+        fields: name and type.
+        prefix: of the options' names.
+        names: of options that are called otherwise than their field.
+    """
+    for field, kind in fields.items():
+        name = f"--{prefix}{names.get(field, field).replace('_', '-')}"
+        more: dict[str, Any] = {"action": "store_true"}
+        if kind is not bool:
+            unit = "N" if kind is int else field.rpartition("_")[2].upper()
+            more = {"type": kind, "metavar": unit}
+        if kind is tuple:
+            more = {"type": float, "nargs": 2, "metavar": ("LEAST", "MOST")}
+        dest, text = f"{table.partition(':')[2]}.{field}", FieldHelp(f"{table}.{field}")
+        parser.add_argument(name, dest=dest, default=argparse.SUPPRESS, help=text, **more)
+
+
+def table_values(options: argparse.Namespace, table: str) -> dict[str, Any]:
+    """The fields of a settings table that the command line names."""
+    return {
+        name.partition(".")[2]: tuple(value) if isinstance(value, list) else value
+        for name, value in vars(options).items()
+        if name.startswith(f"{table}.")
+    }
+
+
+def setting_option(parser: Options, text: str) -> None:
+    """Add --set."""
+    unit = "TABLE.FIELD=VALUE"
+    option(parser, "--set", str, f"{text} (default: none)", unit, action="append", default=[])
+
+
+def run_option(parser: Options) -> None:
+    """Add RUN."""
+    option(parser, "run", Path, "run folder of `ucfrec train`", "RUN")
+
 
 def environment_options(parser: argparse.ArgumentParser) -> None:
     """Add --env with the options that belong to it, and --seed."""
     env_options(parser, required=True)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the sessions (default: 0)")
+    option(parser, "--seed", 0, "seed of the sessions")
 
 
 def env_options(parser: argparse.ArgumentParser, required: bool, use: str = "") -> None:
     """Add --env, --env-folder, --observe and --item-features.
 
     Args:
-        required: whether --env must be given.
         use: what the environment is used for, for the help of --env.
     """
-    parser.add_argument(
+    option(
+        parser,
         "--env",
-        required=required,
-        help=f"simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment "
+        str,
+        "simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment "
         f"(gymnasium:MODULE:ID imports MODULE first){use}",
+        required=required,
     )
-    parser.add_argument(
+    group = parser.add_argument_group("the environment")
+    option(
+        group,
         "--env-folder",
-        type=Path,
-        metavar="FOLDER",
-        help="folder with the simulator's files, e.g. its weights (default: none)",
+        Path,
+        "folder with the simulator's files, e.g. its weights (default: none)",
+        "FOLDER",
     )
-    parser.add_argument(
+    option(
+        group,
         "--observe",
-        default="",
-        metavar="KEY[,KEY…]",
-        help="of gymnasium:ID with a dict observation: entries that are observed, one after the "
+        str,
+        "of gymnasium:ID with a dict observation: entries that are observed, one after the "
         "other as one vector (default: none, states come from the items shown and their rewards; "
         "environments of vector actions need one)",
+        "KEY[,KEY…]",
+        default="",
     )
-    parser.add_argument(
+    option(
+        group,
         "--item-features",
-        metavar="SOURCE",
-        help="of gymnasium:ID with items: their features, from an attribute of the environment or "
+        str,
+        "of gymnasium:ID with items: their features, from an attribute of the environment or "
         "a file .npy (a row for each item) or .parquet (with a column item_id from 0) (default: "
         "none)",
+        "SOURCE",
     )
 
 
-def log_options(parser: argparse.ArgumentParser) -> argparse.Action:
-    """Add LOGS, which is returned, and how they are read."""
-    logs = parser.add_argument(
-        "logs",
-        nargs="+",
-        type=uri_or_path(Input, str),
-        metavar="LOGS",
-        help="log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …",
-    )
-    parser.add_argument(
+def log_options(
+    parser: argparse.ArgumentParser, metavar: str = "LOGS", nargs: str = "+"
+) -> argparse._ArgumentGroup:
+    """Add LOGS and how they are read; returns the group of the latter."""
+    text = "log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"
+    option(parser, "logs", INPUT, text, metavar, nargs=nargs)
+    group = parser.add_argument_group("reading logs")
+    option(
+        group,
         "--dataset",
-        metavar="NAME",
-        help="kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there "
+        str,
+        "kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there "
         "is one, else generic)",
+        "NAME",
     )
-    parser.add_argument(
+    option(
+        group,
         "--column",
+        str,
+        "file column or SQL expression for a log column, e.g. user_id=uid; repeatable "
+        "(default: as in the logs that the run was trained on, or the column of the same name)",
+        "NAME=COLUMN",
         action="append",
         default=[],
-        metavar="NAME=COLUMN",
-        help="file column or SQL expression for a log column, e.g. user_id=uid; repeatable "
-        "(default: as in the logs that the run was trained on, or the column of the same name)",
     )
-    parser.add_argument(
+    option(
+        group,
         "--mapping",
-        type=Path,
-        metavar="TOML",
-        help="file with column mapping, reward and feature tables; --column overrides it "
+        Path,
+        "file with column mapping, reward and feature tables; --column overrides it "
         "(default: none; a run remembers the columns of its logs)",
+        "TOML",
     )
-    parser.add_argument(
+    option(
+        group,
         "--time-format",
-        metavar="FORMAT",
-        help="how times are written that are text, e.g. '%%d/%%m/%%Y %%H:%%M' (default: ISO 8601, "
+        str,
+        "how times are written that are text, e.g. '%%d/%%m/%%Y %%H:%%M' (default: ISO 8601, "
         "and dates whose order of day and month the file settles)",
+        "FORMAT",
     )
-    parser.add_argument(
-        "--earliest",
-        metavar="TIME",
-        help="ISO time before which times are clock errors (default: 2000-01-01)",
-    )
-    parser.add_argument(
+    text = "ISO time before which times are clock errors (default: 2000-01-01)"
+    option(group, "--earliest", str, text, "TIME")
+    option(
+        group,
         "--where",
-        metavar="SQL",
-        help="condition over the log's columns; rows that do not fulfil it are excluded and "
+        str,
+        "condition over the log's columns; rows that do not fulfil it are excluded and "
         "counted, e.g. \"user_id NOT IN ('bot-0', 'bot-1')\" (default: none)",
+        "SQL",
     )
-    parser.add_argument(
-        "--partitions",
-        action="store_true",
-        help="read names of folders such as country=DE as columns (default: no)",
-    )
-    return logs
+    option(group, "--partitions", False, "read names of folders such as country=DE as columns")
+    return group
+
+
+def memory_option(parser: Options, more: str = "") -> None:
+    """Add --memory-limit, of reading logs."""
+    text = "memory of the process while it reads the logs, from 800MB on; beyond it rows spill "
+    option(parser, "--memory-limit", "2GB", f"{text}to a scratch folder{more}", "SIZE")
 
 
 def runs_given(options: argparse.Namespace) -> list[Path]:
@@ -129,178 +250,102 @@ def runs_given(options: argparse.Namespace) -> list[Path]:
     options.logs = [path for path in options.logs if Path(path) not in runs]
     if not runs:
         raise InputError("name a run folder of `ucfrec train` first, then the logs")
-    return runs
-
-
-def memory_option(parser: argparse.ArgumentParser) -> None:
-    """Add --memory-limit, of reading logs."""
-    parser.add_argument(
-        "--memory-limit",
-        default="2GB",
-        metavar="SIZE",
-        help="memory of the process while it reads the logs, from 800MB on; beyond it rows spill "
-        "to a scratch folder (default: 2GB)",
-    )
-
-
-_NUMBERS_OF_RULES: Final = (
-    (
-        "--minimum-target",
-        float,
-        "RETURN",
-        "lower bound of the target, also once a session has reached it",
-    ),
-    ("--reward-weight", float, "BETA", "weight of the reward model; 0 for none"),
-    ("--policy-weight", float, "W", "weight of the policy; 0 for none"),
-    (
-        "--lookahead",
-        float,
-        "RETURN",
-        "expected return after a step that does not end the session; 0 for none",
-    ),
-    ("--temperature", float, "TEMPERATURE", "draw items at this temperature; 0 takes the best"),
-    ("--top-k", int, "N", "draw from the N best items only"),
-    (
-        "--explore",
-        float,
-        "SHARE",
-        "share of the requests that draw uniformly from all items that are allowed",
-    ),
-    ("--explore-top", int, "N", "these draw from the N best items only"),
-)
-"""Option, type, unit and meaning of numbers that a rule has."""
+    return list(dict.fromkeys(runs))
 
 
 def rule_options(parser: argparse.ArgumentParser) -> None:
     """Add --checkpoint and the parts of a decision rule that replace those of the run's own."""
-    parser.add_argument(
-        "--checkpoint",
-        choices=["best", "last"],
-        default="best",
-        help="policy weights: of the lowest validation loss, or the last ones (default: best)",
-    )
     rule = parser.add_argument_group(
         "decision rule", "each part is the run's own, chosen at the end of its training, by default"
     )
+    text = "policy weights: of the lowest validation loss, or the last ones (default: best)"
+    option(rule, "--checkpoint", ["best", "last"], text, default="best")
     target = rule.add_mutually_exclusive_group()
-    target.add_argument(
+    option(
+        target,
         "--target-return",
-        type=float,
-        metavar="RETURN",
-        help="target return, in units of the reward: of a session, or of every step for "
+        float,
+        "target return, in units of the reward: of a session, or of every step for "
         "returns-to-go of a horizon or discounted ones",
+        "RETURN",
     )
-    target.add_argument(
-        "--target-quantile",
-        type=float,
-        metavar="QUANTILE",
-        help="target return: this quantile of the training's, 0 to 1; 1 is the largest",
-    )
-    target.add_argument(
-        "--max-return",
-        action="store_true",
-        help="target return: the largest that the policy expects in each state",
-    )
-    for name, kind, unit, text in _NUMBERS_OF_RULES:
-        rule.add_argument(name, type=kind, metavar=unit, help=text)
-    rule.add_argument(
-        "--exclude-seen", action="store_true", help="exclude items that the session has shown"
-    )
-    rule.add_argument(
-        "--tag-window",
-        type=int,
-        metavar="N",
-        help="exclude items that share a tag with one of the last N, unless none remain",
-    )
-    rule.add_argument(
-        "--tag-run",
-        type=int,
-        metavar="N",
-        help="exclude items of one main tag once the last N had it and were liked",
-    )
+    text = "target return: this quantile of the training's, 0 to 1; 1 is the largest"
+    option(target, "--target-quantile", float, text, "QUANTILE")
+    text = "target return: the largest that the policy expects in each state"
+    option(target, "--max-return", False, text)
+    table_options(rule, "ucfrec.acting.decision:DecisionRule", RULE)
 
 
-def keep_seen_option(parser: argparse.ArgumentParser) -> None:
+def keep_seen_option(parser: Options) -> None:
     """Add the option on items that users have seen."""
-    parser.add_argument(
-        "--keep-seen",
-        action="store_true",
-        help="also recommend items that the user has seen (default: leave them out)",
-    )
+    text = "also recommend items that the user has seen; (default: leave them out)"
+    option(parser, "--keep-seen", False, text)
 
 
-def filter_seen_option(parser: argparse.ArgumentParser) -> None:
+def filter_seen_option(parser: Options) -> None:
     """Add the option to exclude items that users have seen from what the policy could choose."""
-    parser.add_argument(
+    option(
+        parser,
         "--filter-seen",
-        action="store_true",
-        help="exclude items that the user was shown before, as serve and recommend do without "
+        False,
+        "exclude items that the user was shown before, as serve and recommend do without "
         "--keep-seen: for logs of what they showed",
     )
 
 
-def item_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options on items that users have seen and on items that the run does not know."""
-    keep_seen_option(parser)
-    parser.add_argument(
-        "--skip-unknown",
-        action="store_true",
-        help="ignore rows with items outside the catalogue of the run, and such candidates "
-        "(default: an error)",
-    )
-
-
-def draw_options(parser: argparse.ArgumentParser, place: str) -> None:
-    """Add --seed and --exposures, of a rule that draws items."""
-    parser.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        help="of the draws of a rule with --temperature or --explore (default: 0)",
-    )
-    parser.add_argument(
-        "--exposures",
-        type=Path,
-        metavar=place,
-        help="write what was shown, with its probability, as Parquet (docs/exposures.md)",
-    )
-
-
-def limit_options(parser: argparse.ArgumentParser) -> None:
-    """Add the limits of a request for recommendations."""
-    limits = parser.add_argument_group("request limits", "larger requests are rejected")
-    for name, most, text in (
-        ("--max-bytes", 2**21, "bytes of JSON (default: 2 MiB)"),
-        ("--max-k", 1000, "items requested (default: 1,000)"),
-        ("--max-history", 5000, "rows (default: 5,000)"),
-        ("--max-candidates", 10_000, "items (default: 10,000)"),
-    ):
-        limits.add_argument(name, type=int, default=most, metavar="N", help=text)
-
-
-def engine_option(parser: argparse.ArgumentParser, *more: str, more_help: str = "") -> None:
-    """Add what computes the network of requests that are not batched.
+def answer_options(
+    parser: argparse.ArgumentParser, exposures: str, *engines: str
+) -> argparse._ArgumentGroup:
+    """Add what `recommend` and `serve` share, and return the group of the finer points.
 
     Args:
-        more: further choices.
-        more_help: what they are, for the help.
+        exposures: what --exposures takes, FILE or DIR.
+        engines: choices besides torch and onnxruntime.
     """
-    parser.add_argument(
-        "--engine",
-        choices=("torch", "onnxruntime", *more),
-        default="torch",
-        help="what computes the network of requests that are not batched; onnxruntime is faster, "
-        f"but needs ucfrec[export] and some 10 seconds at the start{more_help} (default: torch)",
+    option(parser, "--k", 10, "items for each user; if a request does not say how many")
+    option(
+        parser,
+        "--exposures",
+        Path,
+        "write what was shown, with its probability, as Parquet; see docs/exposures.md",
+        exposures,
     )
+    keep_seen_option(parser)
+    group = parser.add_argument_group("answering")
+    option(
+        group,
+        "--skip-unknown",
+        False,
+        "ignore rows with items outside the catalogue of the run, and such candidates "
+        "(default: an error)",
+    )
+    option(group, "--seed", 0, "of the draws of a rule with --temperature or --explore")
+    text = (
+        "what computes the network of requests that are not batched; onnxruntime is faster, "
+        "but needs ucfrec[export] and some 10 seconds at the start"
+    )
+    if "spark" in engines:
+        text += (
+            "; spark: with LOGS, Spark's workers each recommend to some of the users and "
+            "write the parts of a folder --out"
+        )
+    choices = ["torch", "onnxruntime", *engines]
+    option(group, "--engine", choices, f"{text} (default: torch)", default="torch")
+    limits = parser.add_argument_group("request limits", "larger requests are rejected")
+    sizes = dict.fromkeys(("bytes", "k", "history", "candidates"), int)
+    table_options(limits, "ucfrec.recommending.requests:Limits", sizes, "max-")
+    return group
 
 
-def spark_option(parser: argparse.ArgumentParser) -> None:
+def spark_option(parser: Options) -> None:
     """Add where Spark is, for an engine of that name."""
-    parser.add_argument(
+    option(
+        parser,
         "--spark-master",
-        metavar="MASTER",
-        help="with --engine spark: its master, e.g. spark://HOST:7077; inputs and output must lie "
+        str,
+        "with --engine spark: its master, e.g. spark://HOST:7077; inputs and output must lie "
         "where every worker sees them (default: local[*], this machine)",
+        "MASTER",
     )
 
 
@@ -318,8 +363,7 @@ def spark_given(options: argparse.Namespace) -> str | None:
 
 
 def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Responder":
-    """What answers requests, by `--k`, `item_options`, `draw_options`, `engine_option`,
-    `limit_options` and `rule_options`.
+    """What answers requests, by `answer_options` and `rule_options`.
 
     Raises:
         InputError: a value is out of range, or the policy's actions are vectors.
@@ -327,15 +371,9 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
     from ucfrec.recommending.requests import Limits
     from ucfrec.recommending.responder import Responder
 
-    limits = Limits(
-        bytes=options.max_bytes,
-        k=options.max_k,
-        history=options.max_history,
-        candidates=options.max_candidates,
-    )
     return Responder(
         trained,
-        limits,
+        Limits(**table_values(options, "Limits")),
         rule=rule_given(options, trained),
         k=options.k,
         filter_seen=not options.keep_seen,
@@ -349,7 +387,7 @@ def responder_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "R
 def exposures_given(
     options: argparse.Namespace, trained: "TrainedPolicy"
 ) -> "Iterator[ExposureLog | None]":
-    """Where `draw_options` say that a server's answers are written; None for nowhere."""
+    """Where --exposures says that a server's answers are written; None for nowhere."""
     from ucfrec.recommending.exposures import ExposureLog
 
     if options.exposures is None:
@@ -365,15 +403,12 @@ def rule_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Decisi
     Raises:
         InputError: a value is out of range.
     """
-    target = options.target_return
+    parts = table_values(options, "DecisionRule")
     if options.target_quantile is not None:
-        target = trained.target_return(options.target_quantile)
-    parts = {each.name: getattr(options, each.name, None) for each in fields(trained.rule)}
-    parts |= {"target": target, "exclude_seen": options.exclude_seen or None}
-    given = {name: value for name, value in parts.items() if value is not None}
-    if options.max_return:
-        given["target"] = None
-    return replace(trained.rule, **given)
+        parts["target"] = trained.target_return(options.target_quantile)
+    elif options.target_return is not None or options.max_return:
+        parts["target"] = options.target_return
+    return replace(trained.rule, **parts)
 
 
 def logs_given(
@@ -392,7 +427,7 @@ def logs_given(
     from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
     from ucfrec.plugins import load_plugin
 
-    given = LogMapping(
+    mapping = LogMapping(
         columns_given(options.column),
         time_format=options.time_format,
         earliest=options.earliest,
@@ -400,20 +435,20 @@ def logs_given(
         partitions=options.partitions,
     )
     if options.mapping is not None:
-        given = given.over(read_mapping(options.mapping))
+        mapping = mapping.over(read_mapping(options.mapping))
     if trained is not None and options.dataset is None:
         from ucfrec.runs.later_logs import later_logs
 
-        files, mapping = later_logs(trained, options.logs, given)
+        files, mapping = later_logs(trained, options.logs, mapping)
     else:
         dataset: Dataset = load_plugin("datasets", options.dataset or "generic")
-        files, mapping = dataset.resolve(options.logs, given)
+        files, mapping = dataset.resolve(options.logs, mapping)
     outputs = (getattr(options, name, None) for name in ("out", "exposures", "json"))
-    read = [*files]
+    inputs = [*files]
     if trained is not None:
-        of_run = (trained.record.FILE, *trained.record.files)
-        read += [trained.folder / name for name in of_run]
-    require_other_files((each for each in outputs if isinstance(each, Path)), read)
+        names = (trained.record.FILE, *trained.record.files)
+        inputs += [trained.folder / name for name in names]
+    require_other_files((path for path in outputs if isinstance(path, Path)), inputs)
     return files, mapping
 
 
@@ -424,3 +459,16 @@ def environment_given(options: argparse.Namespace) -> "Environment":
     observe = tuple(key for key in options.observe.split(",") if key)
     features = options.item_features
     return Environment(options.env, options.env_folder, observe=observe, item_features=features)
+
+
+def read_duration(option: str, text: str) -> int:
+    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`.
+
+    Raises:
+        InputError: it is written otherwise, or is 0.
+    """
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", text.strip())
+    milliseconds = 0 if match is None else round(float(match[1]) * _UNITS_MS[match[2]])
+    if not milliseconds:
+        raise InputError(f"{option} {text} is not a duration; write e.g. 90s, 30m, 12h or 60d")
+    return milliseconds

@@ -1,80 +1,81 @@
 """`ucfrec prepare`: turn logs into an episode store."""
 
 import argparse
-from pathlib import Path
 
-from ucfrec.commands.options import log_options, logs_given, spark_given, spark_option
+from ucfrec.commands.options import (
+    OUTPUT,
+    log_options,
+    logs_given,
+    option,
+    spark_given,
+    spark_option,
+)
 from ucfrec.errors import InputError
-from ucfrec.files.remote import Output, origin, uri_or_path
+from ucfrec.files.remote import origin
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec prepare`."""
-    log_options(parser)
-    parser.add_argument(
-        "--out",
-        type=uri_or_path(Output, Path),
-        metavar="STORE",
-        help="new folder for the store; also at s3://, gs://, hdfs://, …",
-    )
-    parser.add_argument(
+    reading = log_options(parser)
+    text = "new folder for the store; also at s3://, gs://, hdfs://, …"
+    option(parser, "--out", OUTPUT, text, "STORE")
+    option(
+        parser,
         "--reward",
-        metavar="SQL",
-        help="scalar SQL expression over the log's columns, e.g. is_click (default: of the "
+        str,
+        "scalar SQL expression over the log's columns, e.g. is_click (default: of the "
         "dataset or --mapping, else the column reward)",
+        "SQL",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--session-by",
-        choices=["gap", "user", "session_id"],
-        help="start a new session after a pause, once per user, or with a new session_id "
+        ["gap", "user", "session_id"],
+        "start a new session after a pause, once per user, or with a new session_id "
         "(default: of the dataset or --mapping, else session_id if the log has it, else gap)",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--gap-minutes",
-        type=float,
-        metavar="MINUTES",
-        help="with --session-by gap: a longer pause of the user ends the session, in minutes "
-        "(default: 30)",
+        float,
+        "with --session-by gap: a longer pause of the user ends the session (default: 30)",
+        "MINUTES",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--split",
-        metavar="TRAIN,VALIDATION,TEST",
-        help="shares of the rows in order of time, or two ISO times (UTC) at which validation and "
+        str,
+        "shares of the rows in order of time; or two ISO times (UTC) at which validation and "
         "test begin (default: 0.8,0.1,0.1)",
+        "TRAIN,VALIDATION,TEST",
     )
-    parser.add_argument(
+    option(parser, "--validate", False, "check the logs without writing a store")
+    option(
+        reading,
         "--duplicates",
-        choices=["highest", "lowest", "first", "last"],
-        help="of rows with the same user, item and time, keep that with the highest or lowest "
+        ["highest", "lowest", "first", "last"],
+        "of rows with the same user, item and time, keep that with the highest or lowest "
         "reward, or the first or last in the files (default: highest)",
     )
-    parser.add_argument(
-        "--max-session",
-        type=int,
-        metavar="N",
-        help="exclude and count sessions of more than N rows, as of bots (default: none)",
-    )
-    parser.add_argument(
-        "--validate", action="store_true", help="check the logs without writing a store"
-    )
-    _engine_options(parser)
-
-
-def _engine_options(parser: argparse.ArgumentParser) -> None:
-    """Add what reads the rows, and in how much memory."""
-    parser.add_argument(
+    text = "exclude and count sessions of more than N rows, as of bots (default: none)"
+    option(reading, "--max-session", int, text, "N")
+    engine = parser.add_argument_group("engine and memory")
+    option(
+        engine,
         "--memory-limit",
-        metavar="SIZE",
-        help="memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
+        str,
+        "memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder "
         "beside the store, to at most 90%% of the free disk (default: 2GB)",
+        "SIZE",
     )
-    parser.add_argument(
+    option(
+        engine,
         "--engine",
-        choices=["duckdb", "spark"],
-        help="what reads and sorts the rows: DuckDB on this machine, or Spark, for logs that "
+        ["duckdb", "spark"],
+        "what reads and sorts the rows: DuckDB on this machine, or Spark, for logs that "
         "outgrow it; the store is the same (default: duckdb)",
     )
-    spark_option(parser)
+    spark_option(engine)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -92,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
     by = options.session_by or mapping.session_by or "gap"
     if options.gap_minutes is not None and by != "gap":
         raise InputError(f"--gap-minutes needs --session-by gap, not {by}; leave one of them out")
-    given = {
+    fields = {
         "reward": options.reward and Expression(options.reward, "--reward"),
         "session_by": options.session_by,
         "dataset": options.dataset or "generic",
@@ -104,14 +105,14 @@ def run(options: argparse.Namespace) -> None:
         "spark_master": spark_given(options),
         "split": options.split and parse_split(options.split),
     }
-    prepared = PrepareOptions(**{name: value for name, value in given.items() if value is not None})
+    how = PrepareOptions(**{name: value for name, value in fields.items() if value is not None})
     if options.validate:
-        print(format_report(validate(files, mapping, prepared)))
+        print(format_report(validate(files, mapping, how)))
         print("\nnothing was written; next: the same command with --out STORE, not --validate")
         return
     if options.out is None:
         raise InputError("no store is named; add --out STORE, or --validate to only check the logs")
-    print(format_report(prepare(files, mapping, options.out, prepared)))
+    print(format_report(prepare(files, mapping, options.out, how)))
     store = origin(options.out)
     print(
         f"\nstore: {store}; policies learn from its train split, later rows validate and test them"

@@ -3,26 +3,27 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.options import option
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec promote`."""
-    parser.add_argument(
+    option(
+        parser,
         "run",
-        type=Path,
-        metavar="RUN",
-        help="run folder that becomes the current one of the folder that it lies in; with --back, "
+        Path,
+        "run folder that becomes the current one of the folder that it lies in; with --back, "
         "that folder",
+        "RUN",
     )
     how = parser.add_mutually_exclusive_group()
-    how.add_argument(
+    option(
+        how,
         "--force",
-        action="store_true",
-        help="promote a run without a verdict against the current one, or a worse one (default: "
-        "refuse)",
+        False,
+        "promote a run without a verdict against the current one, or a worse one (default: refuse)",
     )
-    how.add_argument(
-        "--back", action="store_true", help="return to the run that was current before"
-    )
+    option(how, "--back", False, "return to the run that was current before")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -36,10 +37,10 @@ def run(options: argparse.Namespace) -> None:
 
     if options.back:
         folder = options.run.parent if (options.run / RUN_RECORD).is_file() else options.run
-        found = promote_back(folder)
+        pointer = promote_back(folder)
     else:
-        folder, found = options.run.resolve().parent, promote(options.run, options.force)
-    before = f", before it {found.previous[-1]}" if found.previous else ""
-    print(f"current run: {found.current}{before} ({folder / POINTER})")
+        folder, pointer = options.run.resolve().parent, promote(options.run, options.force)
+    before = f", before it {pointer.previous[-1]}" if pointer.previous else ""
+    print(f"current run: {pointer.current}{before} ({folder / POINTER})")
     if not options.back:
         print(f"next: ucfrec serve {folder}, which follows it; --back returns")

@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING
 
 from ucfrec import schema
 from ucfrec.commands.options import (
-    draw_options,
-    engine_option,
+    OUTPUT,
+    answer_options,
     exposures_given,
-    item_options,
-    limit_options,
     log_options,
     logs_given,
     memory_option,
+    option,
     responder_given,
     rule_given,
     rule_options,
+    run_option,
     spark_given,
     spark_option,
 )
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.remote import Output, origin, uri_or_path
+from ucfrec.files.remote import origin
 from ucfrec.progress import Progress, progress
 
 if TYPE_CHECKING:
@@ -36,51 +36,41 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec recommend`."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
-    logs = log_options(parser)
-    logs.nargs, logs.required = "*", False
-    memory_option(parser)
-    parser.add_argument("--k", type=int, default=10, help="items for each user (default: 10)")
-    item_options(parser)
-    parser.add_argument(
-        "--candidates",
-        type=Path,
-        metavar="FILE",
-        help="the only items to recommend: Parquet or CSV with a column item_id (default: all)",
+    run_option(parser)
+    memory_option(log_options(parser, nargs="*"))
+    answering = answer_options(parser, "FILE", "spark")
+    text = "Parquet file (with --engine spark: folder) to write"
+    option(parser, "--out", OUTPUT, text)
+    option(
+        parser,
+        "--stream",
+        False,
+        "instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
+        "answers to stdout; see docs/serving.md",
     )
-    parser.add_argument(
+    option(
+        parser,
+        "--candidates",
+        Path,
+        "the only items to recommend: Parquet or CSV with a column item_id (default: all)",
+        "FILE",
+    )
+    option(
+        answering,
         "--new-session",
-        action="store_true",
-        help="recommend for the first step of a new session (default: the latest session of each "
+        False,
+        "recommend for the first step of a new session (default: the latest session of each "
         "user goes on)",
     )
     rule_options(parser)
-    draw_options(parser, "FILE")
-    parser.add_argument(
+    option(
+        answering,
         "--approximate",
-        action="store_true",
-        help="find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule "
+        False,
+        "find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule "
         "without a temperature; says the recall (default: exactly)",
     )
-    parser.add_argument(
-        "--out",
-        type=uri_or_path(Output, Path),
-        help="Parquet file (with --engine spark: folder) to write",
-    )
-    parser.add_argument(
-        "--stream",
-        action="store_true",
-        help="instead of LOGS and --out: read requests from stdin, JSON on each line, and write "
-        "answers to stdout (docs/serving.md)",
-    )
-    engine_option(
-        parser,
-        "spark",
-        more_help="; spark: with LOGS, Spark's workers each recommend to some of the users and "
-        "write the parts of a folder --out",
-    )
-    spark_option(parser)
-    limit_options(parser)
+    spark_option(answering)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -115,11 +105,11 @@ def run(options: argparse.Namespace) -> None:
     with progress(None, "recommend", "users") as bar:
         frames = recommend(
             trained,
-            _counted(histories_of_files(trained, files, mapping, options.memory_limit), bar),
+            _count_users(histories_of_files(trained, files, mapping, options.memory_limit), bar),
             options.k,
             rule=rule,
             filter_seen=not options.keep_seen,
-            candidates=_candidates_given(options, trained),
+            candidates=_read_candidates(options, trained),
             skip_unknown=options.skip_unknown,
             new_session=options.new_session,
             seed=options.seed,
@@ -138,7 +128,7 @@ def run(options: argparse.Namespace) -> None:
         )
 
 
-def _candidates_given(options: argparse.Namespace, trained: "TrainedPolicy") -> "Array | None":
+def _read_candidates(options: argparse.Namespace, trained: "TrainedPolicy") -> "Array | None":
     """The ids in the file of candidates that the run knows; all ids if it knows none."""
     if options.candidates is None:
         return None
@@ -189,16 +179,18 @@ def _answer_stream(options: argparse.Namespace) -> None:
     from ucfrec.recommending.stream import answer_stream
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-    if options.logs or options.out:
-        raise InputError("--stream reads stdin and writes stdout; leave LOGS and --out out")
-    if options.engine == "spark" or options.spark_master:
-        raise InputError("--stream answers in this process; leave --engine spark out")
-    if options.approximate:
-        raise InputError("--stream finds items exactly; leave --approximate out")
-    if options.new_session:
-        raise InputError("with --stream, each line says new_session; leave --new-session out")
-    if options.candidates is not None:
-        raise InputError("with --stream, each line has its candidates; leave --candidates out")
+    refusals = {
+        "--stream reads stdin and writes stdout; leave LOGS and --out out": options.logs
+        or options.out,
+        "--stream answers in this process; leave --engine spark out": options.engine == "spark"
+        or options.spark_master,
+        "--stream finds items exactly; leave --approximate out": options.approximate,
+        "with --stream, each line says new_session; leave --new-session out": options.new_session,
+        "with --stream, each line has its candidates; leave --candidates out": options.candidates,
+    }
+    for message, refused in refusals.items():
+        if refused:
+            raise InputError(message)
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     # Unbuffered, so that a request is answered without waiting for the next ones.
     with (
@@ -212,7 +204,7 @@ def _answer_stream(options: argparse.Namespace) -> None:
     )
 
 
-def _counted(batches: "Iterator[Histories]", bar: Progress) -> "Iterator[Histories]":
+def _count_users(batches: "Iterator[Histories]", bar: Progress) -> "Iterator[Histories]":
     for batch in batches:
         yield batch
         bar.update(len(batch.users))

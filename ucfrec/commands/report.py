@@ -3,38 +3,34 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec report`."""
-    parser.add_argument(
-        "runs", nargs="*", type=Path, metavar="RUN", help="run folders of `ucfrec train`"
-    )
-    parser.add_argument(
+    option(parser, "runs", Path, "run folders of `ucfrec train`", "RUN", nargs="*")
+    option(
+        parser,
         "--results",
+        Path,
+        "results to show: JSON or JSON lines (.jsonl) of `ucfrec evaluate --json`, "
+        "`ucfrec ope --json` or `ucfrec demo` (default: none)",
+        "FILE",
         nargs="+",
         action="extend",
-        type=Path,
         default=[],
-        metavar="FILE",
-        help="results to show: JSON or JSON lines (.jsonl) of `ucfrec evaluate --json`, "
-        "`ucfrec ope --json` or `ucfrec demo` (default: none)",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--items",
-        type=Path,
-        metavar="FILE",
-        help="item features to show with the sample recommendations: Parquet or CSV with a column "
+        Path,
+        "item features to show with the sample recommendations: Parquet or CSV with a column "
         "item_id (default: none)",
+        "FILE",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("report.html"),
-        metavar="FILE",
-        help="HTML file to write (default: report.html)",
-    )
+    text = "HTML file to write (default: report.html)"
+    option(parser, "--out", Path, text, "FILE", default=Path("report.html"))
     parser.usage = "%(prog)s RUN... [options]"
 
 

@@ -1,40 +1,38 @@
 """`ucfrec score`: write a policy's probability of every logged choice."""
 
 import argparse
-from pathlib import Path
 
 from ucfrec.commands.options import (
+    OUTPUT,
     filter_seen_option,
     log_options,
     logs_given,
     memory_option,
+    option,
     rule_given,
     rule_options,
+    run_option,
     spark_given,
     spark_option,
 )
-from ucfrec.files.remote import Output, origin, uri_or_path
+from ucfrec.files.remote import origin
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec score`."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
-    log_options(parser)
-    memory_option(parser)
+    run_option(parser)
+    memory_option(log_options(parser))
     rule_options(parser)
     filter_seen_option(parser)
-    parser.add_argument(
-        "--out",
-        type=uri_or_path(Output, Path),
-        required=True,
-        help="Parquet file (with --engine spark: folder) to write",
-    )
-    parser.add_argument(
+    text = "Parquet file (with --engine spark: folder) to write"
+    option(parser, "--out", OUTPUT, text, required=True)
+    option(
+        parser,
         "--engine",
-        choices=("torch", "spark"),
-        default="torch",
-        help="what computes the probabilities: this process, or Spark's workers, each for some of "
+        ["torch", "spark"],
+        "what computes the probabilities: this process; or Spark's workers, each for some of "
         "the users, which write the parts of a folder --out (default: torch)",
+        default="torch",
     )
     spark_option(parser)
 

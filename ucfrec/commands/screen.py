@@ -3,18 +3,14 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.files.remote import Input, uri_or_path
+from ucfrec.commands.options import INPUT_FOLDER, option
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec screen`."""
-    parser.add_argument(
-        "store", type=uri_or_path(Input, Path), metavar="STORE", help="episode store to screen"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the predictors (default: 0)")
-    parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write the report here (default: none)"
-    )
+    option(parser, "store", INPUT_FOLDER, "episode store to screen", "STORE")
+    option(parser, "--seed", 0, "seed of the predictors")
+    option(parser, "--json", Path, "write the report here (default: none)", "FILE")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ucfrec.commands.options import (
-    draw_options,
-    engine_option,
+    answer_options,
     exposures_given,
-    item_options,
-    limit_options,
+    option,
     responder_given,
     rule_options,
+    table_options,
+    table_values,
 )
 from ucfrec.errors import InputError, InputNote
 from ucfrec.processes import Interrupted
@@ -29,75 +29,49 @@ if TYPE_CHECKING:
 
     from ucfrec.recommending.responder import Responder
     from ucfrec.recommending.workers import Parent
-
-
 _STOPPED: Final = "ucfrec serve: stopped"
+_LIMITS: Final = "ucfrec.recommending.web:ServerLimits"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec serve`."""
-    parser.add_argument(
+    option(
+        parser,
         "run",
-        type=Path,
-        metavar="RUN",
-        help="run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec "
+        Path,
+        "run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec "
         "promote` made current answers, and is followed",
+        "RUN",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--split",
-        metavar="A=SHARE,B=SHARE",
-        help="answer with several runs of the folder RUN, each for its share of the users, e.g. "
+        str,
+        "answer with several runs of the folder RUN, each for its share of the users; e.g. "
         "run1=0.9,run2=0.1; the exposures have the arm (default: one run answers all)",
+        "A=SHARE,B=SHARE",
     )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; one that is not this machine's own exposes the server to the "
-        "network (default: 127.0.0.1)",
-    )
-    parser.add_argument(
+    text = "address to listen on; one that is not this machine's own exposes the server to the "
+    option(parser, "--host", "127.0.0.1", f"{text}network")
+    option(parser, "--port", 8080, "0 for a free one")
+    answer_options(parser, "DIR")
+    rule_options(parser)
+    server = parser.add_argument_group("the server")
+    option(
+        server,
         "--allowed-hosts",
-        metavar="HOST[,HOST…]",
-        help="answer only requests whose header Host names one of these: names, addresses, "
+        str,
+        "answer only requests whose header Host names one of these: names, addresses, "
         "*.example.org, or * for any (default: this machine's own names where --host is 127.0.0.1, "
         "localhost or ::1, otherwise any)",
+        "HOST[,HOST…]",
     )
-    parser.add_argument("--port", type=int, default=8080, help="0 for a free one (default: 8080)")
-    parser.add_argument(
-        "--k", type=int, default=10, help="items, if a request does not say how many (default: 10)"
-    )
-    item_options(parser)
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=1,
-        metavar="N",
-        help="processes that answer on the address, each with the run in its memory (default: 1)",
-    )
-    parser.add_argument(
-        "--threads",
-        type=int,
-        metavar="N",
-        help="threads per forward pass (default: one per core, divided by --workers)",
-    )
-    rule_options(parser)
-    draw_options(parser, "DIR")
-    engine_option(parser)
-    limit_options(parser)
-    server = parser.add_argument_group("limits of the server")
-    server.add_argument(
-        "--max-batch", type=int, default=64, metavar="N", help="requests per forward pass (64)"
-    )
-    server.add_argument(
-        "--max-queue", type=int, default=1024, metavar="N", help="requests in the queue (1,024)"
-    )
-    server.add_argument(
-        "--timeout",
-        type=float,
-        default=5.0,
-        metavar="S",
-        help="timeout per request, in seconds (5)",
-    )
+    text = "processes that answer on the address, each with the run in its memory"
+    option(server, "--workers", 1, text, "N")
+    text = "threads per forward pass (default: one per core, divided by --workers)"
+    option(server, "--threads", int, text, "N")
+    table_options(server, _LIMITS, {"batch": int, "queue": int}, "max-")
+    table_options(server, _LIMITS, {"timeout": float})
 
 
 def run(options: argparse.Namespace) -> None:
@@ -153,9 +127,7 @@ def _serve(
         if threads < 1:
             raise InputError(f"--threads is {threads}; give 1 or more")
         torch.set_num_threads(threads)
-    of_server = ServerLimits(
-        batch=options.max_batch, queue=options.max_queue, timeout=options.timeout
-    )
+    limits = ServerLimits(**table_values(options, "ServerLimits"))
 
     def make(run: Path) -> "Responder":
         verified(run)
@@ -172,8 +144,8 @@ def _serve(
         if shares is None:
             served.follow()
         config = server_config(
-            application(served, of_server, _allowed_hosts(options), exposures, several),
-            timeout_graceful_shutdown=int(of_server.timeout) + 1,
+            application(served, limits, _allowed_hosts(options), exposures, several),
+            timeout_graceful_shutdown=int(limits.timeout) + 1,
             workers=options.workers,
         )
         with address as listening:

@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from ucfrec.commands.options import option
 from ucfrec.policies.registry import policy_names
 
 if TYPE_CHECKING:
@@ -21,12 +22,8 @@ _WIDEST: Final = 160
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec settings`."""
-    parser.add_argument(
-        "--policy",
-        default="ucf",
-        metavar="NAME",
-        help=f"policy whose settings to list: {', '.join(policy_names())} (default: ucf)",
-    )
+    text = f"policy whose settings to list: {', '.join(policy_names())}"
+    option(parser, "--policy", str, f"{text} (default: ucf)", "NAME", default="ucf")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ucfrec.commands.options import INPUT_FOLDER, option, setting_option
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.remote import Input, uri_or_path
 from ucfrec.policies.registry import policy_names
 
 if TYPE_CHECKING:
@@ -18,25 +18,28 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec train`."""
     training_options(parser)
-    parser.add_argument(
+    option(
+        parser,
         "--refit",
-        type=Path,
-        metavar="RUN",
-        help="go on training this finished run on all rows of the store, with its settings and "
+        Path,
+        "go on training this finished run on all rows of the store, with its settings and "
         "decision rule, in another folder (default: a new training)",
+        "RUN",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--no-refit",
-        action="store_true",
-        help="keep the weights of the training rows (default: once everything is chosen, go on "
+        False,
+        "keep the weights of the training rows; (default: once everything is chosen, go on "
         "learning from all rows; `rank` and `ope` on the test split use the weights before that)",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--evidence",
-        type=int,
-        metavar="N",
-        help="effective users that the decision rule must leave in the validation sessions, where "
+        int,
+        "effective users that the decision rule must leave in the validation sessions; where "
         "the log has propensities, so that `ope` can estimate its value; 0 for any (default: 200)",
+        "N",
     )
 
 
@@ -49,47 +52,23 @@ def training_options(
         policies: names of those that the program trains, others are refused; None for all.
     """
     parser.epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
-    parser.add_argument(
-        "store",
-        type=uri_or_path(Input, Path),
-        metavar="STORE",
-        help="episode store to train on; also at s3://, gs://, hdfs://, …",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="RUN",
-        help="folder of the run; an unfinished run in it is resumed",
-    )
-    parser.add_argument(
-        "--policy",
-        default="ucf",
-        choices=policies,
-        metavar="NAME",
-        help=f"policy: {', '.join(policies or policy_names())} (default: ucf)",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="TOML",
-        help="file of settings with one table per section (default: none)",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="TABLE.FIELD=VALUE",
-        help="one setting, e.g. train.steps=2000; overrides --config; repeatable (default: none)",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of weights and batches (default: 0)"
-    )
-    parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
-    parser.add_argument(
+    text = "episode store to train on; also at s3://, gs://, hdfs://, …"
+    option(parser, "store", INPUT_FOLDER, text, "STORE")
+    text = "folder of the run; an unfinished run in it is resumed"
+    option(parser, "--out", Path, text, "RUN", required=True)
+    names = ", ".join(policies or policy_names())
+    text = f"policy: {names} (default: ucf)"
+    option(parser, "--policy", str, text, "NAME", default="ucf", choices=policies)
+    text = "file of settings with one table per section (default: none)"
+    option(parser, "--config", Path, text, "TOML")
+    setting_option(parser, "one setting, e.g. train.steps=2000; overrides --config; repeatable")
+    option(parser, "--seed", 0, "seed of weights and batches")
+    option(parser, "--threads", int, "CPU threads (default: all cores)")
+    option(
+        parser,
         "--screen",
-        choices=["drop", "copies"],
-        help="what to do with observation columns without effect: train without them, or add "
+        ["drop", "copies"],
+        "what to do with observation columns without effect; train without them, or add "
         "copies of the sessions that intervene on them (default: not screened)",
     )
 
@@ -125,17 +104,17 @@ def _train(options: argparse.Namespace) -> None:
         wait()  # until the leader has begun the run
     store = EpisodeStore.open(options.store)
     if options.refit is not None:
-        given = (options.config, options.set or None, options.screen, options.evidence)
-        if any(each is not None for each in given):
+        settings = (options.config, options.set or None, options.screen, options.evidence)
+        if any(setting is not None for setting in settings):
             raise InputError(
                 "--refit takes all settings of the run; omit --config, --set, --screen and "
                 "--evidence"
             )
         record = refit(store, options.refit, options.out)
     else:
-        wanted = [] if options.evidence is None else [f"rule.evidence={options.evidence}"]
-        settings = [*options.set, *wanted]
-        config = resolve_config(options.policy, options.config, settings, options.seed)
+        if options.evidence is not None:
+            options.set.append(f"rule.evidence={options.evidence}")
+        config = resolve_config(options.policy, options.config, options.set, options.seed)
         record = train_screened(store, options.out, config, options.screen)
     if options.no_refit:
         shutil.rmtree(options.out / REFIT, ignore_errors=True)
@@ -146,8 +125,8 @@ def _train(options: argparse.Namespace) -> None:
     card = write_card(options.out)
     print(record.describe(read_metrics(options.out / "policy")))
     if (options.out / REFIT / RUN).exists():
-        done = read_record(options.out / REFIT)
-        print(f"refit         {done.train_steps:,} rows, all of the store")
+        whole = read_record(options.out / REFIT)
+        print(f"refit         {whole.train_steps:,} rows, all of the store")
     print(f"\nrun: {options.out} (TensorBoard can open it)\nmodel card: {card}")
     if record.rule is None:
         print(f"next: ucfrec evaluate {options.out} --env NAME, in a simulator of these actions")

@@ -3,82 +3,55 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.options import option, setting_option
 from ucfrec.errors import InputError
 from ucfrec.policies.registry import policy_names
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec tune`."""
-    parser.add_argument("store", type=Path, metavar="STORE", help="episode store to train on")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder of the search; an unfinished search in it is resumed",
-    )
-    parser.add_argument(
+    option(parser, "store", Path, "episode store to train on", "STORE")
+    text = "folder of the search; an unfinished search in it is resumed"
+    option(parser, "--out", Path, text, "DIR", required=True)
+    option(
+        parser,
         "--policy",
+        str,
+        f"policy; {', '.join(policy_names())}; repeatable to search the policy too (default: ucf)",
+        "NAME",
         action="append",
-        metavar="NAME",
-        help=f"policy: {', '.join(policy_names())}; repeatable to search the policy too "
-        "(default: ucf)",
     )
-    parser.add_argument(
-        "--trials",
-        type=int,
-        default=30,
-        metavar="N",
-        help="trainings that the search has at the end (default: 30)",
-    )
-    _search_options(parser)
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the search and of every training (default: 0)"
-    )
-    parser.epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
-
-
-def _search_options(parser: argparse.ArgumentParser) -> None:
-    """Add what is searched, for what, and how."""
-    parser.add_argument(
+    option(parser, "--trials", 30, "trainings that the search has at the end", "N")
+    option(
+        parser,
         "--metric",
-        choices=("value", "ndcg", "gauc"),
-        default="value",
-        help="what is maximised: the return of a session in the user model, or NDCG or GAUC on "
+        ["value", "ndcg", "gauc"],
+        "what is maximised: the return of a session in the user model, or NDCG or GAUC on "
         "validation rows (default: value)",
+        default="value",
     )
-    parser.add_argument(
-        "--k", type=int, default=10, help="items recommended, of --metric ndcg (default: 10)"
-    )
-    parser.add_argument(
+    option(parser, "--k", 10, "items recommended, of --metric ndcg")
+    option(
+        parser,
         "--space",
-        type=Path,
-        metavar="TOML",
-        help="settings to search, one table per section; each a list of choices or "
+        Path,
+        "settings to search, one table per section; each a list of choices or "
         "{low = …, high = …, log = true} (default: learning rate, steps, width, dropout, "
         "context, exposure features and augmentation of networks, neighbours of item-knn; with "
         "ndcg and gauc also the reward weight)",
+        "TOML",
     )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="TABLE.FIELD=VALUE",
-        help="a setting that all trials have, e.g. train.steps=2000; repeatable (default: none)",
-    )
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=1,
-        metavar="N",
-        help="trainings side by side, each in a process (default: 1)",
-    )
-    parser.add_argument(
+    setting_option(parser, "a setting that all trials have, e.g. train.steps=2000; repeatable")
+    option(parser, "--workers", 1, "trainings side by side, each in a process", "N")
+    option(
+        parser,
         "--no-pruning",
-        action="store_true",
-        help="train every trial to its end (default: end those whose validation loss is above the "
+        False,
+        "train every trial to its end; (default: end those whose validation loss is above the "
         "median of earlier ones)",
     )
+    option(parser, "--seed", 0, "seed of the search and of every training")
+    parser.epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
 
 
 def run(options: argparse.Namespace) -> None:
@@ -107,9 +80,9 @@ def run(options: argparse.Namespace) -> None:
     plan = Plan(options.store, out, search, options.metric, options.k, not options.no_pruning)
     study = tune(plan, options.trials, options.workers)
     write_report(study, plan)
-    best, found = study.best_trial, importances(study)
+    best, weights = study.best_trial, importances(study)
     lines = [
-        (name, f"{value:.4g}" if isinstance(value, float) else value, f"{found.get(name, 0):.2f}")
+        (name, f"{value:.4g}" if isinstance(value, float) else value, f"{weights.get(name, 0):.2f}")
         for name, value in best.params.items()
     ]
     print(text_table(("setting", "best", "importance"), lines))

@@ -3,53 +3,50 @@
 import argparse
 from pathlib import Path
 
-from ucfrec.commands.durations import duration_ms
-from ucfrec.commands.options import filter_seen_option, log_options, logs_given, memory_option
+from ucfrec.commands.options import (
+    filter_seen_option,
+    log_options,
+    logs_given,
+    memory_option,
+    option,
+    read_duration,
+)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec update`."""
-    parser.add_argument(
+    option(
+        parser,
         "run",
-        type=Path,
-        metavar="RUN",
-        help="finished run on the older logs; or a folder of runs, for the one that was promoted",
+        Path,
+        "finished run on the older logs; or a folder of runs, for the one that was promoted",
+        "RUN",
     )
-    log_options(parser).metavar = "NEW_LOGS"
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="RUN2",
-        help="folder of the new run; an interrupted update in it is resumed",
-    )
-    parser.add_argument(
-        "--store",
-        type=Path,
-        metavar="STORE",
-        help="folder of the store with the new rows (default: RUN2-store, beside RUN2)",
-    )
-    parser.add_argument(
+    memory_option(log_options(parser, "NEW_LOGS"))
+    text = "folder of the new run; an interrupted update in it is resumed"
+    option(parser, "--out", Path, text, "RUN2", required=True)
+    text = "folder of the store with the new rows (default: RUN2-store, beside RUN2)"
+    option(parser, "--store", Path, text, "STORE")
+    option(
+        parser,
         "--window",
-        metavar="TIME",
-        help="exclude sessions that ended longer ago, before the end of the new logs, e.g. 60d or "
+        str,
+        "exclude sessions that ended longer ago, before the end of the new logs, e.g. 60d or "
         "12h (default: keep all)",
+        "TIME",
     )
-    parser.add_argument(
-        "--split",
-        metavar="TRAIN,VALIDATION,TEST",
-        help="shares of the new rows in order of time (default: 0.6,0.2,0.2); older rows train",
-    )
-    parser.add_argument(
+    text = "shares of the new rows in order of time (default: 0.6,0.2,0.2); older rows train"
+    option(parser, "--split", str, text, "TRAIN,VALIDATION,TEST")
+    option(
+        parser,
         "--no-refit",
-        action="store_true",
-        help="once the runs are compared, do not go on learning from the validation and test rows "
+        False,
+        "once the runs are compared, do not go on learning from the validation and test rows; "
         "(default: RUN2 acts by the weights that learned from all rows)",
     )
     filter_seen_option(parser)
-    parser.add_argument("--seed", type=int, help="of everything random (default: that of RUN)")
-    parser.add_argument("--threads", type=int, help="CPU threads (default: all cores)")
-    memory_option(parser)
+    option(parser, "--seed", int, "of everything random (default: that of RUN)")
+    option(parser, "--threads", int, "CPU threads (default: all cores)")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -77,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
     old = TrainedPolicy.load(run)
     files, mapping = logs_given(options, old)
     append = AppendOptions(
-        window_ms=None if options.window is None else duration_ms("--window", options.window),
+        window_ms=None if options.window is None else read_duration("--window", options.window),
         split=SPLIT if options.split is None else parse_split(options.split),
         memory_limit=options.memory_limit,
     )
@@ -99,11 +96,11 @@ def run(options: argparse.Namespace) -> None:
     assert update is not None
     assert update.drift is not None
     assert update.verdict is not None
-    read = update.appended
+    counts = update.appended
     print(
-        f"new rows      {read['steps']:,} of {read['rows_read']:,} read"
-        f" ({read['not_newer']:,} not newer than the store); {read['new_users']:,} new users, "
-        f"{read['new_items']:,} new items; {read['expired_steps']:,} old rows excluded"
+        f"new rows      {counts['steps']:,} of {counts['rows_read']:,} read"
+        f" ({counts['not_newer']:,} not newer than the store); {counts['new_users']:,} new users, "
+        f"{counts['new_items']:,} new items; {counts['expired_steps']:,} old rows excluded"
     )
     print(record.describe())
     if record.rule is not None and record.rule.rule != old.rule:

@@ -3,18 +3,20 @@
 import argparse
 from pathlib import Path
 
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `ucfrec verify`."""
-    parser.add_argument(
+    option(
+        parser,
         "paths",
-        nargs="+",
-        type=Path,
-        metavar="PATH",
-        help="episode stores and run folders (each file of theirs is read), or files of result "
+        Path,
+        "episode stores and run folders (each file of theirs is read), or files of result "
         "rows (.jsonl)",
+        "PATH",
+        nargs="+",
     )
 
 
@@ -24,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: a file is missing, has another content than was written, or cannot be verified.
     """
-    faults = sum(_verified(path) for path in options.paths)
+    faults = sum(_verify(path) for path in options.paths)
     if faults:
         raise InputError(
             f"{faults} files do not have the content that was written; restore them, or make the "
@@ -32,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
         )
 
 
-def _verified(path: Path) -> int:
+def _verify(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
     from ucfrec.episodes.record import StoreRecord
     from ucfrec.errors import one_line
@@ -60,8 +62,8 @@ def _verified(path: Path) -> int:
     for name in sealed.strangers():
         if name != record.FILE:
             print(one_line(f"{path / name} is not listed in {record.FILE}: it was added later"))
-    within = path / REFIT
-    more = _verified(within) if (within / RunRecord.FILE).is_file() else 0
+    refit = path / REFIT
+    more = _verify(refit) if (refit / RunRecord.FILE).is_file() else 0
     size = sum(size for size, _ in sealed.files.values())
     print(
         one_line(

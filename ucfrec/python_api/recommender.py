@@ -5,7 +5,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from datetime import date
 from html import escape
 from pathlib import Path
@@ -24,27 +24,21 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.liked import LikedExpression
-from ucfrec.evaluation.ranking import Later
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue
+from ucfrec.evaluation.ranking_table import require_one_catalogue
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
-from ucfrec.logs.expressions import Expression
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles
 from ucfrec.off_policy.evaluate import (
     DEFAULTS,
     EstimateOptions,
     OffPolicyReport,
-    evaluate_off_policy,
 )
-from ucfrec.off_policy.score import score, seen_too_often, share_seen
+from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
@@ -58,11 +52,12 @@ from ucfrec.python_api.given_data import (
     split_given,
     store_given,
 )
+from ucfrec.python_api.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.python_api.run_folders import Scratch, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
-from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking, write_card
+from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
@@ -388,21 +383,23 @@ class Recommender:
                 has another catalogue.
         """
         beside = require_list("others", others, "a Recommender", Recommender)
-        trained, *rest = (each._evaluated(logs) for each in (self, *beside))
+        trained, *rest = (policy._evaluated(logs) for policy in (self, *beside))
         require_one_catalogue([trained, *rest])
-        with in_words_of_python():
-            wanted = liked and Expression(liked, "--liked")
-            by = LikedExpression(wanted, trained.record.reward) if wanted else None
-        rankers = [PolicyRanker(trained, rule), *map(PolicyRanker, rest)]
-        with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
-            said = [] if logs is None else seen_too_often(share_seen(trained, logged.store))
-            said += [logged.history_lacking] if logged.history_lacking else []
-            later = Later(logged.store, logged.rows, filter_seen)
-            about = later, logged.users, k, seed
-            rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
-        rows = [replace(row, checkpoint="best") for row in rows]
-        add_ranking(trained.folder, rows[0], _named(logs), said)
-        return Ranking(rows, said)
+        candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
+        with (
+            logs_given(trained, logs, mapping, keep_unknown=False) as logged,
+            in_words_of_python(),
+        ):
+            return rank_policies(
+                candidates,
+                logged,
+                _named(logs),
+                k=k,
+                filter_seen=filter_seen,
+                liked=liked,
+                seed=seed,
+                checkpoint="best",
+            )
 
     @_checked
     def ope(
@@ -431,9 +428,14 @@ class Recommender:
         """
         trained = self._evaluated(logs)
         with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
-            report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
-        add_estimates(trained.folder, [_named(logs)], report)
-        return report
+            return estimate_return(
+                (trained, rule or trained.rule),
+                logged,
+                [_named(logs)],
+                options=options,
+                seed=seed,
+                checkpoint="best",
+            )
 
     @_checked
     def evaluate(
@@ -460,12 +462,14 @@ class Recommender:
         trained = self.trained
         beside = require_list("behaviors", behaviors, "the name of a behavior", str)
         simulated = Environment(environment) if isinstance(environment, str) else environment
-        about = episodes, seed
-        own = evaluate_policy(simulated, trained, trained.name, *about, rule)
-        own = replace(own, checkpoint="best")
-        add_evaluation(trained.folder, own)
-        others = [evaluate_behavior(simulated, name, *about) for name in beside]
-        return Evaluation([own, *others])
+        return evaluate_in(
+            simulated,
+            {trained.folder: (trained, rule or trained.rule)},
+            beside,
+            episodes=episodes,
+            seed=seed,
+            checkpoint="best",
+        )
 
     @_checked
     def score(
@@ -633,7 +637,7 @@ def _changed(config: Config) -> dict[str, Any]:
 def _named(logs: Logs | None) -> str:
     """What a model card calls the logs that a measurement is on."""
     if logs is None:
-        return "the test split"
+        return TEST_SPLIT
     if isinstance(logs, pd.DataFrame):
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs

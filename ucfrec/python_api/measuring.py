@@ -1,0 +1,138 @@
+"""What `rank`, `ope` and `evaluate` do, as commands and as methods of `Recommender`: measure, and
+add each result to the model card of its run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.liked import LikedExpression
+from ucfrec.evaluation.ranking import Later
+from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.evaluation.ranking_table import ranking_rows
+from ucfrec.logs.expressions import Expression
+from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy
+from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen
+from ucfrec.off_policy.scored import evaluate_scored
+from ucfrec.provenance import shorten_paths
+from ucfrec.reporting.cards import card_of_estimates, card_of_evaluation, card_of_ranking
+from ucfrec.results.table import Evaluation, Ranking
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+Candidate = tuple[TrainedPolicy, DecisionRule]
+"""A policy with the decision rule that is measured."""
+TEST_SPLIT = "the test split"
+"""Name of the logs where none are given."""
+
+
+def rank_policies(
+    candidates: Sequence[Candidate],
+    logged: LoggedSessions,
+    logs: str,
+    *,
+    k: int,
+    filter_seen: bool,
+    liked: str | None,
+    seed: int,
+    checkpoint: str,
+) -> Ranking:
+    """Rank what users were shown later, by policies of one store and by baselines.
+
+    Args:
+        logs: their name in model cards; `TEST_SPLIT` for that of the store.
+        liked: condition on the reward; None for the run's own.
+        seed: of the bootstrap over users and of the random baseline.
+        checkpoint: name of the policies' weights, for the rows.
+
+    Raises:
+        InputError: `liked` cannot be used.
+    """
+    trained, later = candidates[0][0], Later(logged.store, logged.rows, filter_seen)
+    condition = None
+    if liked is not None:
+        condition = LikedExpression(Expression(liked, "--liked"), trained.record.reward)
+    rows = ranking_rows(
+        [PolicyRanker(policy, rule) for policy, rule in candidates],
+        trained,
+        trained.training_store(),
+        later,
+        logged.users,
+        k,
+        seed,
+        condition,
+    )
+    rows = [replace(row, checkpoint=checkpoint) for row in rows]
+    warnings = []
+    for number, ((policy, _), row) in enumerate(zip(candidates, rows, strict=False)):
+        doubts = [] if logs == TEST_SPLIT else seen_too_often(share_seen(policy, logged.store))
+        if logged.history_lacking and number == 0:
+            doubts.append(logged.history_lacking)
+        card_of_ranking(policy.folder, row, logs, doubts)
+        alone = len(candidates) == 1
+        warnings += [doubt if alone else f"{policy.folder}: {doubt}" for doubt in doubts]
+    return Ranking(rows, warnings)
+
+
+def estimate_return(
+    candidate: Candidate,
+    logged: LoggedSessions | Sequence[Path],
+    logs: Sequence[str],
+    *,
+    options: EstimateOptions,
+    seed: int,
+    checkpoint: str,
+) -> OffPolicyReport:
+    """Estimate the return of a session from logs, or from the files that `score` made of them.
+
+    Args:
+        logs: their names in the model card.
+        seed: of the folds and the bootstrap.
+        checkpoint: name of the policy's weights, for the rows.
+
+    Raises:
+        InputError: the logs cannot be used.
+    """
+    trained, rule = candidate
+    if isinstance(logged, LoggedSessions):
+        report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
+    else:
+        report = evaluate_scored(trained, logged, rule=rule, seed=seed, options=options)
+    report = replace(
+        report,
+        rows=[replace(row, checkpoint=checkpoint) for row in report.rows],
+        step_rows=[replace(row, checkpoint=checkpoint) for row in report.step_rows],
+    )
+    card_of_estimates(trained.folder, logs, report)
+    return report
+
+
+def evaluate_in(
+    environment: Environment,
+    candidates: Mapping[Path, Candidate],
+    behaviors: Sequence[str],
+    *,
+    episodes: int,
+    seed: int,
+    checkpoint: str,
+) -> Evaluation:
+    """Measure the return of policies, and of built-in policies, in a simulator.
+
+    Args:
+        candidates: by run folder, as the rows name it.
+        behaviors: built-in policies of the simulator.
+        seed: of the episodes.
+        checkpoint: name of the policies' weights, for the rows.
+
+    Raises:
+        InputError: a policy does not fit the environment, or it has no such behavior.
+    """
+    rows = []
+    for run, (trained, rule) in candidates.items():
+        row = evaluate_policy(environment, trained, trained.name, episodes, seed, rule)
+        conditions = {**row.conditions, "run": shorten_paths(str(run))}
+        rows.append(replace(row, conditions=conditions, checkpoint=checkpoint))
+        card_of_evaluation(trained.folder, rows[-1])
+    rows += [evaluate_behavior(environment, name, episodes, seed) for name in behaviors]
+    return Evaluation(rows)

@@ -242,15 +242,3 @@ def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
     assert "For ucf: Do not rely on it" in page.text
     write_results(tmp_path / "ope.json", rows[1:])
     page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"metrics": {"R_cum": "many"}}, {"details": 3}, {"metrics": {}}, {"policy": 3}]
-)
-def test_estimates_of_another_kind_are_refused(
-    folder: Path, tmp_path: Path, wrong: dict[str, object]
-) -> None:
-    good = estimate("DR", 1.0).to_json()
-    (tmp_path / "ope.json").write_text(json.dumps([good, good | wrong]))
-    with pytest.raises(InputError, match=f"row 2 is not a result row: .*{next(iter(wrong))}"):
-        write_report(tmp_path / "out.html", [folder / "ucf"], [tmp_path / "ope.json"])

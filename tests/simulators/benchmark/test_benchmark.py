@@ -214,13 +214,14 @@ def test_every_cell_of_every_table_has_a_configuration(
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_task_that_the_budget_leaves_out_is_swept_if_it_is_named(tmp_path: Path) -> None:
-    budget = replace(TINY, seeds=1)
-    assert {cell.task for cell in planned(tmp_path, budget).cells("sweeps")} == {
-        "synthetic-catalog"
-    }
-    named = planned(tmp_path, budget, tasks=["synthetic-taobao"])
-    assert {cell.task for cell in named.cells("sweeps")} == {"synthetic-taobao"}
+@pytest.mark.parametrize("table", ["main", "sweeps"])
+def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
+    tmp_path: Path, table: str
+) -> None:
+    for task in ("synthetic-catalog", "synthetic-taobao"):
+        plan = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
+        assert {cell.task for cell in plan.cells(table)} == {task}
+        assert plan.missing() == []
 
 
 @pytest.mark.slow
@@ -344,12 +345,3 @@ def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path
             suite,
             BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given),
         )
-
-
-def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
-    budget = replace(BUDGETS["small"], seeds=1, logs=1, sessions=60)
-    # The second is no task of the budget, but was requested.
-    for task in ("synthetic-catalog", "synthetic-taobao"):
-        plan = planned(tmp_path, budget, tasks=[task])
-        assert {cell.task for cell in plan.cells("main")} == {task}
-        assert plan.missing() == []

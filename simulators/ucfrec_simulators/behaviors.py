@@ -115,10 +115,10 @@ class SessionMixture:
         choices = [actor.act(observations, live) for actor in self._actors]
         rows = np.arange(len(observations))
         actions = np.stack([chosen for chosen, _ in choices])[self.component, rows]
-        known = [propensity for _, propensity in choices if propensity is not None]
-        if len(known) < len(choices):
+        propensities = [propensity for _, propensity in choices if propensity is not None]
+        if len(propensities) < len(choices):
             return actions, None
-        return actions, np.stack(known)[self.component, rows]
+        return actions, np.stack(propensities)[self.component, rows]
 
     def observe(self, actions: Array, rewards: Float32Array) -> None:
         """Pass the actions taken and rewards (N,) to every actor."""

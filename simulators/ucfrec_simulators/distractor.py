@@ -88,7 +88,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
         observations, info = super().reset(seed=seed, options=options)
         if seed is not None:
             self._distractors = np.random.default_rng([seed, 31])
-        return self._with_distractors(observations), info
+        return self._add_distractors(observations), info
 
     def step(
         self, actions: Array
@@ -97,12 +97,12 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
             rows = np.flatnonzero(info["_final_obs"])
-            last = self._with_distractors(np.stack(info["final_obs"][rows].tolist()))
+            last = self._add_distractors(np.stack(info["final_obs"][rows].tolist()))
             for row, final in zip(rows, last, strict=True):
                 info["final_obs"][row] = final
-        return self._with_distractors(observations), rewards, terminated, truncated, info
+        return self._add_distractors(observations), rewards, terminated, truncated, info
 
-    def _with_distractors(self, observations: Float32Array) -> Float32Array:
+    def _add_distractors(self, observations: Float32Array) -> Float32Array:
         distractors = self._distractors.random(len(observations)) < self._rate
         return np.column_stack([distractors, observations]).astype(np.float32)
 
@@ -125,7 +125,7 @@ class WithoutDistractor:
             self._actor.inform(info)
 
 
-def _without_distractor(
+def _hide_distractor(
     behavior: Callable[[VectorEnv[Any, Any, Any], int], Actor],
     env: VectorEnv[Any, Any, Any],
     seed: int,
@@ -142,7 +142,7 @@ def with_distractor(simulator: Simulator, rate: float) -> Simulator:
         summary=f"{simulator.summary}; with a distractor, {state}",
         make=lambda num_envs, folder: DistractorEnv(simulator.make(num_envs, folder), rate),
         behaviors={
-            name: partial(_without_distractor, behavior)
+            name: partial(_hide_distractor, behavior)
             for name, behavior in simulator.behaviors.items()
         },
     )

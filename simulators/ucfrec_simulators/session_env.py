@@ -101,7 +101,7 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
         """
         if not self._started:
             raise ResetNeeded("call reset before the first step")
-        rewards, terminated, truncated = self._play(self._checked(actions))
+        rewards, terminated, truncated = self._play(self._check_actions(actions))
         ended = terminated | truncated
         final = {}
         if ended.any():
@@ -124,7 +124,7 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
         described = self._describe()
         return described | {f"_{key}": rows.copy() for key in described}
 
-    def _checked(self, actions: Array) -> Array:
+    def _check_actions(self, actions: Array) -> Array:
         space = self.action_space
         actions = np.asarray(actions)
         if actions.shape != space.shape:

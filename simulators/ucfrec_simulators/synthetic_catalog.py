@@ -220,8 +220,8 @@ class SoftmaxGuess(Memoryless):
             live: (N,) marks the sessions of interest; None for all.
         """
         environment, rows = self._environment, slice(None) if live is None else live
-        shown = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)
-        scores = self._guess[environment.users[rows]] - self._variety * shown
+        repeated = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)
+        scores = self._guess[environment.users[rows]] - self._variety * repeated
         if environment.mood:
             favoured = (environment.tags % 2 == 0) == (environment.good_mood[rows] == 1)[:, None]
             scores = scores + environment.mood * favoured

@@ -105,8 +105,6 @@ class Budget:
     """Logs of every task: simulated ones of as many seeds, or parts of a given log."""
     sessions: int = 0
     """Sessions collected where logs are simulated."""
-    rates: Mapping[str, float] | None = None
-    """Learning rates by method; None for those that come with the package."""
 
     def tasks_in(self, table: str) -> tuple[str, ...]:
         """The tasks of a table."""

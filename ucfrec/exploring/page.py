@@ -133,9 +133,14 @@ class Explorer:
                 lists = [self._recommend(trained, fields) for trained in self.runs]
         except InputError as fault:
             lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in own.cards} for _, _, own in lists]
+        ids = [{str(card.item_id) for card in explained.cards} for _, _, explained in lists]
         common = set.intersection(*ids) if len(ids) == 2 else None
-        widths = [abs(v) for _, _, own in lists for card in own.cards for v in card.parts.values()]
+        widths = [
+            abs(v)
+            for _, _, explained in lists
+            for card in explained.cards
+            for v in card.parts.values()
+        ]
         return {
             "lists": lists,
             "error": error,

@@ -37,29 +37,29 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         record = train_screened(
             opened(cell), cell.run, cell.config, cell.screening, shared=cell.shared
         )
-    about, rows = _training_metrics(record), []
+    training_metrics, rows = _training_metrics(record), []
     if record.screening is not None:
-        about[SCREENING] = list(record.screening.flagged)
+        training_metrics[SCREENING] = list(record.screening.flagged)
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
     rule = _rule(cell, trained)
     for environment in cell.environments:
-        found = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
+        evaluation = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
         # Other methods are given a rule, but do not look at its target.
-        target = found.target_return if cell.conditioned else None
+        target = evaluation.target_return if cell.conditioned else None
         row = replace(
-            _row(found, row_key, environment),
+            _row(evaluation, row_key, environment),
             checkpoint=CHECKPOINT,
             rule=f"{rule} ({rule.hash})",
             target_return=target,
             details={},
         )
-        rows.append(row.extended(about))
+        rows.append(row.extended(training_metrics))
     return rows
 
 
-def _row(found: ResultRow, row_key: RowKey, environment: Environment) -> ResultRow:
+def _row(measured: ResultRow, row_key: RowKey, environment: Environment) -> ResultRow:
     rate = environment.rate if isinstance(environment, DistractorEnvironment) else None
-    row = found.of(row_key)
+    row = measured.of(row_key)
     return replace(row, conditions={**row.conditions, "distractor": rate})
 
 

@@ -24,7 +24,7 @@ BASELINES: Final[Mapping[str, Method]] = {
 """The methods of Table 2 beside UCF."""
 
 
-def _with(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
+def _extend(method: Method, settings: tuple[str, ...], vectors: bool) -> Method:
     return replace(method, settings=(*method.settings, *settings), vectors=vectors)
 
 
@@ -57,10 +57,10 @@ METHODS: Final[Mapping[str, Method]] = {
         for name in ("recent-clicks", "recent-rate", "boosted")
     },
     "crm-greedy": Method("crm-greedy", ("rule.choose=false",), conditioned=False),
-    **{name: _with(method, PLAIN, True) for name, method in BASELINES.items()},
-    **{f"{name}+shared": _with(method, SHARED, False) for name, method in BASELINES.items()},
-    **{name: _with(method, PLAIN, False) for name, method in PEERS.items()},
-    **{f"{name}+shared": _with(method, SHARED, False) for name, method in PEERS.items()},
+    **{name: _extend(method, PLAIN, True) for name, method in BASELINES.items()},
+    **{f"{name}+shared": _extend(method, SHARED, False) for name, method in BASELINES.items()},
+    **{name: _extend(method, PLAIN, False) for name, method in PEERS.items()},
+    **{f"{name}+shared": _extend(method, SHARED, False) for name, method in PEERS.items()},
     **PAPER,
     "ucf-plain": augmented_ucf(*PLAIN, vectors=False),
     "ucf-wo-count": Method("ucf"),

@@ -57,7 +57,7 @@ class RecommendationCells:
         """The cells of a table."""
         made_by: dict[str, Callable[[Task, int], Iterator[Cell]]] = {
             "main": self._main,
-            "shared": partial(self._trained, "shared", _SHARED),
+            "shared": partial(self._list_trained, "shared", _SHARED),
             "sweeps": self._sweeps,
             "distractor": self._distractor,
         }
@@ -69,24 +69,24 @@ class RecommendationCells:
         """Tasks of the main table that are excluded: their files or package are missing."""
         if self._request.environment is not None:
             return []
-        return [name for name in self._wanted("main") if not _available(name)]
+        return [name for name in self._select_tasks("main") if not _available(name)]
 
     def _names(self, table: str) -> list[str]:
         if self._request.environment is not None:
             return [self._request.environment.title]
-        return [name for name in self._wanted(table) if _available(name)]
+        return [name for name in self._select_tasks(table) if _available(name)]
 
-    def _wanted(self, table: str) -> Sequence[str]:
+    def _select_tasks(self, table: str) -> Sequence[str]:
         if not self._request.tasks:
             return self._budget.tasks_in(table)
-        known = _TASKS_OF.get(table, tuple(TASKS))
-        return [name for name in self._request.tasks if name in known]
+        available = _TASKS_OF.get(table, tuple(TASKS))
+        return [name for name in self._request.tasks if name in available]
 
     def _main(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
         if log == 0:
             yield from self._plan.built_in("main", task, METHODS)
-        yield from self._trained("main", METHODS, task, log)
+        yield from self._list_trained("main", METHODS, task, log)
 
     def _sweeps(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
@@ -97,7 +97,7 @@ class RecommendationCells:
             **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
         }
         methods = {f"ucf, {name}": augmented_ucf(s) for name, s in sweeps.items()}
-        yield from self._trained("sweeps", {**methods, **PAPER}, task, log)
+        yield from self._list_trained("sweeps", {**methods, **PAPER}, task, log)
 
     def _distractor(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of methods that are trained without and with a distractor in the logs.
@@ -120,14 +120,14 @@ class RecommendationCells:
             ),
         )
         # Cells that share a run lie far apart, so that no process waits for another's.
-        for quantile, each in product(DISTRACTOR_TARGETS, both):
+        for quantile, variant in product(DISTRACTOR_TARGETS, both):
             evaluation = replace(self._budget.evaluation, target_quantile=quantile)
             conditions = {"quantiles": f"{quantile:g}"}
             yield from self._plan.trained(
-                "distractor", each, DISTRACTOR_METHODS, evaluation, conditions
+                "distractor", variant, DISTRACTOR_METHODS, evaluation, conditions
             )
 
-    def _trained(
+    def _list_trained(
         self, table: str, methods: Mapping[str, Method], task: Task, log: int
     ) -> Iterator[Cell]:
         return self._plan.trained(table, task, methods, conditions={"quantiles": "rule"})
@@ -135,7 +135,7 @@ class RecommendationCells:
     def _task(self, name: str, log: int) -> Task:
         if (name, log) not in self._tasks:
             environment, seed = self._request.environment, self._request.log_seed
-            given = Log(self._budget.sessions, seed + log, log, self._budget.logs)
+            log_request = Log(self._budget.sessions, seed + log, log, self._budget.logs)
             number: int | None = seed + log
             which = str(number)
             if name in tasks.LOGGED:
@@ -143,7 +143,7 @@ class RecommendationCells:
                 which = "whole" if number is None else f"{number}-of-{self._budget.logs}"
             folder = self._folder / "tasks" / f"{folder_name(name)}-{which}"
             make = TASKS[name] if environment is None else partial(tasks.simulated, environment)
-            self._tasks[name, log] = replace(make(folder, given), name=name, log_seed=number)
+            self._tasks[name, log] = replace(make(folder, log_request), name=name, log_seed=number)
         return self._tasks[name, log]
 
 

@@ -161,7 +161,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
 TASKS: Final[Mapping[str, Callable[[Path, Log], Task]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
-    **{name: partial(built_in, name, own) for name, own in _REFERENCES.items()},
+    **{name: partial(built_in, name, behaviors) for name, behaviors in _REFERENCES.items()},
     "sardine-static": partial(sardine, "sardine-static"),
     "sardine-boredinf": partial(sardine, "sardine-boredinf"),
 }

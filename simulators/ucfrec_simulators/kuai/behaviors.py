@@ -44,9 +44,9 @@ class RandomMask(_Insider):
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         """An item of each session, (N,)."""
         repeated = self._environment.boring(MASK)
-        drawn = self._generator.random(repeated.shape) - repeated
-        self._environment.leave_out_masked(drawn)
-        return drawn.argmax(axis=1), None
+        priorities = self._generator.random(repeated.shape) - repeated
+        self._environment.leave_out_masked(priorities)
+        return priorities.argmax(axis=1), None
 
 
 class Oracle(_Insider):

@@ -154,8 +154,8 @@ def complete(
         model.bias.fill_(torch.logit(fitted[2].mean()).item())
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, ...]:
-        drawn = torch.from_numpy(generator.integers(len(fitted[2]), size=config.batch_size))
-        return tuple(column[drawn] for column in fitted)
+        batch = torch.from_numpy(generator.integers(len(fitted[2]), size=config.batch_size))
+        return tuple(column[batch] for column in fitted)
 
     def loss(rows: tuple[Tensor, ...]) -> tuple[Tensor, dict[str, Tensor]]:
         return F.binary_cross_entropy_with_logits(model(rows[0], rows[1]), rows[2]), {}

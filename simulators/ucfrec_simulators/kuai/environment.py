@@ -123,11 +123,11 @@ class KuaiEnv(SessionsEnv):
         n_users, n_items = rewards.shape
         self.user_ids = np.arange(n_users) if user_ids is None else user_ids
         self.item_ids = np.arange(n_items) if item_ids is None else item_ids
-        given = (len(self.user_ids), len(self.item_ids), len(tags))
-        if given != (n_users, n_items, n_items):
+        sizes = (len(self.user_ids), len(self.item_ids), len(tags))
+        if sizes != (n_users, n_items, n_items):
             raise InputError(
-                f"the table has {n_users} users × {n_items} items, but there are {given[0]} user "
-                f"ids, {given[1]} item ids and tags of {given[2]} items; give the same numbers"
+                f"the table has {n_users} users × {n_items} items, but there are {sizes[0]} user "
+                f"ids, {sizes[1]} item ids and tags of {sizes[2]} items; give the same numbers"
             )
         longest = exit_rule.max_turn if regime.steps is None else regime.steps
         if regime.masked and n_items < longest:
@@ -137,7 +137,7 @@ class KuaiEnv(SessionsEnv):
         self.rewards, self.exit_rule, self.regime = rewards, exit_rule, regime
         self.tags = [tuple(item_tags) or (UNTAGGED,) for item_tags in tags]
         """Tags of each item; at least one."""
-        self._codes, self._n_tags = _coded(self.tags)
+        self._codes, self._n_tags = _encode_tags(self.tags)
         self.users: IntArray = np.zeros(num_envs, dtype=np.int64)
         """(N,) table row of each session's user."""
         self.turns: IntArray = np.zeros(num_envs, dtype=np.int64)
@@ -223,11 +223,11 @@ class KuaiEnv(SessionsEnv):
         return info | {FORBIDDEN: self._shown.copy()} if self.regime.masked else info
 
 
-def _coded(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
+def _encode_tags(tags: Sequence[Sequence[int]]) -> tuple[IntArray, int]:
     """(n_items, most tags of an item) tags numbered from 0, padded with their count; the count."""
     lengths = np.array([len(item_tags) for item_tags in tags])
     flat = np.array([tag for item_tags in tags for tag in item_tags], dtype=np.int64)
-    known, numbers = np.unique(flat, return_inverse=True)
-    codes = np.full((len(tags), lengths.max()), len(known), dtype=np.int64)
+    distinct, numbers = np.unique(flat, return_inverse=True)
+    codes = np.full((len(tags), lengths.max()), len(distinct), dtype=np.int64)
     codes[np.arange(codes.shape[1]) < lengths[:, None]] = numbers
-    return codes, len(known)
+    return codes, len(distinct)

@@ -30,11 +30,11 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
         InputError: no row is in the window.
     """
     names = ", ".join(text(glob_pattern(file)) for file in files)
-    read = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"
+    reader = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"
     key = f"{USER}, {VIDEO}, {time}"
     with engine(files, Path(gettempdir())) as connection:
         rows = connection.sql(
-            f"SELECT * FROM {read}([{names}], hive_partitioning = false) WHERE {where} "
+            f"SELECT * FROM {reader}([{names}], hive_partitioning = false) WHERE {where} "
             f"QUALIFY row_number() OVER (PARTITION BY {key}) = 1 ORDER BY {USER}, {time}, {VIDEO}"
         ).to_arrow_table()
     if not rows.num_rows:

@@ -70,9 +70,9 @@ class CirsTaobao(VirtualTaobao):
         return clicks, bored, np.asarray((self._pages >= self._max_turn) & ~bored)
 
     def _observe(self) -> Float32Array:
-        begun = self._pages[:, None] > 0
-        users = np.where(begun, 0, self._users)
-        actions = np.where(begun, self._recent[:, -1], 0)
+        started = self._pages[:, None] > 0
+        users = np.where(started, 0, self._users)
+        actions = np.where(started, self._recent[:, -1], 0)
         counts = np.concatenate([self._last, self._pages[:, None]], axis=1)
         return np.concatenate([users, actions, counts], axis=1, dtype=np.float32)
 

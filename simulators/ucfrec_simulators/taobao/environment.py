@@ -139,8 +139,8 @@ def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
     for _ in range(restarts):
         mean, spread = np.zeros(ACTION_DIM), np.full(ACTION_DIM, 0.6)
         for _ in range(rounds):
-            drawn = mean + spread * generator.standard_normal((candidates, ACTION_DIM))
-            actions = np.clip(drawn, -1, 1).astype(np.float32)
+            samples = mean + spread * generator.standard_normal((candidates, ACTION_DIM))
+            actions = np.clip(samples, -1, 1).astype(np.float32)
             best = actions[np.argsort(mean_clicks(actions, pages))[-elite:]]
             mean, spread = best.mean(0), best.std(0) + 0.02
         optima.append(np.clip(mean, -1, 1).astype(np.float32))

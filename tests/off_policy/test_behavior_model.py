@@ -131,13 +131,6 @@ def test_groups_are_the_clusters_of_embeddings() -> None:
     assert set(found) == {0, 1, 2, 3}
 
 
-def test_equal_items_are_one_group() -> None:
-    embeddings = np.repeat(np.eye(3, dtype=np.float32), 5, axis=0)
-    found = group_items(embeddings, 7, seed=0)
-    np.testing.assert_array_equal(found, np.repeat(found[::5], 5))
-    assert found.max() == 2
-
-
 @pytest.mark.parametrize(("items", "groups"), [(1, 1), (80, 9), (2000, 32)])
 def test_their_number_follows_the_catalogue(items: int, groups: int) -> None:
     embeddings = np.random.default_rng(0).normal(size=(items, 2)).astype(np.float32)

@@ -430,11 +430,3 @@ def test_wrong_propensities_are_doubted() -> None:
     doubt = step_value(logs(2, wrong=0.5), 0).doubt
     assert doubt is not None
     assert "where 1 is expected" in doubt
-
-
-def test_there_is_none_where_all_steps_or_none_have_propensities() -> None:
-    assert step_value(logs(3, share=1.0), 0) is None
-    assert step_value(logs(3, share=0.0), 0) is None
-    assert step_value(replace(logs(3), model=None), 0) is None
-    never = logs(3)
-    assert step_value(replace(never, target=np.zeros_like(never.target)), 0) is None

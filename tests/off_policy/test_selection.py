@@ -93,17 +93,6 @@ def test_one_clear_winner_loses_nothing() -> None:
     assert [one.rank for one in found.standings] == [1, 2, 3, 4]
 
 
-def test_sessions_of_one_user_count_together() -> None:
-    terms = np.repeat(equal(0, 3, 100), 20, axis=0)
-    together = select(list("abc"), terms, 0, np.repeat(np.arange(100), 20))
-    once = select(list("abc"), equal(0, 3, 100), 0)
-    for mine, other in zip(together.standings, once.standings, strict=True):
-        assert mine.error == pytest.approx(other.error)
-        assert mine.high == pytest.approx(other.high)
-    apart = select(list("abc"), terms, 0)
-    assert apart.chosen.error == pytest.approx(once.chosen.error / 20**0.5, rel=0.01)
-
-
 def test_the_band_of_one_is_an_interval_and_of_many_is_wider() -> None:
     terms = np.random.default_rng(0).normal(size=(2000, 30))
     one, many = select(["0"], terms[:, :1], 0), select([str(k) for k in range(30)], terms, 0)

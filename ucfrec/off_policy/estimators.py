@@ -78,6 +78,11 @@ class Estimate:
     parameter: float | None = None
     """The tuned λ of an estimator that shrinks weights."""
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Its ends, if there is one."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
+
 
 @dataclass(frozen=True)
 class Terms:
@@ -266,7 +271,7 @@ class StepSums:
 
     @classmethod
     def of(cls, steps: LoggedSteps, left: Float64Array) -> "StepSums":
-        """The sums of some sessions, of `left` (N,)."""
+        """The sums of some sessions; `left` has a number a step."""
         rewarded = np.bincount(steps.step, steps.weights * left).astype(np.float64)
         return cls(len(steps.first), steps.step_totals(), rewarded)
 
@@ -353,8 +358,9 @@ class StepValue:
 
     def __str__(self) -> str:
         interval = ""
-        if self.lift.low is not None and self.lift.high is not None:
-            interval = f" [{self.lift.low:+.4g}, {self.lift.high:+.4g}]"
+        if self.lift.interval is not None:
+            low, high = self.lift.interval
+            interval = f" [{low:+.4g}, {high:+.4g}]"
         return (
             f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
             f"logging policy's distribution of histories: {self.lift.value:+.4g}{interval} "

@@ -255,9 +255,7 @@ def make_report(
             data_fingerprint=fingerprint,
             metric=metric,
             metrics={metric: result.value},
-            interval=None
-            if result.low is None or result.high is None
-            else (result.low, result.high),
+            interval=result.interval,
             target_return=rule.target,
             rule=rule.hash,
             **provenance(),

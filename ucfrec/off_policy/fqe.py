@@ -76,10 +76,7 @@ def fit_models(
         discount: γ of Q.
 
     Returns:
-        What the models say of the N steps, and how good they are.
-
-    Raises:
-        InputError: there are fewer than two users.
+        What the models say of the N steps, and how good they are; an `InputError` with one user.
     """
     sessions = np.arange(int(session[-1]) + 1)
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]

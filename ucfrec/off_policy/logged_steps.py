@@ -125,10 +125,7 @@ class LoggedSteps:
             if values is not None and len(values) != n:
                 raise InputError(f"{name} has {len(values):,} values for {n:,} steps")
         if self.user is not None and len(self.user) != len(self.first):
-            raise InputError(
-                f"user has {len(self.user):,} values for {len(self.first):,} sessions: give one "
-                "user a session"
-            )
+            raise InputError(f"user has {len(self.user):,} values for {len(self.first):,} sessions")
         if not 0 < self.discount <= 1:
             raise InputError(f"discount is {self.discount}; it is above 0 and at most 1")
 

@@ -107,12 +107,12 @@ def append_logs(
         atomic_folder(out) as folder,
         prepared_log(
             files, mapping, _prepare_options(old, store, options), out.parent, None, onto=store
-        ) as found,
+        ) as prepared,
     ):
-        _require_held_out(found.rows.log.name, found.report)
-        _note_new_ids(found, store)
-        _note_lacking(found, mapping, store, old)
-        return _Grown(store, old, found, options.window_ms).write(folder, made_of)
+        _require_held_out(prepared.rows.log.name, prepared.report)
+        _note_new_ids(prepared, store)
+        _note_lacking(prepared, mapping, store, old)
+        return _Grown(store, old, prepared, options.window_ms).write(folder, made_of)
 
 
 def _prepare_options(old: StoreRecord, store: Path, options: AppendOptions) -> PrepareOptions:
@@ -134,11 +134,11 @@ def _made_of(
 ) -> dict[str, Any]:
     """What the grown store depends on, to know it again."""
     tables = (*mapping.item_features, *mapping.user_features)
-    given = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
+    columns = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
     return {
         "onto": old.fingerprint,
         "logs": [file_checksum(file) for file in files],
-        "mapping": {name: str(text) for name, text in given.items() if text is not None},
+        "mapping": {name: str(text) for name, text in columns.items() if text is not None},
         "features": [file_checksum(file) for table in tables for file in log_files(table.files)],
         "window_ms": options.window_ms,
         "split": list(options.split),
@@ -163,13 +163,13 @@ def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
             )
 
 
-def _note_new_ids(found: PreparedLog, store: Path) -> None:
+def _note_new_ids(prepared: PreparedLog, store: Path) -> None:
     """Warn of logs that share no user, or no item, with the store."""
-    log = found.rows.log
+    log = prepared.rows.log
     for name, table, file in ID_TABLES:
-        before = pq.read_metadata(store / file).num_rows
+        old_count = pq.read_metadata(store / file).num_rows
         ids, new = log.one(
-            f"SELECT count(*), count(*) FILTER (number >= {before}) FROM used_{table} "
+            f"SELECT count(*), count(*) FILTER (number >= {old_count}) FROM used_{table} "
             f"JOIN {table} USING ({name})"
         )
         # New ids are usual here; only logs without any old one may be written in another way.
@@ -177,32 +177,42 @@ def _note_new_ids(found: PreparedLog, store: Path) -> None:
             note_unknown(log.name, name, new, ids, f"of {store}")
 
 
-def _note_lacking(found: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord) -> None:
+def _note_lacking(
+    prepared: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord
+) -> None:
     """Note the new users and items of which no feature table says anything."""
-    log = found.rows.log
+    log = prepared.rows.log
     for name, table, file in ID_TABLES:
-        before = pq.read_metadata(store / file).num_rows
+        old_count = pq.read_metadata(store / file).num_rows
         new = (
-            f"SELECT {name} FROM used_{table} JOIN {table} USING ({name}) WHERE number >= {before}"
+            f"SELECT {name} FROM used_{table} JOIN {table} USING ({name}) "
+            f"WHERE number >= {old_count}"
         )
-        given = feature_tables(mapping)[name], found.features[name]
+        tables, views = feature_tables(mapping)[name], prepared.features[name]
         note_lacking(
-            log.connection, *given, name, new, str(store) if name in old.source.features else ""
+            log.connection,
+            tables,
+            views,
+            name,
+            new,
+            str(store) if name in old.source.features else "",
         )
 
 
 def _written(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     """The report on a store that is there already."""
-    others = StoreRecord.read(out).source.others
-    if "made_of" not in others:
+    remembered = StoreRecord.read(out).source.others
+    if "made_of" not in remembered:
         raise InputError(f"{out} is a store that no update made; name another folder")
-    other = [name for key, name in _PARTS.items() if others["made_of"].get(key) != made_of[key]]
-    if other:
+    differences = [
+        name for key, name in _PARTS.items() if remembered["made_of"].get(key) != made_of[key]
+    ]
+    if differences:
         raise InputError(
-            f"{out} is a store of {' and of '.join(other)}; give the same as before, or name "
+            f"{out} is a store of {' and of '.join(differences)}; give the same as before, or name "
             "another folder"
         )
-    report = dict(others["appended"])
+    report = dict(remembered["appended"])
     _require_held_out(str(out), report)
     return report
 
@@ -231,10 +241,10 @@ class _Grown:
     """A store that is grown by a log."""
 
     def __init__(
-        self, store: Path, old: StoreRecord, found: PreparedLog, window_ms: int | None
+        self, store: Path, old: StoreRecord, prepared: PreparedLog, window_ms: int | None
     ) -> None:
-        self._store, self._old, self._found, self._log = store, old, found, found.rows.log
-        cut_ms = None if window_ms is None else found.report["time_range_ms"][1] - window_ms
+        self._store, self._old, self._prepared, self._log = store, old, prepared, prepared.rows.log
+        cut_ms = None if window_ms is None else prepared.report["time_range_ms"][1] - window_ms
         self._shards = [self._shard(number, cut_ms) for number in range(old.n_shards)]
         self._kept = [shard for shard in self._shards if shard.kept.any()]
         names = [*old.columns]
@@ -258,25 +268,25 @@ class _Grown:
         """Write the store to a scratch folder; returns the report."""
         from ucfrec.logs.grown_states import write_grown_states  # needs torch
 
-        found, log = self._found, self._log
+        prepared, log = self._prepared, self._log
         self._count_moved_rows()
         fill = {name: float(_FILL.get(name, np.nan)) for name in self._names}
-        with progress(found.report["steps"], "write the new shards", "steps") as bar:
-            writer = write_steps(found.rows, found.cut, folder, bar, len(self._kept), fill)
-        new = writer.finish(found.report["reward"], found.report, write_ids(log, folder))
-        report = found.report | self._counts(folder, new)
+        with progress(prepared.report["steps"], "write the new shards", "steps") as bar:
+            writer = write_steps(prepared.rows, prepared.cut, folder, bar, len(self._kept), fill)
+        new = writer.finish(prepared.report["reward"], prepared.report, write_ids(log, folder))
+        report = prepared.report | self._counts(folder, new)
         files = dict(new.files)
         for number, shard in enumerate(self._kept):
             files |= self._copy(shard, folder / f"shard-{number:05d}")
-        write_grown_states(self._store, folder, found, range(len(self._kept), new.n_shards))
-        made = {"made_of": dict(made_of), "appended": report}
-        self._record(new, report, made).copy_with(files=files).seal(folder)
+        write_grown_states(self._store, folder, prepared, range(len(self._kept), new.n_shards))
+        origin = {"made_of": dict(made_of), "appended": report}
+        self._record(new, report, origin).copy_with(files=files).seal(folder)
         return report
 
     def _copy(self, shard: _Shard, target: Path) -> dict[str, tuple[int, str]]:
         """Link the files of an old shard, or write what changes; returns known checksums."""
         target.mkdir()
-        known, whole = {}, bool(shard.kept.all())
+        checksums, whole = {}, bool(shard.kept.all())
         steps = slice(None) if whole else shard.of_steps(shard.kept)
         for file in sorted(shard.folder.glob("*.npy")):
             if file.stem == schema.SPLIT:
@@ -285,7 +295,7 @@ class _Grown:
                 _link(file, target / file.name)
                 entry = self._old.files.get(f"{shard.folder.name}/{file.name}")
                 if entry is not None:
-                    known[f"{target.name}/{file.name}"] = entry
+                    checksums[f"{target.name}/{file.name}"] = entry
             elif file.stem == schema.OFFSETS:
                 np.save(target / file.name, np.append(0, np.cumsum(shard.lengths[shard.kept])))
             else:
@@ -295,7 +305,7 @@ class _Grown:
         for name in set(self._names) - set(self._old.columns):
             count = int(shard.lengths[shard.kept].sum())
             np.save(target / f"{name}.npy", np.full(count, _FILL[name], schema.STEP_DTYPES[name]))
-        return known
+        return checksums
 
     def _count_moved_rows(self) -> None:
         """Update `train_count`: old validation and test rows train now, expired rows no longer."""
@@ -321,26 +331,26 @@ class _Grown:
         """How many ids and rows are new, and how many old rows are left out."""
         counts = {}
         for name, table, file in ID_TABLES:
-            (known,) = self._log.one(f"SELECT count(*) FROM {table}")
-            before = pq.read_metadata(self._store / file).num_rows
+            (total,) = self._log.one(f"SELECT count(*) FROM {table}")
+            old_count = pq.read_metadata(self._store / file).num_rows
             what = table.removesuffix("s")
-            counts[f"new_{table}"] = known - before
+            counts[f"new_{table}"] = total - old_count
             steps = 0
             for number in range(len(self._kept), new.n_shards):
                 shard = folder / f"shard-{number:05d}"
                 offsets = np.load(shard / f"{schema.OFFSETS}.npy")
                 every = np.ones(len(offsets) - 1, dtype=bool)
                 of_new = _numbers(_Shard(shard, np.diff(offsets), every), name, every)
-                steps += int(np.count_nonzero(of_new >= before))
+                steps += int(np.count_nonzero(of_new >= old_count))
             counts[f"new_{what}_steps"] = steps
         counts["expired_steps"] = sum(int(s.lengths[~s.kept].sum()) for s in self._shards)
         return counts
 
     def _record(
-        self, new: StoreRecord, report: Mapping[str, Any], made: Mapping[str, Any]
+        self, new: StoreRecord, report: Mapping[str, Any], origin: Mapping[str, Any]
     ) -> StoreRecord:
         old, kept = self._old, [shard.lengths[shard.kept] for shard in self._kept]
-        episodes, steps = sum(map(len, kept)), sum(int(each.sum()) for each in kept)
+        episodes, steps = sum(map(len, kept)), sum(int(lengths.sum()) for lengths in kept)
         dropped = dict(old.source.dropped)
         for reason, rows in report["dropped"].items():
             dropped[reason] = dropped.get(reason, 0) + rows
@@ -357,7 +367,7 @@ class _Grown:
             "steps": steps + new.n_steps,
             "time_range_ms": [first, report["time_range_ms"][1]],
             "split_times_ms": report["split_times_ms"],
-            **made,
+            **origin,
         }
         splits = {name: dict(counts) for name, counts in new.splits.items()}
         splits["train"]["episodes"] += episodes

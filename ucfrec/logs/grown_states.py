@@ -31,7 +31,7 @@ _ALIKE = 0.5
 
 
 def write_grown_states(
-    store: Path, folder: Path, found: PreparedLog, new_shards: Iterable[int]
+    store: Path, folder: Path, prepared: PreparedLog, new_shards: Iterable[int]
 ) -> None:
     """Write the item states of the store at `folder`, grown from `store`.
 
@@ -41,26 +41,26 @@ def write_grown_states(
     old.
 
     Args:
-        found: the new log, with the tables `users` and `items` of all ids.
+        prepared: the new log, with the tables `users` and `items` of all ids.
         new_shards: those of the new log's steps.
     """
     steps = [*steps_of_shards(folder, new_shards)]
-    old, log = ItemStates.load(store / ITEM_STATES), found.rows.log
+    old, log = ItemStates.load(store / ITEM_STATES), prepared.rows.log
     encoded, counts = {}, {}
     for name, table, _ in ID_TABLES:
-        encoded[name] = encode_features(log.connection, found.features[name], table, name)
+        encoded[name] = encode_features(log.connection, prepared.features[name], table, name)
         rows = log.connection.sql(f"SELECT train_count FROM {table} ORDER BY number").fetchnumpy()
         counts[name] = rows["train_count"].astype(np.int64)
     items, users = schema.ITEM_ID, schema.USER_ID
-    shown = np.zeros(len(counts[items]), dtype=np.int64)
+    step_counts = np.zeros(len(counts[items]), dtype=np.int64)
     for batch in steps:
-        shown += np.bincount(batch.items, minlength=len(shown))
-    before = np.maximum(counts[items] - shown, 0)
+        step_counts += np.bincount(batch.items, minlength=len(step_counts))
+    before = np.maximum(counts[items] - step_counts, 0)
     vectors = _extended(old.embeddings.numpy(), encoded[items], before)
     if encoded[items] is None:
-        vectors = _moved(vectors, steps, before, shown, old)
+        vectors = _moved(vectors, steps, before, step_counts, old)
     features = _extended(old.user_features.numpy(), encoded[users], counts[users])
-    tags = item_tags(log.connection, found.features[items], "items", items)
+    tags = item_tags(log.connection, prepared.features[items], "items", items)
     write_item_table(
         folder / ITEM_STATES,
         vectors.astype(np.float32),
@@ -73,11 +73,11 @@ def write_grown_states(
 
 def _extended(old: Float32Array, features: sparse.csr_matrix | None, counts: IntArray) -> Array:
     """(n, D): the old rows, and for others what their features predict, or the mean."""
-    known = np.flatnonzero(counts[: len(old)])
-    mean = old[known].mean(axis=0) if len(known) else np.zeros(old.shape[1])
+    trained = np.flatnonzero(counts[: len(old)])
+    mean = old[trained].mean(axis=0) if len(trained) else np.zeros(old.shape[1])
     rows = np.tile(mean, (len(counts), 1)).astype(np.float64)
-    if features is not None and len(known) and old.shape[1]:
-        rows += predicted_from_features(features, known, old[known] - mean, counts[known])
+    if features is not None and len(trained) and old.shape[1]:
+        rows += predicted_from_features(features, trained, old[trained] - mean, counts[trained])
         # Of an id without any feature nothing is predicted.
         rows[np.diff(features.indptr) == 0] = mean
     rows[: len(old)] = old
@@ -88,7 +88,7 @@ def _moved(
     vectors: Float64Array,
     steps: Sequence[TrainingSteps],
     before: IntArray,
-    shown: IntArray,
+    step_counts: IntArray,
     old: ItemStates,
 ) -> Float64Array:
     """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD).
@@ -96,7 +96,7 @@ def _moved(
     A user's vector is the mean of those of the items shown, weighted by liking. What an item has
     in new steps weighs as much as their number, against the number of old ones.
     """
-    if not shown.any():
+    if not step_counts.any():
         return vectors
     new = joined_steps(steps)
     _, rows = np.unique(new.users, return_inverse=True)
@@ -109,32 +109,32 @@ def _moved(
     norms = np.linalg.norm(vectors[before > 0], axis=1)
     lengths = np.linalg.norm(folded, axis=1, keepdims=True)
     folded *= (norms.mean() if len(norms) else 1.0) / np.where(lengths > 0, lengths, 1.0)
-    share = (shown / (shown + before + PRIOR_COUNT))[:, None]
+    share = (step_counts / (step_counts + before + PRIOR_COUNT))[:, None]
     return np.asarray((1 - share) * vectors + share * folded)
 
 
-def _tags(old: IntArray, given: IntArray, n_items: int) -> IntArray:
+def _tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
     """(n_items, T) tags by the old numbers; −1 for tags of new items that the store lacks.
 
     Args:
         old: (n_old, T).
-        given: (n_items, T') of the new tables, numbered otherwise; T' is 0 without tables.
+        new_tags: (n_items, T') of the new tables, numbered otherwise; T' is 0 without tables.
     """
     tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
     tags[: len(old)] = old
-    if not (old.shape[1] and given.shape[1]):
+    if not (old.shape[1] and new_tags.shape[1]):
         return tags
-    same = _same_tags(old, given[: len(old)])
+    same = _same_tags(old, new_tags[: len(old)])
     for item in range(len(old), n_items):
-        known = [same[tag] for tag in given[item].tolist() if tag in same]
-        tags[item, : len(known[: old.shape[1]])] = known[: old.shape[1]]
+        shared = [same[tag] for tag in new_tags[item].tolist() if tag in same]
+        tags[item, : len(shared[: old.shape[1]])] = shared[: old.shape[1]]
     return tags
 
 
-def _same_tags(old: IntArray, given: IntArray) -> dict[int, int]:
+def _same_tags(old: IntArray, new_tags: IntArray) -> dict[int, int]:
     """Given number to the old number of the tag that most of the same items have."""
-    sizes = int(given.max()) + 1, int(old.max()) + 1
-    have = [_incidence(each, size) for each, size in zip((given, old), sizes, strict=True)]
+    sizes = int(new_tags.max()) + 1, int(old.max()) + 1
+    have = [_incidence(tags, size) for tags, size in zip((new_tags, old), sizes, strict=True)]
     both = (have[0].T @ have[1]).toarray()
     union = have[0].sum(axis=0).T + have[1].sum(axis=0) - both
     share = np.asarray(both / np.maximum(union, 1))

@@ -130,7 +130,7 @@ def hash_ids(ids: Sequence[object]) -> IntArray:
     It is that of `HASH`.
     """
     # Text of JSON may hold half a character.
-    texts = (str(each).encode("utf-8", "surrogatepass") for each in ids)
+    texts = (str(identifier).encode("utf-8", "surrogatepass") for identifier in ids)
     digests = (hashlib.md5(text, usedforsecurity=False).hexdigest() for text in texts)
     return np.asarray([int(digest[:7], 16) for digest in digests], dtype=np.int64)
 
@@ -162,13 +162,13 @@ def faults(log: TypedLog, known_items: Path | None = None) -> dict[str, str]:
         conditions["vector_not_finite"] = not_finite(schema.ACTION)
     if known_items is not None:
         source = f"read_parquet({text(glob_pattern(known_items))}, hive_partitioning = false)"
-        known = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
-        conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known})"
+        known_ids = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
+        conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known_ids})"
     return conditions
 
 
 def note_dropped(
-    name: str, dropped: Mapping[str, int], read: int, fine: Collection[str] = _FINE
+    name: str, dropped: Mapping[str, int], n_read: int, fine: Collection[str] = _FINE
 ) -> None:
     """Warn of the rows that are left out, with their numbers and reasons; silent if none is.
 
@@ -184,13 +184,13 @@ def note_dropped(
     hint = f"; {CLOCK_HINT}" if "clock_out_of_range" in counts else ""
     origin = f"{name}: " if name else ""
     warnings.warn(
-        f"{origin}{total:,} of {read:,} rows were excluded ({reasons}{hint})",
+        f"{origin}{total:,} of {n_read:,} rows were excluded ({reasons}{hint})",
         InputNote,
         stacklevel=3,
     )
 
 
-def note_unknown(name: str, column: str, unknown: int, total: int, known: str) -> None:
+def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: str) -> None:
     """Warn where nearly all users or items of a log are unknown, as if written in another way.
 
     Args:
@@ -198,14 +198,14 @@ def note_unknown(name: str, column: str, unknown: int, total: int, known: str) -
         column: `user_id` or `item_id`.
         unknown: number of its ids that are not known.
         total: number of its ids; few say nothing.
-        known: whose ids are known, after "those".
+        known_ids: whose ids are known, after "those".
     """
     if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
         return
     ids = column.removesuffix("_id") + "s"
     warnings.warn(
-        f"{name}: {unknown:,} of {total:,} {ids} are not among those {known}; if they should be, "
-        f"compare how {column} is written",
+        f"{name}: {unknown:,} of {total:,} {ids} are not among those {known_ids}; if they "
+        f"should be, compare how {column} is written",
         InputNote,
         stacklevel=3,
     )
@@ -216,7 +216,7 @@ class NoRowsError(InputError):
 
 
 def require_rows(
-    log: TypedLog, kept: int, dropped: Mapping[str, int], onto: Path | None = None
+    log: TypedLog, count: int, dropped: Mapping[str, int], onto: Path | None = None
 ) -> None:
     """Check that a row is left.
 
@@ -226,7 +226,7 @@ def require_rows(
     Raises:
         NoRowsError: none is.
     """
-    if kept == 0:
+    if count == 0:
         if onto is not None:
             _require_newer(log, dropped, onto)
         reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
@@ -242,14 +242,14 @@ def _require_newer(log: TypedLog, dropped: Mapping[str, int], onto: Path) -> Non
     Raises:
         NoRowsError: all rows that are wanted have a sound time, which is not after the store.
     """
-    wanted = sum(dropped.values()) - dropped["left_out"]
-    if not wanted or dropped["clock_out_of_range"] < wanted:
+    n_wanted = sum(dropped.values()) - dropped["left_out"]
+    if not n_wanted or dropped["clock_out_of_range"] < n_wanted:
         return
     (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
     # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
     if EARLIEST_MS <= latest < log.earliest_ms:
         last = datetime.fromtimestamp((log.earliest_ms - 1) / 1000, UTC)
         raise NoRowsError(
-            f"{log.name}: all {wanted:,} rows are not newer than {onto}, whose last row is of "
+            f"{log.name}: all {n_wanted:,} rows are not newer than {onto}, whose last row is of "
             f"{last:%Y-%m-%d %H:%M:%S} UTC; give newer logs"
         )

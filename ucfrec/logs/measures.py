@@ -53,11 +53,11 @@ class ValueCounts:
         if not self.few:
             return
         places = np.searchsorted(self.values, numbers)
-        known = np.zeros(len(numbers), dtype=bool)
+        counted = np.zeros(len(numbers), dtype=bool)
         if len(self.values):
-            known = self.values[np.minimum(places, len(self.values) - 1)] == numbers
-        if not known.all():
-            new = np.unique(numbers[~known])
+            counted = self.values[np.minimum(places, len(self.values) - 1)] == numbers
+        if not counted.all():
+            new = np.unique(numbers[~counted])
             self.few = len(self.values) + len(new) <= FEW_VALUES
             if not self.few:
                 return
@@ -152,9 +152,9 @@ class StepCounts:
         training = np.repeat(episodes.splits == 0, episodes.lengths)
         ends = np.cumsum(episodes.lengths)
         ahead = np.repeat(ends, episodes.lengths) - np.arange(len(rewards))
-        before = np.append(0.0, np.cumsum(rewards))
-        rest = np.repeat(before[ends], episodes.lengths) - before[:-1]
-        self.returns.add(rest[training], ahead[training])
+        earned = np.append(0.0, np.cumsum(rewards))
+        return_to_go = np.repeat(earned[ends], episodes.lengths) - earned[:-1]
+        self.returns.add(return_to_go[training], ahead[training])
         if ITEM in episodes.rows:
             items, size = episodes.rows[ITEM], len(self.item_steps)
             self.item_steps += np.bincount(items, minlength=size)
@@ -207,11 +207,13 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
         """
     )
     if _has_items(rows):
-        shown = np.flatnonzero(counts.item_steps)
-        columns = (shown, counts.item_steps[shown], counts.item_train_steps[shown])
+        codes = np.flatnonzero(counts.item_steps)
+        columns = (codes, counts.item_steps[codes], counts.item_train_steps[codes])
         connection.register(
             "shown",
-            pa.record_batch([as_arrow(each) for each in columns], ["code", "steps", "train_count"]),
+            pa.record_batch(
+                [as_arrow(column) for column in columns], ["code", "steps", "train_count"]
+            ),
         )
         connection.execute(
             f"CREATE TABLE {USED_ITEMS} AS SELECT {schema.ITEM_ID}, code, steps, train_count "
@@ -268,11 +270,11 @@ def _explain_returns(returns: Moments) -> float | None:
 
     Of the whole rest of the session; None if either does not vary.
     """
-    (rest, both), (_, ahead) = returns.covariance
+    (return_to_go, both), (_, ahead) = returns.covariance
     # What is left of the rounding errors of equal returns is not variance.
-    if rest <= 1e-24 * returns.mean[0] ** 2 or not ahead:
+    if return_to_go <= 1e-24 * returns.mean[0] ** 2 or not ahead:
         return None
-    return float(both**2 / (rest * ahead))
+    return float(both**2 / (return_to_go * ahead))
 
 
 def _require_training(rows: SortedRows, cut: Cut, steps: int) -> None:

@@ -127,16 +127,16 @@ class PrepareOptions:
             )
 
 
-def parse_split(given: str) -> tuple[float, ...]:
+def parse_split(text: str) -> tuple[float, ...]:
     """Read a split: "0.8,0.1,0.1", or two times "2022-04-28,2022-04-29T12:00" (UTC by default).
 
     Returns:
         Three shares, or two times in ms, as in `PrepareOptions.split`.
 
     Raises:
-        InputError: `given` is neither.
+        InputError: `text` is neither.
     """
-    parts = given.split(",")
+    parts = text.split(",")
     try:
         if len(parts) == 3:
             return tuple(float(part) for part in parts)
@@ -144,7 +144,7 @@ def parse_split(given: str) -> tuple[float, ...]:
     except ValueError:
         times = []
     if len(times) != 2:
-        raise InputError(f"split {given!r}: write shares as 0.8,0.1,0.1 or two times in ISO format")
+        raise InputError(f"split {text!r}: write shares as 0.8,0.1,0.1 or two times in ISO format")
     return tuple(t.replace(tzinfo=t.tzinfo or UTC).timestamp() * 1000 for t in times)
 
 
@@ -192,16 +192,16 @@ def prepare(
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
-            prepared_log(files, mapping, options, spill, like, keep_unknown) as found,
-            explained(found.rows.log.connection, found.rows.log.tables, out.parent),
+            prepared_log(files, mapping, options, spill, like, keep_unknown) as prepared,
+            explained(prepared.rows.log.connection, prepared.rows.log.tables, out.parent),
         ):
-            log, report = found.rows.log, found.report
+            log, report = prepared.rows.log, prepared.report
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = write_steps(found.rows, found.cut, folder, bar)
-            ids = {**write_ids(log, folder), **_feature_digests(found)}
+                writer = write_steps(prepared.rows, prepared.cut, folder, bar)
+            ids = {**write_ids(log, folder), **_feature_digests(prepared)}
             record = writer.finish(report["reward"], report, ids)
             if log.key == schema.ITEM_ID:
-                _write_states(found, folder, options.embedding_size, like)
+                _write_states(prepared, folder, options.embedding_size, like)
             if like is not None:
                 write_episode_users(log, folder / EPISODE_USERS)
             record.seal(folder)
@@ -226,8 +226,8 @@ def validate(
     """
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
-    with prepared_log(log_files(paths), mapping, options, spill, None) as found:
-        return found.report
+    with prepared_log(log_files(paths), mapping, options, spill, None) as prepared:
+        return prepared.report
 
 
 Features = dict[str, list[str]]
@@ -260,7 +260,7 @@ def prepared_log(
     items keep their numbers, and others follow."""
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
-    known = None if like is None or keep_unknown else like / ITEMS_FILE
+    known_items = None if like is None or keep_unknown else like / ITEMS_FILE
     inputs = (*files, *_other_inputs(mapping, like, onto))
     with (
         scratch_folder(spill, "sorted") as scratch,
@@ -274,13 +274,13 @@ def prepared_log(
                 from ucfrec.logs.spark import sort_with_spark  # an extra
 
                 rows = sort_with_spark(
-                    *typed, known, scratch, options.duplicates, options.spark_master
+                    *typed, known_items, scratch, options.duplicates, options.spark_master
                 )
             else:
                 log = typed_log(*typed, spill, text_ids(onto or like))
                 with explained(connection, log.tables, spill):
                     by_session = log.session_by == schema.SESSION_ID
-                    rows = sort_rows(log, known, options.duplicates, scratch, by_session)
+                    rows = sort_rows(log, known_items, options.duplicates, scratch, by_session)
             log = rows.log
             with explained(connection, log.tables, spill):
                 require_rows(log, rows.count, rows.dropped, onto)
@@ -320,11 +320,11 @@ def _cut(rows: SortedRows, options: PrepareOptions, like: Path | None) -> Cut:
 
 def _remembered(mapping: LogMapping) -> dict[str, Any]:
     """What the store remembers of the mapping, for later logs."""
-    found: dict[str, Any] = {"mapping": {name: str(s) for name, s in mapping.columns.items()}}
+    memory: dict[str, Any] = {"mapping": {name: str(s) for name, s in mapping.columns.items()}}
     for name in ("time_format", "earliest", "where"):
         if (text := getattr(mapping, name)) is not None:
-            found[name] = str(text)
-    return found | ({"partitions": True} if mapping.partitions else {})
+            memory[name] = str(text)
+    return memory | ({"partitions": True} if mapping.partitions else {})
 
 
 def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features:
@@ -338,11 +338,11 @@ def _features(log: TypedLog, mapping: LogMapping, like: Path | None) -> Features
     }
 
 
-def _feature_digests(found: PreparedLog) -> dict[str, list[Any]]:
+def _feature_digests(prepared: PreparedLog) -> dict[str, list[Any]]:
     """Digests for the fingerprint of the feature tables, if there are any."""
     return {
-        f"features of {name}": [feature_digest(found.rows.log.connection, names)]
-        for name, names in found.features.items()
+        f"features of {name}": [feature_digest(prepared.rows.log.connection, names)]
+        for name, names in prepared.features.items()
         if names
     }
 
@@ -354,10 +354,10 @@ def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:
 
 def _require_known_ids(log: TypedLog, mapping: LogMapping, features: Features, noted: bool) -> None:
     """Check that feature tables are about users and items of the log; after `number_ids`."""
-    kept = {name: f"used_{table}" for name, table, _ in ID_TABLES}
+    id_tables = {name: f"used_{table}" for name, table, _ in ID_TABLES}
     for name, names in features.items():
         tables = feature_tables(mapping)[name]
-        require_known_ids(log.connection, tables, names, name, kept[name], noted)
+        require_known_ids(log.connection, tables, names, name, id_tables[name], noted)
 
 
 def _other_inputs(
@@ -373,7 +373,7 @@ def _other_inputs(
         yield from log_files(table.files)
 
 
-def _write_states(found: PreparedLog, folder: Path, size: int, like: Path | None) -> None:
+def _write_states(prepared: PreparedLog, folder: Path, size: int, like: Path | None) -> None:
     """Learn the item states, or copy those of the store `like`."""
     # Only a store needs scipy, which takes a moment to import.
     from ucfrec.logs.features import encode_features, item_tags
@@ -382,17 +382,17 @@ def _write_states(found: PreparedLog, folder: Path, size: int, like: Path | None
     if like is not None:
         shutil.copy(like / ITEM_STATES, folder / ITEM_STATES)
         return
-    log, encoded, counts = found.rows.log, {}, {}
+    log, encoded, counts = prepared.rows.log, {}, {}
     for name, table, _ in ID_TABLES:
         (counts[name],) = log.one(f"SELECT count(*) FROM {table}")
-        encoded[name] = encode_features(log.connection, found.features[name], table, name)
+        encoded[name] = encode_features(log.connection, prepared.features[name], table, name)
     write_item_states(
         folder,
-        found.scratch,
+        prepared.scratch,
         encoded[schema.ITEM_ID],
         encoded[schema.USER_ID],
         counts[schema.ITEM_ID],
         counts[schema.USER_ID],
         size,
-        item_tags(log.connection, found.features[schema.ITEM_ID], "items", schema.ITEM_ID),
+        item_tags(log.connection, prepared.features[schema.ITEM_ID], "items", schema.ITEM_ID),
     )

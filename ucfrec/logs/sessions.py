@@ -107,16 +107,16 @@ def _cut_episodes(rows: dict[str, Array], cut: Cut, log_end: int) -> Episodes:
         last_ends = log_end - times[last] > cut.gap_ms
     terminated = np.where(user_ends[last], last_ends, ends[last])
     too_long = lengths > (lengths.max() if cut.max_steps is None else cut.max_steps)
-    used = (lengths >= cut.min_steps) & ~too_long
-    if not used.all():
-        steps = np.repeat(used, lengths)
+    fits = (lengths >= cut.min_steps) & ~too_long
+    if not fits.all():
+        steps = np.repeat(fits, lengths)
         rows = {name: values[steps] for name, values in rows.items()}
     return Episodes(
         rows,
-        lengths[used],
-        users[last][used],
-        splits[last][used],
-        begins_session[used],
-        terminated[used],
+        lengths[fits],
+        users[last][fits],
+        splits[last][fits],
+        begins_session[fits],
+        terminated[fits],
         int(lengths[too_long].sum()),
     )

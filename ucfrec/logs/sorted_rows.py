@@ -163,11 +163,12 @@ class SortedRows:
         repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
         if repeated.any():
             batch = self._order_duplicates(batch, repeated, duplicates)
-            counted = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
-            own, other = batch[schema.REWARD][repeated], batch[schema.REWARD][counted[repeated]]
-            equal = (own == other) | (np.isnan(own) & np.isnan(other))
+            winners = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
+            rewards = batch[schema.REWARD]
+            lost, counted = rewards[repeated], rewards[winners[repeated]]
+            equal = (lost == counted) | (np.isnan(lost) & np.isnan(counted))
             self.conflicts += int(np.count_nonzero(~equal))
-            self.dropped["duplicate"] += len(own)
+            self.dropped["duplicate"] += len(lost)
         undefined = np.isnan(batch[schema.REWARD]) & ~repeated
         self.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
         usable = ~(repeated | undefined)

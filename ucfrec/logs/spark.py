@@ -82,7 +82,7 @@ class Task:
     """Of the file."""
     query: str
     """SQL."""
-    others: tuple[Path, ...] = ()
+    more_files: tuple[Path, ...] = ()
     """Other files that the query reads."""
 
     def run(self) -> Iterator[pa.RecordBatch]:
@@ -93,7 +93,7 @@ class Task:
         """
         folder = Path(gettempdir())
         with (
-            engine((*self.table.files, *self.others), folder, MEMORY, threads=1) as connection,
+            engine((*self.table.files, *self.more_files), folder, MEMORY, threads=1) as connection,
             explained(connection, (self.table,), folder),
         ):
             yield from connection.sql(self.query).to_arrow_reader(BATCH_ROWS)
@@ -138,8 +138,8 @@ def sort_with_spark(
             finite, or Spark is missing or fails.
     """
     with spark_session(master) as spark, spark_failures():
-        given = connection, tables, mapping, reward, session_by
-        log, rows = typed_with_spark(spark, *given, known_items, scratch)
+        log_values = connection, tables, mapping, reward, session_by
+        log, rows = typed_with_spark(spark, *log_values, known_items, scratch)
         rows.createOrReplaceTempView(FAULTY)
         for name, table in code_tables(log).items():
             codes = _written(spark, spark.sql(coded_ids(name, FAULTY)), scratch / table)
@@ -185,10 +185,10 @@ def typed_with_spark(
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
-    found = _surveyed(spark, files, vectors(typed.names))
-    log = typed.log(connection, vector_sizes(found.vectors), mapping)
-    require_observations(tables, found.bad, sum(found.rows))
-    tasks = _row_tasks(log, files, found.rows, known_items)
+    survey = _surveyed(spark, files, vectors(typed.names))
+    log = typed.log(connection, vector_sizes(survey.vectors), mapping)
+    require_observations(tables, survey.bad, sum(survey.rows))
+    tasks = _row_tasks(log, files, survey.rows, known_items)
     return log, _written(spark, _run(spark, tasks, _schema(log)), scratch / FAULTY)
 
 
@@ -215,12 +215,12 @@ def _surveyed(spark: Any, files: Files, names: Sequence[str]) -> _Survey:
             counts[_BAD] = (
                 f"SELECT 0 AS size, n FROM ({observation_counts(rows)}) AS bad(n, of_rows)"
             )
-        each = (
+        queries = (
             f"SELECT {number}::BIGINT AS file, '{name}' AS name, size::BIGINT AS size, "
             f"n::BIGINT AS n FROM ({query})"
             for name, query in counts.items()
         )
-        tasks.append(Task(table, " UNION ALL ".join(each)))
+        tasks.append(Task(table, " UNION ALL ".join(queries)))
     survey = _Survey([0] * len(files), {name: Counter() for name in names})
     for file, name, size, n in _run(spark, tasks, _COUNTS).collect():
         if name == _ROWS:
@@ -236,14 +236,14 @@ def _row_tasks(
     log: TypedLog, files: Files, counts: Sequence[int], known_items: Path | None
 ) -> list[Task]:
     """Tasks that read the typed rows with faults of each file."""
-    others = () if known_items is None else (known_items,)
-    tasks, before = [], 0
+    more_files = () if known_items is None else (known_items,)
+    tasks, rows_before = [], 0
     for (values, table), n in zip(files, counts, strict=True):
         rows = f"({numbered_rows([(values, table.sql)])})"
         faulty = with_faults(log, rows, known_items)
-        query = f"SELECT * REPLACE (row + {before} AS row) FROM ({faulty})"
-        tasks.append(Task(table, query, others))
-        before += n
+        query = f"SELECT * REPLACE (row + {rows_before} AS row) FROM ({faulty})"
+        tasks.append(Task(table, query, more_files))
+        rows_before += n
     return tasks
 
 

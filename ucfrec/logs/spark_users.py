@@ -51,7 +51,7 @@ class GivenLog:
     """`items.parquet` of a store or run: rows with other items are left out; None for all."""
 
 
-def by_users(given: GivenLog, folder: Path, master: str, work: Work) -> list[int]:
+def by_users(source: GivenLog, folder: Path, master: str, work: Work) -> list[int]:
     """Give each part of the users of a log to a worker. Warns of the rows that are left out.
 
     Args:
@@ -66,18 +66,18 @@ def by_users(given: GivenLog, folder: Path, master: str, work: Work) -> list[int
         InputError: the log cannot be used, no row is left, or Spark is missing or fails.
     """
     # Workers have a working folder of their own.
-    files = [file.absolute() for file in log_files(given.paths)]
-    known = given.known_items and given.known_items.absolute()
+    files = [file.absolute() for file in log_files(source.paths)]
+    known_items = source.known_items and source.known_items.absolute()
     with (
         scratch_folder(folder.absolute(), "users") as scratch,
         engine(files, scratch) as connection,
         spark_session(master) as spark,
         spark_failures(),
     ):
-        tables = tuple(open_tables(connection, files, given.mapping.partitions))
-        mapping, reward = settled(connection, tables, given.mapping, given.reward)
-        typed = connection, tables, mapping, reward, given.session_by
-        log, rows = typed_with_spark(spark, *typed, known, scratch)
+        tables = tuple(open_tables(connection, files, source.mapping.partitions))
+        mapping, reward = settled(connection, tables, source.mapping, source.reward)
+        typed = connection, tables, mapping, reward, source.session_by
+        log, rows = typed_with_spark(spark, *typed, known_items, scratch)
         if log.key != schema.ITEM_ID:
             raise InputError(f"{log.name}: its actions are vectors; map item_id instead")
         usable, dropped = _counted(log, rows)

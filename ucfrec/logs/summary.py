@@ -69,8 +69,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         if rows:
             lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
     if report["conflicting_duplicates"]:
-        kept = DUPLICATES[report.get("duplicates", "highest")]
-        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {kept}"
+        rule = DUPLICATES[report.get("duplicates", "highest")]
+        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {rule}"
         lines.append(("  conflicting duplicates", conflicts))
     if report["equal_times"]:
         text = f"{report['equal_times']:,} (in no order that could be learned)"
@@ -148,11 +148,11 @@ def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None
     """
     if where is not None and rows.dropped["left_out"]:
         note_undefined(rows.log.connection, rows.log.tables, where)
-    wanted = rows.read - rows.dropped["left_out"]
+    n_wanted = rows.read - rows.dropped["left_out"]
     for reason, n in rows.dropped.items():
-        if n <= MANY * wanted or reason == "left_out":
+        if n <= MANY * n_wanted or reason == "left_out":
             continue
-        share = f"{n:,} of {wanted:,} rows ({n / wanted:.0%}) are dropped"
+        share = f"{n:,} of {n_wanted:,} rows ({n / n_wanted:.0%}) are dropped"
         if reason == "reward_not_finite":
             why = _missing(rows.log, reward, where or "true")
             _note(rows, f"{share}: the reward {reward} is {why}")
@@ -168,9 +168,9 @@ def note_undefined(
     undefined = rows = 0
     for table in tables:
         bound = bind(connection, table, "for --where", where)
-        asked = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
+        columns_asked = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
         source = table.of(bound.columns).sql
-        ((some, every),) = connection.sql(f"SELECT {asked} FROM {source}").fetchall()
+        ((some, every),) = connection.sql(f"SELECT {columns_asked} FROM {source}").fetchall()
         undefined, rows = undefined + some, rows + every
     if undefined:
         warnings.warn(
@@ -229,20 +229,20 @@ def note_bots(rows: SortedRows, report: Mapping[str, Any], user: str) -> None:
         user: expression over the columns of the files that gives the users.
     """
     median = report["summary"]["session_lengths"]["quantiles"]["0.5"]
-    found = rows.log.connection.sql(
+    users_found = rows.log.connection.sql(
         f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
         f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"
     ).fetchall()
-    if not found:
+    if not users_found:
         return
-    named = ", ".join(f"{name} ({steps:,} rows)" for name, steps in found)
-    users = ", ".join(str(n) if isinstance(n, int) else text(str(n)) for n, _ in found)
+    bots = ", ".join(f"{name} ({steps:,} rows)" for name, steps in users_found)
+    users = ", ".join(str(n) if isinstance(n, int) else text(str(n)) for n, _ in users_found)
     if not re.fullmatch(r"[\w' ,:@.-]*", users):
         users = "…"  # what a shell would take for a program is not proposed
     _note(
         rows,
         f"the median session has {median:,} row{'s' * (median > 1)}, but these users have sessions "
-        f"of more than {LONG} times that, as bots have: {named}; leave them out with "
+        f"of more than {LONG} times that, as bots have: {bots}; leave them out with "
         f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
     )
 
@@ -254,10 +254,10 @@ def _note(rows: SortedRows, message: str) -> None:
 def _missing_key(log: TypedLog) -> str:
     names = [schema.USER_ID, log.key, schema.TIMESTAMP]
     names += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
-    asked = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
-    counts = log.one(f"SELECT {asked} FROM {ROWS}")
-    found = [f"{name} in {n:,}" for name, n in zip(names, counts, strict=True) if n]
-    return f" ({', '.join(found)})"
+    columns_asked = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
+    counts = log.one(f"SELECT {columns_asked} FROM {ROWS}")
+    users_found = [f"{name} in {n:,}" for name, n in zip(names, counts, strict=True) if n]
+    return f" ({', '.join(users_found)})"
 
 
 def _missing(log: TypedLog, reward: str, where: str) -> str:
@@ -279,7 +279,7 @@ def _null_counts(
     if not columns:
         return {}
     undefined = f"TRY(CAST({sql} AS DOUBLE)) IS NULL"
-    asked = ", ".join(f"count(*) FILTER ({quoted(name)} IS NULL)" for name in columns)
-    query = f"SELECT {asked} FROM {table.sql} WHERE {undefined} AND ({where}\n)"
+    columns_asked = ", ".join(f"count(*) FILTER ({quoted(name)} IS NULL)" for name in columns)
+    query = f"SELECT {columns_asked} FROM {table.sql} WHERE {undefined} AND ({where}\n)"
     (row,) = log.connection.sql(query).fetchall()
     return dict(zip(columns, row, strict=True))

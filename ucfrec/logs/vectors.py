@@ -30,8 +30,8 @@ def vector_sizes(counts: Mapping[str, Mapping[int, int]]) -> dict[str, int]:
         InputError: a column has vectors of unequal or no size.
     """
     sizes: dict[str, int] = {}
-    for name, found in counts.items():
-        ordered = sorted(found.items(), key=lambda pair: (-pair[1], pair[0]))
+    for name, sizes_found in counts.items():
+        ordered = sorted(sizes_found.items(), key=lambda pair: (-pair[1], pair[0]))
         if len(ordered) > 1:
             lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
             raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")

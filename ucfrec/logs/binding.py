@@ -18,9 +18,9 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import (
     NotScalarError,
+    cast_truth_values,
     columns_of,
-    refused,
-    with_numbers_for_truth_values,
+    refusal,
 )
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
 from ucfrec.logs.tables import Table, fault_of_line, first_line, quoted
@@ -75,10 +75,10 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
             truth = {name for name in used if columns[name] == "BOOLEAN"}
             if not truth:
                 raise
-            sql = f"({with_numbers_for_truth_values(connection, expression, truth)}\n)"
+            sql = f"({cast_truth_values(connection, expression, truth)}\n)"
             kind = _type_of(connection, sql, {name: columns[name] for name in used})
     except (duckdb.Error, NotScalarError) as error:
-        raise refused(what, expression, str(table.files[0]), first_line(error)) from None
+        raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
     return Bound(sql, kind, used, False)
 
 

@@ -42,8 +42,8 @@ def require_whole(name: str, value: object, least: int = 1, most: int | None = N
     except TypeError:
         whole = None
     if whole is None or whole < least or (most is not None and whole > most):
-        limits = f"{least} or more" if most is None else f"from {least} to {most:,}"
-        raise InputError(f"{name} is {shown(value)}; give a whole number, {limits}")
+        limits = f", {least} or more" if most is None else f" from {least} to {most:,}"
+        raise InputError(f"{name} is {shown(value)}; give a whole number{limits}")
     return whole
 
 

@@ -90,6 +90,8 @@ def test_users_in_several_arms_and_rows_without_one_are_left_out(tmp_path: Path)
         ({"arm": None}, "two arms .* none"),
         ({"user_id": None}, "two arms .* none"),
         ({"feedback": np.nan}, r"value of feedback .* 'a' \(0 users\), 'b' \(0 users\)"),
+        ({"feedback": np.inf}, r"log\.parquet: feedback is infinite .* in 500 rows"),
+        ({"feedback": -1e200}, r"feedback is infinite or beyond .* in 500 rows"),
     ],
 )
 def test_logs_without_two_arms_are_refused(
@@ -99,7 +101,7 @@ def test_logs_without_two_arms_are_refused(
     with pytest.raises(InputError, match=message):
         compare_arms([tmp_path / "log.parquet"])
     log(50, 0.0).to_parquet(tmp_path / "log.parquet")
-    with pytest.raises(InputError, match=r"no column clicks; .* of numbers are .*feedback"):
+    with pytest.raises(InputError, match=r"no column clicks; .*of numbers are feedback"):
         compare_arms([tmp_path / "log.parquet"], "clicks")
 
 
@@ -146,18 +148,6 @@ def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) ->
     frame.to_csv(tmp_path / "log.csv", index=False)
     found = compare_arms([tmp_path / "log.csv"])
     assert (found.arms, found.users, found.in_several) == (("1", "1.0"), (3, 3), 0)
-
-
-@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e200])
-def test_infinite_values_are_refused_with_their_file(tmp_path: Path, value: float) -> None:
-    frame = log(50, 0.0).assign(feedback=lambda rows: rows.feedback.astype(float))
-    frame.to_parquet(tmp_path / "a.parquet")
-    frame.loc[[3, 9], "feedback"] = value
-    frame.to_parquet(tmp_path / "b.parquet")
-    frame.assign(feedback=np.nan).to_parquet(tmp_path / "without.parquet")
-    files = [tmp_path / name for name in ("a.parquet", "b.parquet", "without.parquet")]
-    with pytest.raises(InputError, match=r"b\.parquet: feedback is infinite .* in 2 rows"):
-        compare_arms(files)
 
 
 @pytest.mark.parametrize("kind", ["int64", "int8", "float64", "category", "bool"])

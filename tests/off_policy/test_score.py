@@ -116,7 +116,7 @@ def test_models_are_asked_about_what_the_policy_would_show(
 ) -> None:
     rule = replace(RULE, temperature=0.0) if greedy else RULE
     frame = pd.concat(score(trained, logged, RULE))
-    steps = collect_steps(trained, logged, rule, seed=0).steps
+    steps = collect_steps(trained, logged, rule, seed=0)[0]
     certain = (frame.greedy_item_id == frame.item_id).astype(float)
     np.testing.assert_allclose(steps.target, certain if greedy else frame.probability, rtol=1e-5)
     np.testing.assert_array_equal(steps.session, frame.session)
@@ -169,13 +169,13 @@ def test_unknown_items_may_stay_with_no_probability(
     log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
     log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
-    before = collect_steps(trained, logged, RULE, seed=0).steps
+    before = collect_steps(trained, logged, RULE, seed=0)[0]
     files = [tmp_path / "log.parquet"]
     with logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
-        steps = collect_steps(trained, kept, RULE, seed=0).steps
+        steps = collect_steps(trained, kept, RULE, seed=0)[0]
     assert (steps.target[unknown] == 0).all()
     assert (steps.weights[unknown] == 0).all()
     untouched = np.logical_and.accumulate(~unknown)
@@ -275,7 +275,7 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
         whole, filtered = (
             pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
         )
-        steps = collect_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True)).steps
+        steps = collect_steps(trained, logged, rule, 0, EstimateOptions(filter_seen=True))[0]
     np.testing.assert_allclose(filtered.probability, log.propensity, rtol=1e-4)
     np.testing.assert_allclose(steps.target, log.propensity, rtol=1e-4)
     assert (whole.probability < 0.99 * log.propensity.to_numpy()).any()

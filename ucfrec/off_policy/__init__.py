@@ -1,6 +1,6 @@
 """Off-policy estimates: the return of a policy, from logs of another policy.
 
-The array functions need no ucfrec run:
+The array functions need no ucfrec run, and do not load torch:
 
     from ucfrec.off_policy import LoggedSteps, estimate
 
@@ -9,28 +9,22 @@ The array functions need no ucfrec run:
         print(name, one.value, one.low, one.high)
 """
 
-from importlib import import_module
-from typing import Any
+from ucfrec.off_policy.diagnostics import diagnose
+from ucfrec.off_policy.estimators import Estimate, estimate
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled
+from ucfrec.off_policy.pages import as_pages
+from ucfrec.off_policy.selection import select
+from ucfrec.off_policy.verdict import Verdict, conclude
 
-_HOMES = {
-    "Estimate": "estimators",
-    "ItemGroups": "logged_steps",
-    "LoggedSteps": "logged_steps",
-    "Modelled": "logged_steps",
-    "Verdict": "verdict",
-    "as_pages": "pages",
-    "diagnose": "diagnostics",
-    "estimate": "estimators",
-    "conclude": "verdict",
-    "select": "selection",
-}
-"""Public name to the module that defines it."""
-
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    # Neither `ucfrec --help` nor users of the array functions wait for torch.
-    if name not in _HOMES:
-        raise AttributeError(f"module 'ucfrec.off_policy' has no attribute {name!r}")
-    return getattr(import_module(f"ucfrec.off_policy.{_HOMES[name]}"), name)
+__all__ = [
+    "Estimate",
+    "ItemGroups",
+    "LoggedSteps",
+    "Modelled",
+    "Verdict",
+    "as_pages",
+    "conclude",
+    "diagnose",
+    "estimate",
+    "select",
+]

@@ -3,16 +3,15 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Final
+from typing import Any, Final
 
-import duckdb
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.arrays import Float64Array
+from ucfrec.arrays import Array, Float64Array
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.binding import explained
@@ -67,9 +66,9 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
-        for lacking, name in ((self.without_user, schema.USER_ID), (self.without_arm, schema.ARM)):
-            if lacking:
-                lines.append(f"{lacking:,} rows have no {name}; they are left out")
+        for count, name in ((self.without_user, schema.USER_ID), (self.without_arm, schema.ARM)):
+            if count:
+                lines.append(f"{count:,} rows have no {name}; they are left out")
         if self.in_several:
             lines.append(
                 f"{self.in_several:,} users were in more than one arm; their rows are left out"
@@ -141,67 +140,82 @@ def compare_arms(
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
             with two users each.
     """
-    log = _by_user(paths, column, memory_limit)
-    found = log.of_arms
-    names = arms or tuple(sorted(found, key=lambda name: -len(found[name]))[:2])
-    if len(names) != 2 or not all(len(found.get(name, ())) > 1 for name in names):
-        there = ", ".join(f"{name!r} ({len(found[name]):,} users)" for name in sorted(found))
+    files = log_files(paths)
+    name = first_and_more(files)
+    groups, in_several = _sum_by_user(files, column, memory_limit)
+    has_user, has_arm = groups["who"].astype(bool), groups[schema.ARM] != ""
+    if beyond := int(groups["beyond"].sum()):
         raise InputError(
-            f"{log.name}: two arms with two users each who have a value of {column} are needed, "
-            f"the logs have {there or 'none'}; write exposures with serve --split, or name two "
-            "with --arms"
+            f"{name}: {column} is infinite or beyond ±{_LARGEST:g} in {beyond:,} rows; correct the "
+            "values, or remove them to leave the rows out"
         )
-    if arms is None and len(found) > 2:
-        raise InputError(f"the logs have {len(found)} arms; name two of them with --arms A,B")
+    counts = has_user & has_arm & (groups["arms"] == 1)
+    sums: dict[str, Float64Array] = {}
+    without_value: dict[str, int] = {}
+    for arm in map(str, np.unique(groups[schema.ARM][counts])):
+        values, shown, rows = (
+            groups[part][counts & (groups[schema.ARM] == arm)]
+            for part in ("value", "shown", "rows")
+        )
+        sums[arm] = np.stack([values, shown.astype(np.float64)])[:, shown > 0]
+        without_value[arm] = int((rows - shown).sum())
+    users = {arm: values.shape[1] for arm, values in sums.items()}
+    names = arms or tuple(sorted(users, key=lambda arm: -users[arm])[:2])
+    if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
+        present = ", ".join(f"{arm!r} ({count:,} users)" for arm, count in sorted(users.items()))
+        raise InputError(
+            f"{name}: two arms with two users each who have a value of {column} are needed, the "
+            f"logs have {present or 'none'}; write exposures with serve --split, or name two with "
+            "--arms"
+        )
+    if arms is None and len(users) > 2:
+        raise InputError(f"the logs have {len(users)} arms; name two of them with --arms A,B")
     first, second = names
-    lacking = log.without_value[first], log.without_value[second]
-    if any(lacking):
+    if without_value[first] or without_value[second]:
         warnings.warn(
-            f"{log.name}: {column} has no value in {lacking[0]:,} rows of {first} and "
-            f"{lacking[1]:,} of {second}, which are left out; write 0 where that is meant",
+            f"{name}: {column} has no value in {without_value[first]:,} rows of {first} and "
+            f"{without_value[second]:,} of {second}, which are left out; write 0 where that is "
+            "meant",
             InputNote,
             stacklevel=2,
         )
-    counts = [found[name].T for name in names]
-    values, errors = zip(*(cluster_mean(s / n, None, n) for s, n in counts), strict=True)
-    difference, variance = values[1] - values[0], errors[0] ** 2 + errors[1] ** 2
+    (value_a, error_a), (value_b, error_b) = (
+        cluster_mean(total / shown, None, shown) for total, shown in (sums[first], sums[second])
+    )
+    difference, variance = value_b - value_a, error_b**2 + error_a**2
     error = math.sqrt(variance)
     ends: tuple[float | None, ...] = (None,) * 4
-    if min(errors) > 0 and min(len(found[name]) for name in names) >= FEWEST_USERS:
-        always = always_valid(difference, variance, expected or EXPECTED * abs(values[0]) or error)
+    if min(error_a, error_b) > 0 and min(users[first], users[second]) >= FEWEST_USERS:
+        mixture = expected or EXPECTED * abs(value_a) or error
+        always = always_valid(difference, variance, mixture)
         ends = difference - _NORMAL * error, difference + _NORMAL * error, *always
     return Comparison(
-        column,
-        (first, second),
-        values,
-        (len(found[first]), len(found[second])),
-        (int(found[first][:, 1].sum()), int(found[second][:, 1].sum())),
-        lacking,
-        log.without_user,
-        log.without_arm,
-        log.in_several,
-        difference,
-        error,
-        *ends,
+        column=column,
+        arms=(first, second),
+        values=(value_a, value_b),
+        users=(users[first], users[second]),
+        rows=(int(sums[first][1].sum()), int(sums[second][1].sum())),
+        without_value=(without_value[first], without_value[second]),
+        without_user=int(groups["rows"][~has_user].sum()),
+        without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
+        in_several=in_several,
+        difference=difference,
+        error=error,
+        low=ends[0],
+        high=ends[1],
+        always_low=ends[2],
+        always_high=ends[3],
     )
 
 
-@dataclass(frozen=True)
-class _Log:
-    """What the logs have of a column."""
+def _sum_by_user(
+    files: Sequence[Path], column: str, memory_limit: str
+) -> tuple[dict[str, Array], int]:
+    """The sum of the values, numbers of values and rows of each user in each arm; "" for no arm.
 
-    name: str
-    """The first file, and how many more there are."""
-    of_arms: dict[str, Float64Array]
-    """(U, 2) sums of the values and their number, of the users of each arm who have one."""
-    without_value: dict[str, int]
-    without_user: int
-    without_arm: int
-    in_several: int
-
-
-def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Log:
-    files = log_files(paths)
+    Returns:
+        Columns of (user, arm), and the number of users in several arms.
+    """
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
         engine(files, folder, memory_limit, shared=True) as connection,
@@ -209,72 +223,40 @@ def _by_user(paths: Sequence[str | Path], column: str, memory_limit: str) -> _Lo
         tables = tuple(open_tables(connection, files))
         for table in tables:
             _require_columns(table, column)
+        rows = " UNION ALL BY NAME ".join(
+            f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
+            f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
+            f"CAST({quoted(column)} AS DOUBLE) AS value "
+            f"FROM {table.with_texts([column], (schema.USER_ID, schema.ARM)).sql}"
+            for table in tables
+        )
         with explained(connection, tables, folder):
             connection.execute(
-                "CREATE TABLE of_users AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
+                "CREATE TABLE groups AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
                 f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
-                "count(arm) OVER (PARTITION BY who) AS arms "
-                f"FROM ({_rows(tables, column)}) GROUP BY who, arm"
+                f"count(arm) OVER (PARTITION BY who) AS arms FROM ({rows}) GROUP BY who, arm"
             )
-            kept = connection.sql(
-                "SELECT arm, value, shown, rows FROM of_users "
-                "WHERE who IS NOT NULL AND arm IS NOT NULL AND arms = 1 ORDER BY arm, who"
+            groups: dict[str, Any] = connection.sql(
+                "SELECT who IS NOT NULL AS who, coalesce(arm, '') AS arm, value, shown, rows, "
+                "beyond, arms FROM groups ORDER BY groups.arm, groups.who"
             ).fetchnumpy()
-            ((in_several, nobody, no_arm, beyond),) = connection.sql(
-                "SELECT count(DISTINCT who) FILTER (arms > 1), "
-                "coalesce(sum(rows) FILTER (who IS NULL), 0), "
-                "coalesce(sum(rows) FILTER (who IS NOT NULL AND arm IS NULL), 0), "
-                "coalesce(sum(beyond), 0) FROM of_users"
+            ((in_several,),) = connection.sql(
+                "SELECT count(DISTINCT who) FILTER (arms > 1) FROM groups"
             ).fetchall()
-            if beyond:
-                raise _beyond(connection, tables, column)
-    names, shown = np.asarray(kept[schema.ARM], dtype=str), kept["shown"]
-    pairs = np.stack([kept["value"], shown.astype(np.float64)], axis=1)
-    arms = [str(name) for name in np.unique(names)]
-    return _Log(
-        first_and_more(files),
-        {name: pairs[(names == name) & (shown > 0)] for name in arms},
-        {name: int((kept["rows"] - shown)[names == name].sum()) for name in arms},
-        int(nobody),
-        int(no_arm),
-        int(in_several),
-    )
+    return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}, int(in_several)
 
 
 def _require_columns(table: Table, column: str) -> None:
     file, kinds = table.files[0], table.columns
-    for name in (schema.USER_ID, schema.ARM):
-        if name not in kinds:
-            raise InputError(f"{file} has no column {name}; give the log of ucfrec join")
     numbers = [name for name, kind in kinds.items() if is_number(kind) or kind == "BOOLEAN"]
-    if column not in numbers:
-        lacks = f": {column} is not a number" if column in kinds else f" has no column {column}"
-        remedy = f"its columns of numbers are {', '.join(numbers)}"
-        raise InputError(f"{file}{lacks}; {remedy if numbers else 'give the log of ucfrec join'}")
-
-
-def _rows(tables: Sequence[Table], column: str) -> str:
-    """SQL of the rows: `who`, `arm` and `value`, NULL where there is none."""
-    return " UNION ALL BY NAME ".join(
-        f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
-        f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
-        f"CAST({quoted(column)} AS DOUBLE) AS value FROM {read.sql}"
-        for table in tables
-        for read in [table.with_texts([column], (schema.USER_ID, schema.ARM))]
-    )
-
-
-def _beyond(
-    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], column: str
-) -> InputError:
-    """Error for infinite values: names the file with the most."""
-    counts = {}
-    for single in [replace(table, files=(file,)) for table in tables for file in table.files]:
-        query = f"SELECT count(*) FILTER (abs(value) > {_LARGEST}) FROM ({_rows([single], column)})"
-        ((counts[single.files[0]],),) = connection.sql(query).fetchall()
-    file = max(counts, key=lambda each: counts[each])
-    return InputError(
-        f"{file}: {column} is infinite or beyond ±{_LARGEST:g} in {counts[file]:,} rows; correct "
-        "the values, or remove them to leave the rows out"
+    if missing := [name for name in (schema.USER_ID, schema.ARM, column) if name not in kinds]:
+        fault = f" has no column {', '.join(missing)}"
+    elif column not in numbers:
+        fault = f": {column} is not a number"
+    else:
+        return
+    raise InputError(
+        f"{file}{fault}; give the log of ucfrec join; its columns of numbers are "
+        f"{', '.join(numbers)}"
     )

@@ -95,18 +95,25 @@ def fit_behavior(
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
     folds = rng.permutation(int(owner.max()) + 1)[owner] % FOLDS
-    known, count = item >= 0, int(group.max()) + 1
-    samples = [_draw_rows(np.flatnonzero(known & (folds != fold)), rng) for fold in range(FOLDS)]
+    listed, count = item >= 0, int(group.max()) + 1
+    samples = []
+    for fold in range(FOLDS):
+        rows = np.flatnonzero(listed & (folds != fold))
+        if len(rows) > _MOST_ROWS:
+            rows = np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
+        samples.append(rows)
     sample = np.unique(np.concatenate(samples))
     look_up = _look_up_states(states, sample)
     models = []
     with progress(FOLDS, "propensities", "folds") as bar:
         for fold, rows in enumerate(samples):
-            shares = np.bincount(group[known & (folds != fold)], minlength=count) + 1.0
+            shares = np.bincount(group[listed & (folds != fold)], minlength=count) + 1.0
             models.append(_GroupModel(look_up(rows), group[rows], shares / shares.sum()))
             bar.update()
     calibration = _calibrate(models, look_up, group, folds, sample)
-    of_group, begin, table = np.ones(len(item)), 0, np.zeros((2, count, 10))
+    of_group, begin = np.ones(len(item)), 0
+    # By group and tenth of the probability: what is expected, and what occurs.
+    table = np.zeros((2, count, 10))
     for batch in states():
         part = slice(begin, begin + len(batch))
         probabilities = np.empty((len(batch), count))
@@ -114,13 +121,17 @@ def fit_behavior(
             rows = folds[part] == fold
             probabilities[rows] = model.predict(batch[rows], *calibration)
         of_group[part] = np.take_along_axis(probabilities, group[part][:, None], axis=1)[:, 0]
-        _count_calibration(table, probabilities[known[part]], group[part][known[part]])
+        rows = np.flatnonzero(listed[part])
+        tenth = np.minimum((probabilities[rows] * 10).astype(np.int64), 9)
+        logged = group[part][rows]
+        np.add.at(table[0], (np.arange(count)[None, :], tenth), probabilities[rows])
+        np.add.at(table[1], (logged, tenth[np.arange(len(rows)), logged]), 1.0)
         begin = part.stop
-    mean_shares = np.stack([model.shares for model in models])[folds[known], group[known]]
+    mean_shares = np.stack([model.shares for model in models])[folds[listed], group[listed]]
     return BehaviorModel(
-        group=np.where(known, of_group, 1.0),
-        item=np.where(known, of_group * _item_shares(item, group, folds), 1.0),
-        log_loss=float(-np.log(of_group[known]).mean()),
+        group=np.where(listed, of_group, 1.0),
+        item=np.where(listed, of_group * _item_shares(item, group, folds), 1.0),
+        log_loss=float(-np.log(of_group[listed]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
         calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
         temperature=calibration[0],
@@ -135,16 +146,14 @@ class _GroupModel:
         # Importing scikit-learn takes a second, which no other estimate must cost.
         from sklearn.linear_model import LogisticRegression
 
-        self.shares = shares
-        self._present = np.unique(group)
-        self._model = None
+        self.shares, self._present, self._model = shares, np.unique(group), None
         # There may be no row at all, where all other users were shown unknown items.
         if len(self._present) > 1:
             self._mean, self._spread = states.mean(axis=0), states.std(axis=0)
             self._spread[self._spread == 0] = 1.0
             require_blas_memory()
-            self._model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
-            self._model.fit(self._scale(states), group)
+            model = LogisticRegression(C=0.1, max_iter=100, tol=1e-3)
+            self._model = model.fit(self._scale(states), group)
 
     def predict(self, states: Float32Array, temperature: float, share: float) -> Float64Array:
         """(B, K), with so much of the shares of groups mixed in."""
@@ -162,12 +171,6 @@ class _GroupModel:
         scaled = np.asarray(states - self._mean, dtype=np.float32)
         scaled /= self._spread
         return scaled
-
-
-def _draw_rows(rows: IntArray, rng: np.random.Generator) -> IntArray:
-    if len(rows) <= _MOST_ROWS:
-        return rows
-    return np.sort(rng.choice(rows, _MOST_ROWS, replace=False))
 
 
 def _look_up_states(states: States, rows: IntArray) -> Callable[[IntArray], Float32Array]:
@@ -206,21 +209,12 @@ def _calibrate(
 def _item_shares(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
     """(N,) share of the item among its group's steps in the other folds, one step added to each
     item."""
-    known, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
+    listed, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
     group_of = np.zeros(items, dtype=np.int64)
-    group_of[item[known]] = group[known]
+    group_of[item[listed]] = group[listed]
     for fold in range(FOLDS):
-        rows = known & (folds == fold)
-        counts = np.bincount(item[known & (folds != fold)], minlength=items) + 1.0
+        rows = listed & (folds == fold)
+        counts = np.bincount(item[listed & (folds != fold)], minlength=items) + 1.0
         totals = np.bincount(group_of, counts, int(group.max()) + 1)
         shares[rows] = counts[item[rows]] / totals[group[rows]]
     return shares
-
-
-def _count_calibration(table: Float64Array, probabilities: Float64Array, group: IntArray) -> None:
-    """Add to table (2, K, 10), by group and tenth of the probability: what is expected, and what
-    occurs."""
-    tenth = np.minimum((probabilities * 10).astype(np.int64), 9)
-    groups, rows = np.arange(probabilities.shape[1]), np.arange(len(group))
-    np.add.at(table[0], (groups[None, :], tenth), probabilities)
-    np.add.at(table[1], (group, tenth[rows, group]), 1.0)

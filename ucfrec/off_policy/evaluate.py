@@ -12,7 +12,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.behavior_model import BehaviorModel, fit_behavior, group_items
+from ucfrec.off_policy.behavior_model import fit_behavior, group_items
 from ucfrec.off_policy.diagnostics import FAR_OFF, MOST_LEFT_OUT, Diagnosis, diagnose, implied_items
 from ucfrec.off_policy.estimators import (
     LOGGED,
@@ -100,18 +100,6 @@ class OffPolicyReport(ResultTable):
         return [*warnings, f"verdict: {self.verdict.headline}"]
 
 
-@dataclass(frozen=True)
-class EvaluatedSteps:
-    """Logged steps with the evaluated policy's probabilities, and the models fitted on them."""
-
-    steps: LoggedSteps
-    models: ModelReport
-    behavior: BehaviorModel | None
-    """None where neither MIPS nor a lacking propensity needs it."""
-    estimated: int
-    """Number of steps whose propensity is estimated."""
-
-
 @dataclass
 class Doubts:
     """What the logs say against an estimate, beside their weights."""
@@ -147,10 +135,17 @@ def evaluate_off_policy(
             a session of several steps.
     """
     rule, store = rule or trained.rule, logged.store
-    evaluated = collect_steps(trained, logged, rule, seed, options)
-    steps, segment, per_step = evaluated.steps, None, None
-    seen = share_seen(trained, store)
-    doubts = _doubt_logs(trained, logged, evaluated, seen, options.pages)
+    steps, models, declared = collect_steps(trained, logged, rule, seed, options)
+    seen, segment, per_step = share_seen(trained, store), None, None
+    doubts = _doubt_logs(logged, seen, options.pages)
+    assert steps.groups is not None
+    items, in_catalogue = len(trained.items), steps.groups.number >= 0
+    implied = None if declared else implied_items(steps, in_catalogue, items)
+    if implied is not None and not implied.passed:
+        doubts.forbidden.append(
+            f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
+            f"items to choose from, the run knows {items:,}: propensities are too small"
+        )
     if options.pages:
         steps = as_pages(steps, *_find_pages(logged))
     else:
@@ -165,17 +160,19 @@ def evaluate_off_policy(
         doubts.remarks.append(
             f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
-    if not evaluated.models.converged:
+    if not models.converged:
         doubts.remarks.append(
             "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
             "stopped: ignore FQE"
         )
     if per_step is not None and per_step.doubt:
         doubts.remarks.append(per_step.doubt)
-    declared = ""
-    if evaluated.estimated:
-        count, model = evaluated.estimated, evaluated.behavior
-        declared = f"with the propensities of {count:,} steps estimated ({model})"
+    columns = {
+        "seen_in_training": seen,
+        "dropped": logged.report["dropped"],
+        "unknown_item_rows": logged.unknown_items,
+        **models.columns(),
+    }
     return make_report(
         trained,
         rule,
@@ -184,16 +181,11 @@ def evaluate_off_policy(
         options,
         rows=len(steps.reward),
         doubts=doubts,
-        columns={
-            "seen_in_training": seen,
-            "dropped": logged.report["dropped"],
-            "unknown_item_rows": logged.unknown_items,
-            **evaluated.models.columns(),
-        },
+        columns=columns,
         segment=segment,
         declared=declared,
         fingerprint=store.record.fingerprint,
-        models=evaluated.models,
+        models=models,
         per_step=per_step,
     )
 
@@ -307,23 +299,9 @@ def _columns_of_evidence(verdict: Verdict, diagnosis: Diagnosis) -> dict[str, An
     }
 
 
-def _doubt_logs(
-    trained: TrainedPolicy,
-    logged: LoggedSessions,
-    evaluated: EvaluatedSteps,
-    seen: float | None,
-    pages: bool,
-) -> Doubts:
-    """What rows seen in training, unknown and dropped rows and the propensities' sum say."""
-    doubts = Doubts(seen_too_often(seen))
-    steps, items, dropped = evaluated.steps, len(trained.items), logged.report["dropped"]
-    assert steps.groups is not None
-    implied = None if evaluated.estimated else implied_items(steps, steps.groups.number >= 0, items)
-    if implied is not None and not implied.passed:
-        doubts.forbidden.append(
-            f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
-            f"items to choose from, the run knows {items:,}: propensities are too small"
-        )
+def _doubt_logs(logged: LoggedSessions, seen: float | None, pages: bool) -> Doubts:
+    """What rows seen in training, of unknown items, and dropped rows say."""
+    doubts, dropped = Doubts(seen_too_often(seen)), logged.report["dropped"]
     if seen is None:
         doubts.remarks.append(
             "the store that the run was trained on is gone or has changed: whether these logs were "
@@ -368,8 +346,8 @@ def collect_steps(
     rule: DecisionRule,
     seed: int,
     options: EstimateOptions = DEFAULTS,
-) -> EvaluatedSteps:
-    """Collect the logged steps, the policy's probabilities and models of its return.
+) -> tuple[LoggedSteps, ModelReport, str]:
+    """Collect the logged steps, in order, the policy's probabilities and models of its return.
 
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
     groups, lie on disk.
@@ -379,7 +357,7 @@ def collect_steps(
         seed: seed of the folds, item groups and samples.
 
     Returns:
-        The N logged steps, in order.
+        The steps, how good the models are, and which propensities are estimated; "" if none is.
 
     Raises:
         InputError: propensities are not probabilities, or there is only one user.
@@ -421,18 +399,16 @@ def collect_steps(
         inputs.append(batch_inputs)
         end = rows.stop
     columns: dict[str, Any] = {}
-    behavior, estimated = None, 0
-    grouped = one_hot.shape[1] > 1 and plain.unknown_propensities < len(items)
-    if grouped or options.estimate_propensities:
+    declared, unknown = "", plain.unknown_propensities
+    if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
         group = np.maximum(groups.number, 0)
         behavior = fit_behavior(inputs.states, items, group, plain.session, seed, plain.user)
         of_group = np.take_along_axis(groups.target, group[:, None], axis=1)[:, 0]
         columns["cluster_propensity"] = behavior.group
         columns["cluster_target"] = np.where(groups.number < 0, 0.0, of_group).clip(0, 1)
-    if behavior is not None and options.estimate_propensities:
-        estimated = plain.unknown_propensities
-        columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
+        if options.estimate_propensities and unknown:
+            declared = f"with the propensities of {unknown:,} steps estimated ({behavior})"
+            columns["propensity"] = np.where(np.isnan(propensity), behavior.item, propensity)
     reward, session = plain.reward, plain.session
     modelled, models = fit_models(inputs.chunks, reward, session, seed, plain.user, plain.discount)
-    steps = replace(plain, target=target, model=modelled, groups=groups, **columns)
-    return EvaluatedSteps(steps, models, behavior, estimated)
+    return replace(plain, target=target, model=modelled, groups=groups, **columns), models, declared

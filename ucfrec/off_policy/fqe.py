@@ -88,15 +88,24 @@ def fit_models(
         raise InputError("a model needs sessions of users other than the one it predicts")
     folds = (np.random.default_rng(seed).permutation(users) % min(FOLDS, users))[group][session]
     last = np.diff(session, append=len(sessions)) > 0
+    horizon = int(np.diff(np.flatnonzero(last), prepend=-1).max())
     with progress(2 * len(reward), "models", "steps") as bar:
-        sums = _sums(chunks, reward, folds, last, bar.update)
-        horizon = int(np.diff(np.flatnonzero(last), prepend=-1).max())
+        sums = _add_up(chunks, reward, folds, last, bar.update)
         fits = [
             sums.fit(fold, reward[folds != fold], horizon, discount)
             for fold in range(len(sums.rows))
         ]
-        modelled = _predicted(chunks, fits, folds, bar.update)
-    return modelled, _report(modelled, reward, last, discount, fits)
+        modelled = _predict(chunks, fits, folds, bar.update)
+    errors = reward + discount * np.where(last, 0.0, np.roll(modelled.v, -1)) - modelled.q
+    variance = float(((reward - reward.mean()) ** 2).mean())
+    left = float(((reward - modelled.logged_reward) ** 2).mean())
+    return modelled, ModelReport(
+        reward_r2=1 - left / variance if variance > 0 else 0.0,
+        td_loss=float((errors**2).mean()),
+        td_bias=float(errors.mean()),
+        iterations=max(fit.iterations for fit in fits),
+        converged=all(fit.converged for fit in fits),
+    )
 
 
 @dataclass(frozen=True)
@@ -125,6 +134,9 @@ class _Sums:
     def fit(self, fold: int, reward: Float64Array, horizon: int, discount: float) -> _Fit:
         """The models that know all folds but one.
 
+        The ridge penalty counts features by their root mean square, and gives all P of them
+        together the variance of the noise; the constant goes free.
+
         Args:
             reward: rewards of the steps of the other folds.
         """
@@ -132,36 +144,40 @@ class _Sums:
             sums.sum(axis=0) - sums[fold] for sums in (self.gram, self.follows, self.rewards)
         )
         rows = int(self.rows.sum() - self.rows[fold])
-        factor = cho_factor(gram + np.diag(_penalty(self.gram.sum(axis=0), int(self.rows.sum()))))
+        mean_square = np.diag(self.gram.sum(axis=0)) / int(self.rows.sum())
+        # A feature that is always 0 has no weight to find.
+        penalty: Float64Array = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
+        penalty[0] = 0.0
+        factor = cho_factor(gram + np.diag(penalty))
         weights = first = cho_solve(factor, rewards, check_finite=False)
         most = horizon * max(abs(reward.min()), abs(reward.max()))
         iterations, converged = 1, True
         while iterations < _ROUNDS * horizon:
             iterations += 1
-            before, target = weights, rewards + discount * (follows @ weights)
+            previous, target = weights, rewards + discount * (follows @ weights)
             weights = cho_solve(factor, target, check_finite=False)
             size = (weights @ gram @ weights / rows) ** 0.5
             if not size <= most:
                 # Root mean square above the largest possible return: it diverges.
-                weights, converged = before, False
+                weights, converged = previous, False
                 break
-            change = weights - before
+            change = weights - previous
             if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
                 break
         return _Fit(first, weights, iterations, converged)
 
 
-def _sums(
+def _add_up(
     chunks: Chunks,
     reward: Float64Array,
     folds: IntArray,
     last: BoolArray,
-    done: Callable[[int], object],
+    update: Callable[[int], object],
 ) -> _Sums:
     begin, sums = 0, None
     held: Float32Array | None = None
     for features, at_policy in chunks():
-        rows, width = len(features), features.shape[1]
+        rows, width = features.shape
         if sums is None:
             count = int(folds.max()) + 1
             gram, follows = np.zeros((2, count, width, width))
@@ -172,66 +188,37 @@ def _sums(
         later = at_policy[1:] if held is None else at_policy
         start = begin if held is None else begin - 1
         for fold in range(len(sums.rows)):
-            here = folds[begin:end] == fold
-            mine = features[here]
-            sums.gram[fold] += mine.T @ mine
-            sums.rewards[fold] += mine.T @ reward[begin:end][here].astype(np.float32)
+            inside = folds[begin:end] == fold
+            part = features[inside]
+            sums.gram[fold] += part.T @ part
+            sums.rewards[fold] += part.T @ reward[begin:end][inside].astype(np.float32)
             goes_on = (folds[start : end - 1] == fold) & ~last[start : end - 1]
             sums.follows[fold] += earlier[goes_on].T @ later[goes_on]
         held, begin = features[-1:], end
-        done(rows)
+        update(rows)
     assert sums is not None
     return sums
 
 
-def _predicted(
-    chunks: Chunks, fits: list[_Fit], folds: IntArray, done: Callable[[int], object]
+def _predict(
+    chunks: Chunks, fits: list[_Fit], folds: IntArray, update: Callable[[int], object]
 ) -> Modelled:
     """What the models say of every step."""
     reward_weights = np.stack([fit.reward for fit in fits], axis=1)
     q_weights = np.stack([fit.q for fit in fits], axis=1)
-    reward, q, v, at_logged = np.empty((4, len(folds)))
-    begin = 0
+    predictions, begin = np.empty((4, len(folds))), 0
     for features, at_policy in chunks():
-        rows = slice(begin, begin + len(features))
-        fold = folds[rows][:, None]
-        for into, inputs, weights in (
-            (reward, at_policy, reward_weights),
-            (at_logged, features, reward_weights),
-            (q, features, q_weights),
-            (v, at_policy, q_weights),
+        end = begin + len(features)
+        fold = folds[begin:end, None]
+        for row, inputs, weights in (
+            (0, at_policy, reward_weights),
+            (1, features, q_weights),
+            (2, at_policy, q_weights),
+            (3, features, reward_weights),
         ):
-            into[rows] = np.take_along_axis(inputs @ weights, fold, axis=1)[:, 0]
-        begin = rows.stop
-        done(len(features))
-    return Modelled(reward, q, v, at_logged)
-
-
-def _report(
-    modelled: Modelled,
-    reward: Float64Array,
-    last: BoolArray,
-    discount: float,
-    fits: list[_Fit],
-) -> ModelReport:
-    following = np.where(last, 0.0, np.roll(modelled.v, -1))
-    errors = reward + discount * following - modelled.q
-    spread = float(((reward - reward.mean()) ** 2).mean())
-    left = float(((reward - modelled.logged_reward) ** 2).mean())
-    return ModelReport(
-        reward_r2=1 - left / spread if spread > 0 else 0.0,
-        td_loss=float((errors**2).mean()),
-        td_bias=float(errors.mean()),
-        iterations=max(fit.iterations for fit in fits),
-        converged=all(fit.converged for fit in fits),
-    )
-
-
-def _penalty(gram: Float64Array, rows: int) -> Float64Array:
-    """(P,) penalty: features count by their root mean square, and the prior gives all P of them
-    together the variance of the noise; the constant goes free."""
-    mean_square = np.diag(gram) / rows
-    # A feature that is always 0 has no weight to find.
-    penalty: Float64Array = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
-    penalty[0] = 0.0
-    return penalty
+            values = np.take_along_axis(inputs @ weights, fold, axis=1)
+            predictions[row, begin:end] = values[:, 0]
+        begin = end
+        update(len(features))
+    reward, q, v, logged_reward = predictions
+    return Modelled(reward, q, v, logged_reward)

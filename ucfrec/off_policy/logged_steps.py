@@ -284,12 +284,9 @@ def _number_users(values: Any) -> Array:
         missing = int(np.sum(users != users))
         numbers = np.unique(users, return_inverse=True)[1]
     except TypeError:
-        raise InputError("users are missing or of several types; give all as text") from None
+        missing = 1
     if missing:
-        raise InputError(
-            f"user is missing at {missing:,} of {len(users):,} places; give an id to each, or "
-            "leave user out"
-        )
+        raise InputError("users are missing, or of several types: give all as text, or none")
     return np.asarray(numbers)
 
 
@@ -299,25 +296,21 @@ def _require_finite(name: str, values: Float64Array) -> None:
 
 
 def _check_probabilities(name: str, values: Float64Array, densities: bool) -> Float64Array:
-    """The probabilities without rounding errors above 1; the same array where there are none.
-
-    Raises:
-        InputError: some are out of range; only propensities may be NaN, above 0 otherwise.
-    """
+    """The probabilities without rounding errors above 1; the same array where there are none."""
     above = (values > 1) & (values <= 1 + _ROUNDING)
     if above.any() and not densities:
         values = np.where(above, 1.0, values)
-    inside, remedy = np.isfinite(values) if densities else values <= 1, ""
+    inside = np.isfinite(values) if densities else values <= 1
     if name in _TARGETS:
-        rule = f"probabilities of the evaluated policy lie between 0 and {'∞' if densities else 1}"
         outside = ~((values >= 0) & inside)
+        rule, remedy = "probabilities of the evaluated policy lie between 0 and 1", ""
     else:
+        outside = ~((values > 0) & inside | np.isnan(values))
         rule = (
             "propensities must be above 0 and at most 1, the probability of the item shown and not "
             "a density"
         )
         remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
-        outside = ~((values > 0) & inside) & ~np.isnan(values)
     if outside.any():
         raise InputError(
             f"{rule}; {outside.sum():,} of {len(values):,} are outside, the first is "

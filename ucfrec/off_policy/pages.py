@@ -21,7 +21,8 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import LoggedSteps
 
-ENOUGH_TO_NORMALISE = 1e-12
+_LEAST_RATIO = 1e-12
+"""Mean ratio of a position below which nothing is divided by it."""
 PAGE_MS = 10
 """Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""
 
@@ -51,7 +52,7 @@ def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = Non
             "of sessions of one step; prepare the logs with one session a row"
         )
     if page.shape != steps.session.shape:
-        raise InputError(f"page has shape {page.shape}, {len(steps.session)} steps are one each")
+        raise InputError(f"page has shape {page.shape} for {len(steps.session):,} steps")
     places = np.zeros(len(page)) if position is None else position
     order = np.lexsort((places, page))
     number = np.unique(page[order], return_inverse=True)[1]
@@ -78,18 +79,17 @@ def independent_terms(steps: LoggedSteps) -> dict[str, tuple[Float64Array, Float
     """Of each estimator under the independent model: the terms (S,) whose mean is the estimate, and
     what each page counts (S,), its mean ratio. Propensities of all steps are known."""
     ratios = steps.target / steps.propensity
+    rewards = steps.discounts * ratios * steps.reward
     counts = steps.per_session(ratios) / steps.lengths
-    rewards = steps.per_session(steps.discounts * ratios * steps.reward)
-    found = {"IIPS": (rewards, counts)}
-    # Mean over pages, by position, of ρ r γ^t, of ρ, and of there being such a position.
+    terms = {"IIPS": (steps.per_session(rewards), counts)}
+    # Means over pages, by position, of ρ, of ρ r γ^t over it, and of there being such a position.
     pages = len(steps.first)
-    above = np.bincount(steps.step, steps.discounts * ratios * steps.reward) / pages
     below = np.bincount(steps.step, ratios) / pages
-    if (below > ENOUGH_TO_NORMALISE).all():
-        there = np.bincount(steps.step) / pages
-        mean = above / below
-        # The estimate Σ_t there_t mean_t, plus each page's influence on it.
-        normal = (steps.discounts * steps.reward - mean[steps.step]) * ratios
-        influence = (there / below)[steps.step] * normal + mean[steps.step]
-        found["SNIIPS"] = (steps.per_session(influence), counts)
-    return found
+    if (below > _LEAST_RATIO).all():
+        mean = np.bincount(steps.step, rewards) / pages / below
+        positions = np.bincount(steps.step) / pages
+        # The estimate Σ_t positions_t mean_t, plus each page's influence on it.
+        beyond = (steps.discounts * steps.reward - mean[steps.step]) * ratios
+        influence = (positions / below)[steps.step] * beyond + mean[steps.step]
+        terms["SNIIPS"] = (steps.per_session(influence), counts)
+    return terms

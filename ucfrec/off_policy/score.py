@@ -103,17 +103,12 @@ def logged_sessions(
 
     The result is a context manager; the prepared logs are on disk until its block ends.
 
-    Rows of items that the run does not know are dropped and counted in the report; with
-    `keep_unknown` they stay, as item −1, and `LoggedSessions.unknown_items` counts them.
-
     Args:
         mapping: which columns of the logs mean what; what it leaves open is as in the training
             logs.
-        keep_unknown: keep rows whose item the run does not know.
+        keep_unknown: keep rows whose item the run does not know, as item −1, and count them in
+            `LoggedSessions.unknown_items`; else they are dropped and counted in the report.
         memory_limit: of the process while it reads, such as "2GB"; rows spill to disk.
-
-    Yields:
-        The prepared logs.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
@@ -128,12 +123,7 @@ def logged_sessions(
 def as_trained(
     trained: TrainedPolicy, mapping: LogMapping, memory_limit: str = "2GB"
 ) -> tuple[LogMapping, PrepareOptions]:
-    """How logs are read in the same way as the training logs of a policy.
-
-    Args:
-        mapping: which columns of the logs mean what; what it leaves open is as in the training
-            logs.
-    """
+    """The mapping and options that read logs as the training logs of a policy were read."""
     record = trained.record
     options = PrepareOptions(
         reward_of(trained),
@@ -156,49 +146,42 @@ def prepared_sessions(
 ) -> Iterator[LoggedSessions]:
     """`logged_sessions` of logs whose columns and options are given in full."""
     with scratch_folder(Path(gettempdir()), "logs") as scratch:
-        folder = scratch / "store"
-        like = trained.folder
-        report = prepare(files, mapping, folder, options, like=like, keep_unknown=keep_unknown)
+        folder, run = scratch / "store", trained.folder
+        report = prepare(files, mapping, folder, options, like=run, keep_unknown=keep_unknown)
         store = EpisodeStore.open(folder)
-        unknown = _unknown_items(store)
+        unknown = sum(int((items < 0).sum()) for (items,) in store.column_batches(schema.ITEM))
         if unknown == store.n_steps:
             raise InputError(
                 f"{files[0]}: in all {unknown:,} rows the item is not in the store of the run; "
                 "give logs of the same catalogue"
             )
-        _note_unknown_users(str(files[0]), store, report["users"], trained)
-        store = _as_seen(store, trained)
+        if len(trained.user_ids):
+            numbers = np.unique(store.episode_values(schema.USER))
+            strangers = report["users"] - int((numbers >= 0).sum())
+            about = schema.USER_ID, strangers, report["users"], "the run was trained on"
+            note_unknown(str(files[0]), *about)
+        store = _select_observations(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        store, rows = _with_history(trained, store, users, readable_store(trained))
+        store, rows = _add_history(trained, store, users, readable_store(trained))
         yield LoggedSessions(store, users, report, rows, unknown)
 
 
-def _with_history(
+def _add_history(
     trained: TrainedPolicy, store: EpisodeStore, users: Array, earlier: EpisodeStore | None
 ) -> tuple[EpisodeStore, UserRows]:
     """The sessions and all rows of their users; earlier rows of a session that goes on are a part
     of it, as in `recommend`. Session ids of the store are not kept: such sessions begin with the
     logs."""
     record = trained.record
-    rows = UserRows.of(store, users, None if earlier is None else _as_seen(earlier, trained))
-    by_id = record.session_by == schema.SESSION_ID
-    return store if by_id else rows.continued(record.session_gap_ms), rows
+    rows = UserRows.of(
+        store, users, None if earlier is None else _select_observations(earlier, trained)
+    )
+    if record.session_by != schema.SESSION_ID:
+        store = rows.continued(record.session_gap_ms)
+    return store, rows
 
 
-def _unknown_items(store: EpisodeStore) -> int:
-    """Number of steps that show an item which the run does not know."""
-    return sum(int((items < 0).sum()) for (items,) in store.column_batches(schema.ITEM))
-
-
-def _note_unknown_users(name: str, store: EpisodeStore, users: int, trained: TrainedPolicy) -> None:
-    """Warn of logs hardly any of whose users the run knows; nothing where it knows no users."""
-    if len(trained.user_ids):
-        numbers = np.unique(store.episode_values(schema.USER))
-        unknown = users - int((numbers >= 0).sum())
-        note_unknown(name, schema.USER_ID, unknown, users, "the run was trained on")
-
-
-def _as_seen(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
+def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
     """`store` with the columns of the observations that the policy sees."""
     if store.observation_size != trained.logged_observation_size:
         raise InputError(
@@ -222,9 +205,6 @@ def scored_steps(
         rule: the decision rule; None for the run's own.
         seen: rows of the users; items that a user was shown before a step are excluded there, as
             `recommend` and `serve` exclude them by default. None to exclude none.
-
-    Yields:
-        Batches of scored steps.
     """
     n_items = len(trained.items)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
@@ -233,11 +213,11 @@ def scored_steps(
         for begin in range(0, total, at_once):
             numbers = np.arange(begin, min(begin + at_once, total))
             episodes, steps = store.locate(numbers)
-            known, shown = logged_history(scorer, store, episodes, steps)
-            history = scorer.with_target(known)
+            logged, shown_items = logged_history(scorer, store, episodes, steps)
+            history = scorer.with_target(logged)
             query = scorer.query(history)
-            left_out = None if seen is None else _seen_items(seen, numbers, n_items)
-            scores = scorer.scores_of(query, history, left_out, shown)
+            excluded = None if seen is None else _find_seen_items(seen, numbers, n_items)
+            scores = scorer.scores_of(query, history, excluded, shown_items)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
                 episodes,
@@ -252,12 +232,13 @@ def scored_steps(
             bar.update(len(steps))
 
 
-def _seen_items(seen: UserRows, steps: IntArray, n_items: int) -> tuple[Tensor, Tensor]:
+def _find_seen_items(seen: UserRows, steps: IntArray, n_items: int) -> tuple[Tensor, Tensor]:
     """Rows (M,) and items (M,) of what users were shown before steps; none of a row in which no
     item would be left."""
     rows, items = seen.seen(steps)
-    known = items < n_items
-    rows, items = np.divmod(np.unique(rows[known] * n_items + items[known]), n_items)
+    in_catalogue = items < n_items
+    pairs = np.unique(rows[in_catalogue] * n_items + items[in_catalogue])
+    rows, items = np.divmod(pairs, n_items)
     some_left = np.bincount(rows, minlength=len(steps))[rows] < n_items
     return torch.from_numpy(rows[some_left]), torch.from_numpy(items[some_left])
 
@@ -282,19 +263,20 @@ def score(
         and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.items.ids
-    names = [schema.TIMESTAMP, schema.ITEM_ID, schema.REWARD]
-    names += [schema.PROPENSITY] if schema.PROPENSITY in store.record.columns else []
     for batch in scored_steps(trained, store, rule, logged.rows if filter_seen else None):
-        items = batch.items.unsqueeze(1)
-        chosen, scored = batch.log_probabilities.gather(1, items), batch.scores.gather(1, items)
-        columns = {schema.USER_ID: logged.users[batch.episodes], SESSION: batch.episodes}
-        for name in names:
-            if name == schema.ITEM_ID:
-                columns[name] = item_ids[items[:, 0].numpy()]
-            else:
-                columns[name] = store.step_values(name, batch.episodes, batch.steps)
-        columns[PROBABILITY] = chosen[:, 0].double().exp().numpy()
-        columns[RANK] = 1 + (batch.scores > scored).sum(1).numpy()
+        column, places = batch.items.unsqueeze(1), (batch.episodes, batch.steps)
+        columns = {
+            schema.USER_ID: logged.users[batch.episodes],
+            SESSION: batch.episodes,
+            schema.TIMESTAMP: store.step_values(schema.TIMESTAMP, *places),
+            schema.ITEM_ID: item_ids[batch.items.numpy()],
+            schema.REWARD: store.step_values(schema.REWARD, *places),
+        }
+        if schema.PROPENSITY in store.record.columns:
+            columns[schema.PROPENSITY] = store.step_values(schema.PROPENSITY, *places)
+        probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
+        columns[PROBABILITY] = probability.numpy()
+        columns[RANK] = 1 + (batch.scores > batch.scores.gather(1, column)).sum(1).numpy()
         columns[GREEDY] = item_ids[batch.scores.argmax(1).numpy()]
         yield pd.DataFrame(columns)
 
@@ -326,8 +308,9 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
     if not test.n_episodes:
         raise InputError(f"{store.path} has no test split; name later logs")
     users = test.episode_values(schema.USER)
-    before = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
-    sessions, rows = _with_history(first, _as_seen(test, first), users, store.select(before))
+    earlier = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
+    sessions = _select_observations(test, first)
+    sessions, rows = _add_history(first, sessions, users, store.select(earlier))
     return LoggedSessions(sessions, users, {"dropped": {}}, rows)
 
 
@@ -345,17 +328,14 @@ def require_items(trained: TrainedPolicy) -> None:
 
 
 def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
-    """Compute the share of logged rows that are in the run's training or validation data.
+    """The share of logged rows that are in the run's training or validation data; None if the run's
+    store has been moved, deleted or changed.
 
     Rows are the same if their user, item and time are. A refit was trained on its test split too.
 
     Args:
-        trained: the policy, with the record of its run.
         logged: a store that numbers users and items as the run's store does
             (`ucfrec.logs.prepare(like=…)`).
-
-    Returns:
-        The share, from 0 to 1, or None if the run's store has been moved, deleted or changed.
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
@@ -375,9 +355,9 @@ def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
     seen = np.zeros(len(keys), dtype=bool)
     # The training data may be far larger than the logs.
     for name in schema.SPLITS if trained.record.refit_of is not None else ("train", "validation"):
-        for learnt in _hash_store(store.split(name)):
-            places = np.minimum(np.searchsorted(keys, learnt), len(keys) - 1)
-            seen[places[keys[places] == learnt]] = True
+        for trained_keys in _hash_store(store.split(name)):
+            places = np.minimum(np.searchsorted(keys, trained_keys), len(keys) - 1)
+            seen[places[keys[places] == trained_keys]] = True
     return float(rows[seen].sum() / rows.sum())
 
 

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array, Float64Array, IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.parquet import require_regular
 from ucfrec.off_policy.diagnostics import MOST_LEFT_OUT
@@ -63,26 +63,6 @@ def evaluate_scored(
             "pages, estimated propensities and a reward range (of single steps) need the logs; "
             "leave --scored out"
         )
-    files = _find_files(paths, about_scores(trained, rule))
-    sessions = _sum_sessions(files, options)
-    rows = sum(pq.read_metadata(file).num_rows for file in files)
-    seen = _share_seen(trained, files, rows)
-    doubts = _doubt_unknown_items(files, rows)
-    doubts.forbidden += seen_too_often(seen)
-    return make_report(
-        trained,
-        rule,
-        sessions,
-        seed,
-        options,
-        rows=rows,
-        doubts=doubts,
-        columns={"seen_in_training": seen},
-    )
-
-
-def _find_files(paths: Sequence[Path], about: Mapping[str, str]) -> list[Path]:
-    """The files, in the order of their rows; checks what scored them."""
     files = [
         file
         for path in map(Path, paths)
@@ -90,49 +70,52 @@ def _find_files(paths: Sequence[Path], about: Mapping[str, str]) -> list[Path]:
     ]
     if not files:
         raise InputError(f"{paths[0]} has no .parquet file; name what ucfrec score wrote")
-    for file in files:
-        require_regular(file)
-        try:
-            columns = pq.read_schema(file)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{file} cannot be read ({one_line(str(error)):.200})") from None
-        if missing := [name for name in (*_KEYS, *_WEIGHED) if name not in columns.names]:
-            raise InputError(
-                f"{file} has no column {', '.join(missing)}; name what ucfrec score made of logs "
-                "with propensities"
-            )
-        metadata = columns.metadata or {}
-        for name, value in about.items():
-            if (scored := metadata.get(name.encode(), b"").decode(errors="replace")) != value:
-                raise InputError(
-                    f"{file} was scored with {name} {one_line(scored)!r:.80}, not {value!r}; name "
-                    "the same run, --checkpoint and decision rule as for ucfrec score"
-                )
-    return files
-
-
-def _doubt_unknown_items(files: Sequence[Path], rows: int) -> Doubts:
-    """What rows of items that the run does not know say: sessions lack them, where in the logs
-    they weigh 0.
-
-    Args:
-        rows: number of scored rows.
-    """
+    described = [_check_file(file, about_scores(trained, rule)) for file in files]
+    rows = sum(metadata.num_rows for metadata in described)
+    sessions = _sum_sessions(files, options)
+    seen = _share_seen(trained, files, rows)
     doubts = Doubts(remarks=["from scored rows: without models of the reward there is no DR"])
-    metadata = [pq.read_schema(file).metadata or {} for file in files]
-    counts = [values.get(UNKNOWN_ITEMS.encode(), b"") for values in metadata]
+    counts = [(metadata.metadata or {}).get(UNKNOWN_ITEMS.encode(), b"") for metadata in described]
     if not all(count.isdigit() for count in counts):
         doubts.remarks.append(
             "rows of items that the run does not know are not part of scored rows; where the logs "
             "have many, estimate from the logs"
         )
     elif unknown := sum(map(int, counts)):
-        many = unknown > MOST_LEFT_OUT * (rows + unknown)
-        (doubts.forbidden if many else doubts.remarks).append(
+        # In the logs they weigh 0; here sessions lack them.
+        much = unknown > MOST_LEFT_OUT * (rows + unknown)
+        (doubts.forbidden if much else doubts.remarks).append(
             f"{unknown:,} of {rows + unknown:,} rows show items that the run does not know, and "
             "are not part of scored rows: estimate from the logs, where they weigh 0"
         )
-    return doubts
+    doubts.forbidden += seen_too_often(seen)
+    columns = {"seen_in_training": seen}
+    return make_report(
+        trained, rule, sessions, seed, options, rows=rows, doubts=doubts, columns=columns
+    )
+
+
+def _check_file(file: Path, about: Mapping[str, str]) -> pq.FileMetaData:
+    """The metadata of a file that the run and rule scored."""
+    require_regular(file)
+    try:
+        described = pq.read_metadata(file)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{file} cannot be read ({one_line(str(error)):.200})") from None
+    columns = described.schema.names
+    if missing := [name for name in (*_KEYS, *_WEIGHED) if name not in columns]:
+        raise InputError(
+            f"{file} has no column {', '.join(dict.fromkeys(missing))}; name what ucfrec score "
+            "made of logs with propensities"
+        )
+    for name, value in about.items():
+        scored = (described.metadata or {}).get(name.encode(), b"").decode(errors="replace")
+        if scored != value:
+            raise InputError(
+                f"{file} was scored with {name} {one_line(scored)!r:.80}, not {value!r}; name the "
+                "same run, --checkpoint and decision rule as for ucfrec score"
+            )
+    return described
 
 
 def _read_batches(file: Path, names: Sequence[str]) -> Iterator[dict[str, Array]]:
@@ -196,18 +179,28 @@ def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[Logged
 
 
 def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedSteps:
-    """Each session as one step, with the session's return, weight and terms of the estimates."""
+    """Each session as one step, with its return, weight (unknown as its propensities are), and the
+    terms of PDIS and SNPDIS."""
     sums: StepSums | None = None
     for steps, _ in _read_steps(files, options.discount):
         if not steps.lacking.all():
             own = StepSums.of(steps.weighable, steps.weighable.reward)
             sums = own if sums is None else sums + own
-    parts = [
-        (users, *_sum_terms(steps, sums)) for steps, users in _read_steps(files, options.discount)
-    ]
-    if not parts:
+    columns: list[tuple[Array, ...]] = []
+    for steps, users in _read_steps(files, options.discount):
+        complete = ~steps.lacking
+        weights = np.full(len(complete), np.nan)
+        per_decision, by_step = np.zeros((2, len(complete)))
+        if complete.any() and sums is not None:
+            some = steps.weighable
+            weights[complete] = some.session_weights
+            per_decision[complete] = some.per_session(some.discounts * some.weights * some.reward)
+            if sums.totals.all():
+                by_step[complete] = normalise_by_step(some, some.reward, None, sums)
+        columns.append((users, steps.returns, weights, per_decision, by_step))
+    if not columns:
         raise InputError(f"{files[0]} has no rows; give logs with rows of known items to score")
-    users, returns, weights, per_decision, by_step = map(np.concatenate, zip(*parts, strict=True))
+    users, returns, weights, per_decision, by_step = map(np.concatenate, zip(*columns, strict=True))
     heaviest = np.fmax(weights, 1.0)
     return LoggedSteps(
         session=np.arange(len(users)),
@@ -218,27 +211,6 @@ def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedStep
         per_decision=per_decision,
         by_step=by_step,
     )
-
-
-def _sum_terms(
-    steps: LoggedSteps, sums: StepSums | None
-) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-    """(S,) returns, weights (NaN where a propensity is unknown), and the terms of PDIS and SNPDIS
-    (0 there).
-
-    Args:
-        sums: of all sessions with all their propensities; None if there are none.
-    """
-    complete = ~steps.lacking
-    weights = np.full(len(complete), np.nan)
-    per_decision, by_step = np.zeros((2, len(complete)))
-    if complete.any() and sums is not None:
-        some = steps.weighable
-        weights[complete] = some.session_weights
-        per_decision[complete] = some.per_session(some.discounts * some.weights * some.reward)
-        if sums.totals.all():
-            by_step[complete] = normalise_by_step(some, some.reward, None, sums)
-    return steps.returns, weights, per_decision, by_step
 
 
 def _share_seen(trained: TrainedPolicy, files: Sequence[Path], rows: int) -> float | None:

@@ -116,16 +116,13 @@ def select(
 
 def _find_regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
     """Upper end of how much better than the first any other may be."""
-    others = np.delete(terms, first, axis=1) - terms[:, [first]]
-    if not others.shape[1]:
+    lead = np.delete(terms, first, axis=1) - terms[:, [first]]
+    if not lead.shape[1]:
         return 0.0
-    resamples = resample(others, np.ones_like(others), user, seed)
-    # Candidates that never differ are neither better nor worse.
-    differs = resamples.spreads
-    if not differs.any():
-        return 0.0
+    resamples = resample(lead, np.ones_like(lead), user, seed)
     upper = resamples.value + _critical(-_studentise(resamples)) * resamples.error
-    return float(max(upper[differs].max(), 0.0))
+    # Candidates that never differ are neither better nor worse.
+    return float(upper[resamples.spreads].max(initial=0.0))
 
 
 def _studentise(resamples: Resamples) -> Float64Array:
@@ -158,21 +155,21 @@ class Choice:
 
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
-        found: dict[str, Any] = {"selection": self.headline}
-        standings = () if self.selection is None else self.selection.standings
-        one = next((each for each in standings if each.name == name), None)
-        if self.selection is None or one is None:
-            return found
-        found |= {
-            "band_low": one.low,
-            "band_high": one.high,
-            "probability_best": one.probability_best,
-            "rank": one.rank,
+        columns: dict[str, Any] = {"selection": self.headline}
+        if self.selection is None or name in self.excluded:
+            return columns
+        standings = self.selection.standings
+        standing = next(row for row in standings if row.name == name)
+        columns |= {
+            "band_low": standing.low,
+            "band_high": standing.high,
+            "probability_best": standing.probability_best,
+            "rank": standing.rank,
             "candidates": len(standings),
         }
-        if one is self.selection.chosen:
-            found |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
-        return found
+        if standing is self.selection.chosen:
+            columns |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
+        return columns
 
 
 def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
@@ -185,30 +182,24 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
     Raises:
         InputError: the candidates' runs read the logs as different sessions or rewards.
     """
-    _require_same_sessions(reports)
-    standing = {name: one for name, one in reports.items() if one.verdict.reliable}
-    excluded = {
-        name: "; ".join(one.verdict.reasons)
-        for name, one in reports.items()
-        if not one.verdict.reliable
-    }
-    terms = {name: one.terms for name, one in standing.items() if one.terms is not None}
-    if not terms:
-        return Choice(None, excluded)
-    user = next(iter(standing.values())).user
-    columns = np.stack(list(terms.values()), axis=1)
-    return Choice(select(list(terms), columns, seed, user), excluded)
-
-
-def _require_same_sessions(reports: "Mapping[str, OffPolicyReport]") -> None:
-    (first, one), *others = reports.items()
-    for name, other in others:
-        if len(other.returns) != len(one.returns) or not np.allclose(other.returns, one.returns):
+    first, *names = reports
+    returns = reports[first].returns
+    for name in names:
+        again = reports[name].returns
+        if len(again) != len(returns) or not np.allclose(again, returns):
             raise InputError(
                 f"{first} and {name} read these logs as different sessions or rewards (their "
                 "stores were prepared in different ways), so their estimates cannot be compared; "
                 "evaluate them one at a time"
             )
+    verdicts = {name: report.verdict for name, report in reports.items()}
+    excluded = {name: "; ".join(v.reasons) for name, v in verdicts.items() if not v.reliable}
+    terms = {name: report.terms for name, report in reports.items() if name not in excluded}
+    columns = [values for values in terms.values() if values is not None]
+    if not columns:
+        return Choice(None, excluded)
+    user = reports[first].user
+    return Choice(select(list(terms), np.stack(columns, axis=1), seed, user), excluded)
 
 
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
@@ -220,19 +211,16 @@ def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
         candidates: of each, what it is made of, e.g. run, target return and rule.
     """
     differing = [
-        key for key in candidates[0] if len({str(one[key]) for one in candidates}) > 1
+        key for key in candidates[0] if len({str(parts[key]) for parts in candidates}) > 1
     ] or list(candidates[0])[:1]
-    columns = [_parts(key, [one[key] for one in candidates]) for key in differing]
-    return [", ".join(parts) for parts in zip(*columns, strict=True)]
 
+    def describe(key: str, value: object, digits: int) -> str:
+        if value is None:
+            return f"largest {key} expected"
+        return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)
 
-def _parts(key: str, values: Sequence[object]) -> list[str]:
-    """What the names say of one part of all candidates."""
-    short, full = ([_part(key, value, digits) for value in values] for digits in (6, 17))
-    return short if len(set(short)) == len(set(values)) else full
-
-
-def _part(key: str, value: object, digits: int) -> str:
-    if value is None:
-        return f"largest {key} expected"
-    return f"{key} {value:.{digits}g}" if isinstance(value, float) else str(value)
+    short, full = (
+        [", ".join(describe(key, parts[key], digits) for key in differing) for parts in candidates]
+        for digits in (6, 17)
+    )
+    return short if len(set(short)) == len(short) else full

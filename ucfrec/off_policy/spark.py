@@ -59,11 +59,11 @@ def score_with_spark(
     require_items(trained)
     columns, options = as_trained(trained, mapping)
     assert options.reward is not None
-    given = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
+    log = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
         run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
         part = _ScorePart(run, folder.absolute(), memory_limit, rule, filter_seen)
-        sessions = by_users(given, folder.parent, master, part)
+        sessions = by_users(log, folder.parent, master, part)
         number_sessions(folder, sessions)
     return sum(sessions)
 
@@ -98,17 +98,12 @@ def number_sessions(folder: Path, sessions: Sequence[int]) -> None:
         folder: of the parts.
         sessions: number of each part's sessions, in the order of the names.
     """
-    before = 0
+    first = 0
     for file, count in zip(sorted(folder.iterdir()), sessions, strict=True):
-        if before:
-            _shift(file, before)
-        before += count
-
-
-def _shift(file: Path, by: int) -> None:
-    with atomic_file(file) as scratch, pq.ParquetFile(file) as source:
-        place = source.schema_arrow.get_field_index(SESSION)
-        with pq.ParquetWriter(scratch, source.schema_arrow) as writer:
-            for batch in source.iter_batches():
-                shifted = pc.add(batch.column(place), pa.scalar(by, pa.int64()))
-                writer.write_batch(batch.set_column(place, SESSION, shifted))
+        with atomic_file(file) as scratch, pq.ParquetFile(file) as source:
+            place = source.schema_arrow.get_field_index(SESSION)
+            with pq.ParquetWriter(scratch, source.schema_arrow) as writer:
+                for batch in source.iter_batches():
+                    numbers = pc.add(batch.column(place), pa.scalar(first, pa.int64()))
+                    writer.write_batch(batch.set_column(place, SESSION, numbers))
+        first += count

@@ -67,19 +67,19 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
         for name in reads:
             if name.casefold() not in names:
                 raise _missing(table, what, name)
-        used = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
+        read_columns = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
         try:
             sql = f"({expression}\n)"
-            kind = _type_of(connection, sql, {name: columns[name] for name in used})
+            kind = _type_of(connection, sql, {name: columns[name] for name in read_columns})
         except duckdb.BinderException:
-            truth = {name for name in used if columns[name] == "BOOLEAN"}
+            truth = {name for name in read_columns if columns[name] == "BOOLEAN"}
             if not truth:
                 raise
             sql = f"({cast_truth_values(connection, expression, truth)}\n)"
-            kind = _type_of(connection, sql, {name: columns[name] for name in used})
+            kind = _type_of(connection, sql, {name: columns[name] for name in read_columns})
     except (duckdb.Error, NotScalarError) as error:
         raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
-    return Bound(sql, kind, used, False)
+    return Bound(sql, kind, read_columns, False)
 
 
 def _type_of(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping[str, str]) -> str:

@@ -21,11 +21,10 @@ test: .venv/dev  ## Set up and run the tests, all but the slow ones.
 test-slow: .venv/dev  ## The slow tests: trainings and simulations that take many seconds each.
 	$(PYTEST) --dist worksteal -m slow $$(grep -rl --include "test_*.py" mark.slow tests)
 
-# SCALE is a share of the cases. What build/torture.jsonl has for this code is not measured again.
+# SCALE is a share of the cases.
 SCALE ?= 1
 torture: .venv/dev  ## Kill, interrupt, corrupt, fuzz and starve the commands; print a table.
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE) \
-	  --results build/torture.jsonl
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.torture --scale $(SCALE)
 
 lint: .venv/dev  ## Style.
 	$(BIN)/ruff check .

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from tests.support import killed_run
 from tests.support.signals import wait_until_handled
-from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
@@ -263,16 +262,6 @@ def test_the_loop(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is nan"):
         linear_fit(tmp_path / "b", float("nan"))
     assert torch.equal(torch.get_rng_state(), after)
-
-
-@pytest.mark.parametrize("kind", ["tangent", "noise"])
-def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
-    config = resolve_config("ucf", None, {"crm.epochs": 1, "csg.epochs": 1, "csg.kind": kind})
-    tables = (config.crm, config.csg, config.augment)
-    with unnoticed():
-        counterfactual_augmentation(
-            store.split("train"), store.split("validation"), *tables, tmp_path, 0
-        )
 
 
 @pytest.mark.parametrize("name", ["ucf", "dt", "edt4rec"])

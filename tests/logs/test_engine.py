@@ -145,7 +145,7 @@ def test_inputs_are_read(closed: duckdb.DuckDBPyConnection, inputs: list[Path]) 
     assert closed.execute(f"FROM read_csv('{inputs[1]}')").fetchall() == [(1,), (2,)]
 
 
-NAMES = "a [1] b* c? it's é {1,2} x\\y"
+NAMES = "[1] b* it's é {1,2} x\\y"
 
 
 @pytest.mark.parametrize(
@@ -191,11 +191,11 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     folder.mkdir()
     with engine([], folder, "60MB") as connection:
         connection.execute(
-            "CREATE TABLE t AS SELECT range AS i, md5(range::TEXT) AS s FROM range(800000)"
+            "CREATE TABLE t AS SELECT range AS i, md5(range::TEXT) AS s FROM range(400000)"
         )
         rows = connection.execute(
             "SELECT i, row_number() OVER (PARTITION BY i % 7 ORDER BY s) FROM t "
-            "ORDER BY s LIMIT 5 OFFSET 700000"
+            "ORDER BY s LIMIT 5 OFFSET 300000"
         ).fetchall()
         assert len(rows) == 5
         assert [path.is_dir() for path in sorted(folder.iterdir())] == [False, True]

@@ -32,8 +32,9 @@ class End:
 
     @property
     def lines(self) -> list[str]:
-        """Lines on stderr but those of progress and of counting."""
-        return [line for line in self.printed.splitlines() if not line.startswith("benchmark")]
+        """Lines on stderr but notes and those of counting."""
+        quiet = ("benchmark", "ucfrec: note")
+        return [line for line in self.printed.splitlines() if not line.startswith(quiet)]
 
     @property
     def traceback(self) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.torture.children import Running, command, leftovers
-from tests.torture.made import Inputs, Job
+from tests.torture.inputs import Inputs, Job
 
 _BY_A_LIBRARY = (127, -signal.SIGABRT, -signal.SIGSEGV)
 """How libraries in C++ and the C library end a process that gets no memory, without asking us."""
@@ -210,8 +210,8 @@ def _write_hostile(place: Path) -> int:
         "decimal": table(reward=pa.array([10**30] * rows, pa.decimal128(38, 0))),
         "binary ids": table(user_id=pa.array([b"\xff\x00"] * rows)),
     }
-    for name, each in tables.items():
-        pq.write_table(each, place / f"{name}.parquet")
+    for name, table_of_name in tables.items():
+        pq.write_table(table_of_name, place / f"{name}.parquet")
     unfolds = pa.table({k: np.full(10_000_000, int(v[0].as_py())) for k, v in plain.items()})
     pq.write_table(unfolds, place / "unfolds.parquet", row_group_size=10_000_000)
     return 0

@@ -21,12 +21,7 @@ from ucfrec.evaluation.ranking import (
     rank_steps,
     rankers_named,
 )
-from ucfrec.evaluation.ranking_baselines import (
-    PolicyRanker,
-    RewardRanker,
-    baselines,
-    recent_rankers,
-)
+from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -73,7 +68,7 @@ def ranking_rows(
     Args:
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
-        train: the store of those rows; None excludes item-kNN and ALS.
+        train: the store of those rows; None excludes all that learn from single rows.
         users: (E,) identifier of the user of each of its episodes.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.
@@ -130,9 +125,10 @@ def _rankers(
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    others = baselines(counts, fitted_on, seed, liked)
-    if train is not None and fitted_on is not None:
-        others += recent_rankers(fitted_on, train, liked)
+    held_out = None
+    if train is not None and (validation := train.split("validation")).n_episodes:
+        held_out = train.split("train"), validation
+    others = baselines(counts, fitted_on, seed, liked, held_out)
     return rankers_named([*policies, *model, *others]), liked
 
 

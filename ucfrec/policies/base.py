@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -91,18 +91,6 @@ class PolicyConfig:
         return ReturnToGo(definition, self.discount, self.horizon)
 
 
-RESERVED_ATTRIBUTES: Final = frozenset(
-    {"config", "state_mean", "state_std", "return_scale", "lowest_return_to_go", "values"}
-)
-"""What `SequencePolicy` sets on its instances, and no subclass may replace."""
-RESERVED: Final = RESERVED_ATTRIBUTES | {
-    *("head", "normalized", "imitation", "act_and_features", "max_return", "exposed"),
-    "_exposed_last",
-}
-"""Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
-by another with the same methods."""
-
-
 class SequencePolicy(nn.Module, ABC):
     """Predicts a_t from returns-to-go and states up to t and actions before t.
 
@@ -142,20 +130,6 @@ class SequencePolicy(nn.Module, ABC):
         )
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute.
-
-        Raises:
-            InputError: `name` is reserved, and set already.
-        """
-        taken = name in RESERVED_ATTRIBUTES and name in {*self.__dict__, *self._buffers}
-        if taken or (name == "values" and name in self._modules):
-            raise InputError(
-                f"{type(self).__name__} sets {name!r}, which ucfrec.policies.base.SequencePolicy "
-                "keeps for itself; choose another name"
-            )
-        super().__setattr__(name, value)
 
     @classmethod
     def training_view(

@@ -31,9 +31,9 @@ BUILT_IN: Final = {
     "gsasrec": "gsasrec:GSASRecPolicy",
     "bc": "bc:BCPolicy",
     "popular": "popular:PopularPolicy",
-    "item-rate": "item_rate:ItemRatePolicy",
-    "recent-clicks": "recent:RecentClicksPolicy",
-    "recent-rate": "recent:RecentRatePolicy",
+    "item-rate": "popular:ItemRatePolicy",
+    "recent-clicks": "popular:RecentClicksPolicy",
+    "recent-rate": "popular:RecentRatePolicy",
     "bpr": "bpr:BPRPolicy",
     "boosted": "boosted:BoostedPolicy",
     "item-knn": "item_knn:ItemKNNPolicy",
@@ -54,13 +54,28 @@ def policy_class(name: str) -> "type[SequencePolicy]":
         InputError: no policy has this name, it cannot be imported, or it is not a `SequencePolicy`
             whose `Config` is a table of settings.
     """
+    # Imported here so that listing the names does not need torch.
+    from ucfrec.policies.base import PolicyConfig, SequencePolicy
+    from ucfrec.settings import is_table
+
     if isinstance(name, str) and name in BUILT_IN:
         module, _, title = BUILT_IN[name].partition(":")
         built_in: type[SequencePolicy] = getattr(import_module(f"ucfrec.policies.{module}"), title)
         return built_in
     if name not in policy_names():
         raise InputError(f"no policy is called {name!r}; choose from {', '.join(policy_names())}")
-    return _checked(name, load_plugin("policies", name))
+    policy_type: object = load_plugin("policies", name)
+    if not (isinstance(policy_type, type) and issubclass(policy_type, SequencePolicy)):
+        raise InputError(
+            f"the policy {name!r} is installed as {policy_type!r}, which is not a class derived "
+            "from ucfrec.policies.base.SequencePolicy"
+        )
+    if not (issubclass(policy_type.Config, PolicyConfig) and is_table(policy_type.Config)):
+        raise InputError(
+            f"the policy {name!r} is configured by {policy_type.Config!r}, which is not derived "
+            "from ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
+        )
+    return policy_type
 
 
 def policy_package(name: str) -> str:
@@ -82,26 +97,3 @@ def note_ignored(name: str) -> None:
             InputNote,
             stacklevel=2,
         )
-
-
-def _checked(name: str, policy_type: object) -> "type[SequencePolicy]":
-    from ucfrec.policies.base import RESERVED, PolicyConfig, SequencePolicy
-    from ucfrec.settings import is_table
-
-    if not (isinstance(policy_type, type) and issubclass(policy_type, SequencePolicy)):
-        raise InputError(
-            f"the policy {name!r} is installed as {policy_type!r}, which is not a class derived "
-            "from ucfrec.policies.base.SequencePolicy"
-        )
-    own = policy_type.__mro__[: policy_type.__mro__.index(SequencePolicy)]
-    if taken := sorted(RESERVED.intersection(n for each in own for n in vars(each))):
-        raise InputError(
-            f"the policy {name!r} defines {', '.join(taken)}, which "
-            "ucfrec.policies.base.SequencePolicy keeps for itself; choose another name"
-        )
-    if not (issubclass(policy_type.Config, PolicyConfig) and is_table(policy_type.Config)):
-        raise InputError(
-            f"the policy {name!r} is configured by {policy_type.Config!r}, which is not derived "
-            "from ucfrec.policies.base.PolicyConfig under @ucfrec.settings.settings_table"
-        )
-    return policy_type

@@ -28,8 +28,7 @@ from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_wit
 from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.checks import require_sound, require_whole
-from ucfrec.policies.registry import BUILT_IN, note_ignored
+from ucfrec.policies.registry import note_ignored
 from ucfrec.processes import random_state_kept
 from ucfrec.progress import phase
 from ucfrec.runs.config import Config
@@ -47,8 +46,6 @@ from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import (
     begin,
     new_policy,
-    policy_sizes,
-    rebuilt,
     require_startable,
     training_views,
 )
@@ -136,7 +133,6 @@ def train_run(
             fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
-        _require_whole(run.policy, run.train, config)
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.copy_with(augmentation=augmentation, policy=fit)
         if run.logged.has_items and config.rule.choose and not chosen:
@@ -172,8 +168,6 @@ def _prepare_inputs(
         note_ignored(config.policy_name)
     policy = new_policy(train, config)
     if distributed.leads():
-        require_sound(policy, train, config.policy_name)
-        _require_whole(policy, train, config)
         if not (out / RUN).exists():
             begin(store, train, validation, out, config, about)
         record = RunRecord.read(out).reopen(out, INPUTS)
@@ -196,13 +190,6 @@ def _prepare_inputs(
         *(record, out, config, shared, device),
         *(logged, held_out, view, validation, policy.to(device)),
     )
-
-
-def _require_whole(policy: SequencePolicy, train: EpisodeStore, config: Config) -> None:
-    """Check that the file of a plug-in's policy will have all of it, `require_whole`."""
-    if config.policy_name not in BUILT_IN:
-        other = rebuilt(policy, config, policy_sizes(train))
-        require_whole(policy, other, train, config.policy_name)
 
 
 def _augment(

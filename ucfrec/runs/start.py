@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -23,7 +22,6 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.checks import blamed
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import random_state_kept
@@ -158,24 +156,6 @@ def begin(
         RunRecord.of(entries, out / RUN).seal(scratch)
 
 
-@random_state_kept()
-def rebuilt(policy: SequencePolicy, config: Config, sizes: Mapping[str, int]) -> SequencePolicy:
-    """Another policy with the parameters and buffers of `policy`, in evaluation mode.
-
-    Raises:
-        InputError: what the policy wants to keep is no tensor.
-    """
-    state = policy.state_dict()
-    if strange := [key for key, value in state.items() if not isinstance(value, Tensor)]:
-        raise InputError(
-            f"the policy {config.policy_name!r} keeps {strange[0]}, which is no tensor; use "
-            "register_buffer"
-        )
-    other = policy_class(config.policy_name)(config.policy, sizes)
-    other.load_state_dict(state)
-    return other.to(policy.state_mean.device).eval()
-
-
 def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
     """What the returns-to-go of a run on `store` count."""
     return config.policy.returns(store.record.source.session_by)
@@ -232,14 +212,13 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     """An untrained policy with the normalisation and item embeddings of `train`.
 
     Raises:
-        InputError: the policy does not support the actions of `train`, or is a plug-in that fails.
+        InputError: the policy does not support the actions of `train`.
     """
     torch.manual_seed(config.seed)
     base = train.without_augmentation()
-    with blamed(config.policy_name, "__init__(config, sizes) or start_from"):
-        policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
-        _set_statistics(policy, base, config)
-        policy.start_from(base)
+    policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
+    _set_statistics(policy, base, config)
+    policy.start_from(base)
     return policy
 
 

@@ -1,4 +1,4 @@
-"""Clicks and click rate that forget: the half-life that fits the validation rows, and its use."""
+"""Popular items, rates and recent ones: what they equal, and the half-life that fits best."""
 
 import math
 from pathlib import Path
@@ -9,9 +9,17 @@ import pytest
 import torch
 
 from tests.support.logs import store_of
+from tests.support.tagged import tagged_store
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.policies.recent import HALF_LIVES, RecentClicksPolicy, RecentRatePolicy, decayed_counts
+from ucfrec.errors import InputError
+from ucfrec.policies.popular import (
+    HALF_LIVES,
+    RecentClicksPolicy,
+    RecentRatePolicy,
+    decayed_counts,
+    liked_rates,
+)
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -48,13 +56,13 @@ def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
 def test_the_half_life_is_short_where_tastes_change(
     tmp_path: Path, kind: type[RecentRatePolicy]
 ) -> None:
-    found = {}
+    hours = {}
     for drifts in (False, True):
         (tmp_path / str(drifts)).mkdir()
         store = drifting_store(tmp_path / str(drifts), drifts)
-        found[drifts] = kind.best(store.split("train"), store.split("validation"))
-    assert found[True] <= 24 < 96 <= found[False]
-    assert {*found.values()} <= {*HALF_LIVES}
+        hours[drifts] = kind.best_half_life(store.split("train"), store.split("validation"))
+    assert hours[True] <= 24 < 96 <= hours[False]
+    assert {*hours.values()} <= {*HALF_LIVES}
 
 
 def test_a_run_beats_the_item_rate_where_tastes_change(tmp_path: Path) -> None:
@@ -69,3 +77,44 @@ def test_a_run_beats_the_item_rate_where_tastes_change(tmp_path: Path) -> None:
         shown = np.isin(test.column("item"), best)
         rates.append(liked[shown].mean())
     assert min(rates[1:]) > rates[0] + 0.1
+
+
+def test_rates_are_shrunk_to_the_mean() -> None:
+    counts = TrainingCounts(torch.tensor([0, 10, 1000]), torch.tensor([0, 10, 100]), 5)
+    mean = 110.5 / 1011
+    expected = [mean, (10 + 10 * mean) / 20, (100 + 10 * mean) / 1010]
+    np.testing.assert_allclose(liked_rates(counts), expected, rtol=1e-6)
+
+
+def test_the_best_item_is_shown_first_and_tags_are_left_out(tmp_path: Path) -> None:
+    store = tagged_store(tmp_path)
+    settings = ["rule.choose=false", "rule.default_tag_window=2", "policy.context=4"]
+    train_run(store, tmp_path / "run", resolve_config("item-rate", None, settings))
+    trained = TrainedPolicy.load(tmp_path / "run")
+    assert trained.rule.tag_window == 2
+    counts = TrainingCounts.of(store.split("train"))
+    order = liked_rates(counts).argsort(descending=True, stable=True)
+    actor = trained.actor(3)
+    actor.begin(np.arange(3))
+    shown = []
+    for _ in range(3):
+        items, _ = actor.act(np.zeros((3, 0), dtype=np.float32), np.ones(3, dtype=bool))
+        actor.observe(items, np.ones(3, dtype=np.float32))
+        assert len(set(items)) == 1
+        shown.append(int(np.flatnonzero(trained.item_ids == items[0])[0]))
+    assert shown[0] == int(order[0])
+    tags = store.item_states.tags
+    seen = [set(tags[item].tolist()) - {-1} for item in shown]
+    assert not seen[0] & seen[1]
+    assert not seen[2] & (seen[0] | seen[1])
+
+
+def test_vectors_have_no_rate(tmp_path: Path) -> None:
+    columns = {
+        "observation": np.zeros((8, 2), dtype=np.float32),
+        "action": np.zeros((8, 1), dtype=np.float32),
+        "reward": np.arange(8, dtype=np.float32),
+    }
+    store = EpisodeStore.write(tmp_path / "store", columns, np.array([4, 4]))
+    with pytest.raises(InputError, match="store of items"):
+        train_run(store, tmp_path / "run", resolve_config("item-rate", None, []))

@@ -1,13 +1,15 @@
-"""Small inputs of every kind, the commands that use them, and what their outputs say."""
+"""Small inputs of every kind, the commands that use them, and digests of their outputs."""
 
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from tests.torture.children import run_first
 
@@ -32,7 +34,7 @@ class Job:
 
 
 class Inputs:
-    """Logs, a store and a run, made once."""
+    """Logs, a store, a run and small files of other kinds, made once."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -46,6 +48,44 @@ class Inputs:
             end = run_first(*arguments)
             if end.status:
                 raise SystemExit(f"{arguments[0]}: {end.printed}")
+        self.single_run, self.texts = folder / "single-run", folder / "texts"
+        # Readers of a run with a refit read the files of the refit.
+        shutil.copytree(self.run, self.single_run, ignore=shutil.ignore_patterns("refit"))
+        self.texts.mkdir()
+        self._write_texts()
+
+    def _write_texts(self) -> None:
+        from tests.support.control_files import hopper_like, write_hdf5
+
+        def write(name: str, text: str) -> None:
+            (self.texts / name).write_text(text)
+
+        row = {"suite": "s", "table": "t", "task": "a", "method": "m", "policy": "p"}
+        values = {"metric": "r", "metrics": {"r": 1.0}, "interval": [0.5, 1.5]}
+        write("rows.jsonl", f"{json.dumps({**row, **values, 'conditions': {'b': 1}})}\n" * 3)
+        options = ("--episodes", 20, "--json", self.texts / "evaluations.json")
+        end = run_first("evaluate", self.run, "--env", "synthetic-catalog", *options)
+        if end.status:
+            raise SystemExit(f"evaluate: {end.printed}")
+        write(
+            "mapping.toml",
+            'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'
+            'timestamp = "seconds * 1000"\n[[item_features]]\nfiles = ["items.csv"]\n'
+            'key = "iid"\ncolumns = ["ln(1 + price)"]\n',
+        )
+        write("empty.toml", "")
+        write(
+            "config.toml",
+            "[train]\nsteps = 20\nlearning_rate = 1e-3\n[policy]\ndim = 16\n"
+            "[csg]\nband = [0.2, 0.5]\n",
+        )
+        write("setting.txt", "train.steps=200")
+        count = np.arange(40)
+        frame = pd.DataFrame({"user_id": count % 5, "item_id": (count % 7).astype(str)})
+        frame["timestamp"], frame["reward"] = 1_700_000_000_000 + count, count % 2
+        frame.to_csv(self.texts / "log.csv", index=False)
+        frame.to_parquet(self.texts / "log.parquet")
+        write_hdf5(self.texts / "hopper.hdf5", hopper_like())
 
     @property
     def log(self) -> Path:
@@ -75,8 +115,8 @@ class Inputs:
         ]
 
 
-def said(path: Path) -> str:
-    """A digest of what an output says, without times and names of folders."""
+def digest_output(path: Path) -> str:
+    """A digest of an output, without times and names of folders."""
     digest = hashlib.sha256()
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     for file in files:
@@ -115,11 +155,11 @@ def _numbers(value: object) -> object:
         timed = ("seconds", "wall_time_s", "checksum", "per_second", "memory", "commit", "command")
         return {k: _numbers(v) for k, v in value.items() if not any(t in k for t in timed)}
     if isinstance(value, list):
-        return [_numbers(each) for each in value]
+        return [_numbers(entry) for entry in value]
     return value if isinstance(value, int | float) else None
 
 
-def temporary(folder: Path) -> Path:
+def use_temporary(folder: Path) -> Path:
     """Make a folder inside `folder` the one for temporary files."""
     import tempfile
 

@@ -1,0 +1,434 @@
+"""Every reader on files with flipped bits and with other content.
+
+A reader gets a copy of the folder that it reads. A flipped bit must be found, or change nothing
+that is read. After a mutation the record of the folder is sealed again: its checksums would find
+every change. The first mutant is no file of any kind; a reader that does not refuse it reads
+another file.
+"""
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.torture.children import Running
+from tests.torture.inputs import Inputs
+
+BATCH, SECONDS, MEMORY = 200, 20, 24 * 2**30
+"""Cases of a process; seconds after which reading one file counts as hung; bytes."""
+WORDS = (
+    *(b"\x00", b"\xff\xfe", b"\n", b"\r\n", b'"', b"{", b"}", b"[" * 3000, b"null", b"NaN", b"'"),
+    *(b"1e999", b"-1", b"9" * 5000, b"4294967296", b"true", b"../../etc/passwd", b"\x1b[31m"),
+    *(b"\x89HDF\r\n\x1a\n", b"\xff" * 8, b"\x00" * 64, b"\xe2\x80\xa8", b"int64", b"'|O'"),
+)
+VALUES: tuple[Any, ...] = (
+    *(None, True, -1, 0, 10**12, 10**400, 1.5, float("nan"), float("inf"), "", "a\nb", "../x", "1"),
+    *([], [[]], [1, "a"], {}, {"a": {}}, "\ud800", "\x1b[2J", [0] * 1000),
+)
+SHAPES = ((0,), (0, 0), (1,), (7,), (3, 5), (1, 2, 3), (10_000,), (300, 300))
+DTYPES = ("float64", "float16", "int64", "uint8", "bool", "int32")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A file, and the code that reads it."""
+
+    name: str
+    folder: Path
+    file: str
+    """Path in the folder."""
+    read: Callable[[Path], object]
+    """Reads the folder."""
+    slow: bool = False
+
+
+class HungError(Exception):
+    """A reader took too long."""
+
+
+def share_cases(cases: int, readers: list[Reader]) -> dict[str, int]:
+    """Number of cases of each reader; slow ones have a tenth of the others' share."""
+    weights = {reader.name: 1 if reader.slow else 10 for reader in readers}
+    return {name: -(-cases * weight // sum(weights.values())) for name, weight in weights.items()}
+
+
+def run_batches(work: Callable[[range, Path], int], folder: Path, cases: int) -> Counter[str]:
+    """The counts that `work` writes as JSON for so many cases, in processes of their own."""
+    counts, answer = Counter[str](), folder / "counts.json"
+    for begin in range(0, cases, BATCH):
+        answer.unlink(missing_ok=True)
+        numbers = range(begin, min(begin + BATCH, cases))
+        end = Running(partial(work, numbers, answer)).wait(SECONDS * 60)
+        if answer.exists():
+            counts.update(json.loads(answer.read_text()))
+        if end.status:
+            last = end.printed.strip().splitlines()[-1:] or [""]
+            counts[f"a process ended with {end.status}: {last[0][:150]}"] += 1
+    return counts
+
+
+def fuzz(reader: Reader, folder: Path, cases: int, seed: int) -> Counter[str]:
+    """Give one reader the file, one that is none, and `cases` mutated ones."""
+    return run_batches(partial(_fuzz_batch, reader, folder / "fuzz", seed), folder, cases)
+
+
+def flip_bits(reader: Reader, folder: Path, cases: int, seed: int) -> Counter[str]:
+    """Flip single bits of all files of the reader's folder, and read everything of it."""
+    return run_batches(partial(_flip_batch, reader, folder / "flips", seed), folder, cases)
+
+
+def _fuzz_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    signal.signal(signal.SIGALRM, _raise_hung)
+    warnings.simplefilter("ignore")
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(reader.folder, place, copy_function=os.link)
+    path, content = place / reader.file, (reader.folder / reader.file).read_bytes()
+    counts = Counter[str]()
+    if (outcome := _read(reader, place, Counter[str]())) != "harmless":
+        counts[f"the file as it was written is {outcome}"] += 1
+    _write_file(path, b"\xff[{\n\x00")
+    _reseal(place, reader.file)
+    if (outcome := _read(reader, place, Counter[str]())) != "found":
+        counts[f"no file of any kind is {outcome}"] += 1
+    for number in numbers:
+        generator = random.Random(f"{seed} {reader.name} {number}")
+        _write_file(path, _mutate(generator, content, path, number))
+        _reseal(place, reader.file)
+        counts[_read(reader, place, counts)] += 1
+    answer.write_text(json.dumps(counts))
+    return 0
+
+
+def _raise_hung(*_: object) -> None:
+    raise HungError
+
+
+def _read(reader: Reader, place: Path, counts: Counter[str]) -> str:
+    """What came of reading: "found", "harmless" or a fault."""
+    from ucfrec.errors import InputError
+
+    signal.alarm(SECONDS)
+    try:
+        reader.read(place)
+    except InputError as error:
+        if not str(error).isprintable():
+            counts["not one printable line"] += 1
+        return "found"
+    except HungError:
+        return "hung"
+    except Exception as error:
+        return f"{type(error).__name__} {_find_place(error)}: {str(error)[:80]}"
+    finally:
+        signal.alarm(0)
+    return "harmless"
+
+
+def _find_place(error: BaseException) -> str:
+    """The last place in ucfrec that the error passed."""
+    place, step = "", error.__traceback__
+    while step is not None:
+        file = step.tb_frame.f_code.co_filename
+        if "ucfrec" in file:
+            place = f"{Path(file).name}:{step.tb_lineno}"
+        step = step.tb_next
+    return place
+
+
+def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
+    from ucfrec.errors import InputError
+
+    expected, counts = reader.read(reader.folder), Counter[str]()
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(reader.folder, place)
+    files = sorted(path for path in place.rglob("*") if path.is_file() and path.stat().st_size)
+    for number in numbers:
+        generator = random.Random(f"{seed} {reader.name} {number}")
+        path = generator.choice(files)
+        content = path.read_bytes()
+        flipped = bytearray(content)
+        flipped[generator.randrange(len(flipped))] ^= 1 << generator.randrange(8)
+        _write_file(path, bytes(flipped))
+        name = path.relative_to(place).as_posix()
+        try:
+            same = _are_equal(reader.read(place), expected)
+        except InputError as error:
+            counts["found" if "\n" not in str(error) else "several lines"] += 1
+        except Exception as error:
+            counts[f"{name}: {type(error).__name__}: {str(error)[:80]}"] += 1
+        else:
+            counts["harmless" if same else f"{name}: silently another content"] += 1
+        _write_file(path, content)
+    answer.write_text(json.dumps(counts))
+    return 0
+
+
+def _are_equal(first: Any, second: Any) -> bool:
+    if isinstance(first, list):
+        return len(first) == len(second) and all(map(_are_equal, first, second))
+    if isinstance(first, np.ndarray):
+        return first.dtype == second.dtype and first.tobytes() == second.tobytes()
+    return bool(first == second)
+
+
+def _write_file(path: Path, content: bytes) -> None:
+    """Write a new file: the old one may be a link, or still mapped."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
+
+
+def _reseal(place: Path, file: str) -> None:
+    """Put the checksum of a changed file into the record of its folder, if that lists it."""
+    from ucfrec.files.atomic import read_json, write_sealed_json
+    from ucfrec.files.record import file_checksum
+
+    for record in (place / "run.json", place / "meta.json"):
+        if record.exists() and record.name != file:
+            value = read_json(record)
+            if file in value["files"]:
+                path = place / file
+                value["files"][file] = [path.stat().st_size, file_checksum(path)]
+                record.unlink()
+                write_sealed_json(record, value)
+
+
+def _mutate(generator: random.Random, content: bytes, path: Path, number: int) -> bytes:
+    if number % 4:
+        if path.suffix == ".safetensors":
+            return _mutate_tensors(generator, content, path)
+        if path.suffix == ".json":
+            return _mutate_json(generator, content)
+        if path.suffix == ".jsonl":
+            lines = content.splitlines()
+            at = generator.randrange(len(lines))
+            lines[at] = _mutate_json(generator, lines[at]).replace(b"\n", b" ")
+            return b"\n".join(lines) + b"\n"
+    return _mutate_bytes(generator, content)
+
+
+def _mutate_json(generator: random.Random, content: bytes) -> bytes:
+    """JSON in which values are other ones, without its own checksum."""
+    value = json.loads(content)
+    if isinstance(value, dict):
+        value.pop("checksum", None)
+    for _ in range(generator.choice((1, 1, 1, 2, 5))):
+        place, key, inner = None, None, value
+        while isinstance(inner, dict | list) and inner:
+            place = inner
+            key = generator.choice([*inner] if isinstance(inner, dict) else range(len(inner)))
+            inner = place[key]
+            if generator.random() < 0.4:
+                break
+        if place is None:
+            return json.dumps(generator.choice(VALUES)).encode()
+        if generator.random() < 0.2:
+            del place[key]
+        else:
+            place[key] = deepcopy(generator.choice(VALUES))
+    return json.dumps(value).encode()
+
+
+def _mutate_tensors(generator: random.Random, content: bytes, path: Path) -> bytes:
+    """Safetensors with other tensors and metadata, as ucfrec would write them."""
+    import torch
+
+    from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+
+    copy = path.with_name("original.safetensors")
+    _write_file(copy, content)
+    tensors, metadata = load_tensors(copy)
+    for _ in range(generator.choice((1, 1, 2, 4))):
+        name = generator.choice([*tensors] or ["new"])
+        tensor = tensors.pop(name, torch.zeros(3))
+        match generator.randrange(7):
+            case 0:
+                continue
+            case 1:
+                tensors[name + "s"] = tensor
+            case 2:
+                tensor = tensor.to(getattr(torch, generator.choice(DTYPES)))
+            case 3:
+                tensor = tensor.reshape(-1)
+            case 4:
+                tensor = tensor[: len(tensor) // 2] if tensor.dim() else tensor.unsqueeze(0)
+            case 5:
+                number = generator.choice((-1, 0, 100, float("nan"), float("inf")))
+                if tensor.is_floating_point() or isinstance(number, int):
+                    boolean = tensor.dtype == torch.bool
+                    tensor = torch.full_like(tensor, number != 0 if boolean else number)
+            case 6:
+                tensor = torch.zeros(generator.choice(SHAPES), dtype=tensor.dtype)
+        tensors[name] = tensor.clone()
+    if generator.random() < 0.4:
+        changed = json.loads(_mutate_json(generator, json.dumps(metadata).encode()))
+        metadata = changed if isinstance(changed, dict) else {"changed": changed}
+    save_tensors(copy, tensors, metadata)
+    mutant = copy.read_bytes()
+    copy.unlink()
+    return mutant
+
+
+def _mutate_bytes(generator: random.Random, content: bytes) -> bytes:
+    changed = bytearray(content)
+    for _ in range(generator.choice((1, 1, 2, 4, 16))):
+        at = generator.randrange(len(changed) + 1)
+        if generator.random() < 0.5:
+            at = min(at, generator.randrange(256))  # headers lie at the beginning
+        word = generator.choice(WORDS)
+        match generator.randrange(5):
+            case 0:
+                changed[at : at + 1] = bytes([generator.randrange(256)])
+            case 1:
+                changed[at:at] = word
+            case 2:
+                del changed[at : at + generator.choice((1, 4, 100))]
+            case 3:
+                del changed[at:]
+            case 4:
+                changed[at : at + len(word)] = word
+    return bytes(changed)
+
+
+def list_readers(inputs: Inputs) -> list[Reader]:
+    """The readers of every kind of file."""
+    from ucfrec.files.parquet import read_ids
+    from ucfrec.fitting.checkpoint import load_tensors
+    from ucfrec.fitting.metrics_log import read_metrics
+    from ucfrec.logs.mapping import read_mapping
+    from ucfrec.logs.prepare import validate
+    from ucfrec.reporting.page import write_report
+    from ucfrec.results.rows_file import read_results, read_rows
+    from ucfrec.runs.config import resolve_config
+    from ucfrec_control.data.d4rl import read_d4rl
+
+    store, run, texts = inputs.store, inputs.single_run, inputs.texts
+
+    def report(folder: Path) -> object:
+        return write_report(folder.with_name("out.html"), [folder])
+
+    def report_results(folder: Path) -> object:
+        return write_report(folder / "out.html", [inputs.run], [folder / "evaluations.json"])
+
+    def read_setting(folder: Path) -> object:
+        text = (folder / "setting.txt").read_bytes().decode("utf-8", "replace")
+        return resolve_config(overrides=[text])
+
+    def read_log(name: str) -> Callable[[Path], object]:
+        return lambda folder: validate([folder / name], read_mapping(folder / "empty.toml"))
+
+    return [
+        *(
+            Reader(file, store, file, read_store)
+            for file in (
+                *("meta.json", "item_states.safetensors", "users.parquet", "items.parquet"),
+                *("shard-00000/reward.npy", "shard-00000/offsets.npy"),
+            )
+        ),
+        *(
+            Reader(f"run: {file}", run, file, act, slow=True)
+            for file in (
+                *("run.json", "decision_rule.json", "policy/best.safetensors", "items.parquet"),
+                *("reward_model/item_reward.safetensors", "item_states.safetensors"),
+                *("training_counts.safetensors", "training_returns.safetensors"),
+            )
+        ),
+        Reader("report: run.json", run, "run.json", report, slow=True),
+        Reader("report: samples.json", run, "samples.json", report, slow=True),
+        Reader(
+            "last.safetensors",
+            run,
+            "policy/last.safetensors",
+            lambda folder: load_tensors(folder / "policy/last.safetensors"),
+        ),
+        Reader(
+            "metrics.jsonl",
+            run,
+            "policy/metrics.jsonl",
+            lambda folder: read_metrics(folder / "policy"),
+        ),
+        Reader(
+            "ids",
+            run,
+            "items.parquet",
+            lambda folder: read_ids(folder / "items.parquet", "item_id"),
+        ),
+        Reader("rows.jsonl", texts, "rows.jsonl", lambda folder: read_rows(folder / "rows.jsonl")),
+        Reader(
+            "evaluations.json",
+            texts,
+            "evaluations.json",
+            lambda folder: read_results(folder / "evaluations.json"),
+        ),
+        Reader("report: evaluations.json", texts, "evaluations.json", report_results, slow=True),
+        Reader(
+            "mapping.toml",
+            texts,
+            "mapping.toml",
+            lambda folder: read_mapping(folder / "mapping.toml"),
+        ),
+        Reader(
+            "config.toml",
+            texts,
+            "config.toml",
+            lambda folder: resolve_config(file=folder / "config.toml"),
+        ),
+        Reader("setting", texts, "setting.txt", read_setting),
+        Reader("log.csv", texts, "log.csv", read_log("log.csv"), slow=True),
+        Reader("log.parquet", texts, "log.parquet", read_log("log.parquet"), slow=True),
+        Reader(
+            "hopper.hdf5", texts, "hopper.hdf5", lambda folder: read_d4rl(folder / "hopper.hdf5")
+        ),
+    ]
+
+
+def read_store(path: Path) -> list[Any]:
+    """All that ucfrec reads of a store."""
+    from ucfrec import schema
+    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.files.parquet import read_ids
+
+    store = EpisodeStore.open(path)
+    columns = [store.step_values(name, *store.all_steps()) for name in store.record.columns]
+    episodes = [store.episode_values(name) for name in schema.EPISODE_DTYPES]
+    states = store.item_states
+    store.record.checksums(path).require_small()
+    ids = [read_ids(path / f"{name}.parquet", f"{name[:-1]}_id") for name in ("users", "items")]
+    used = ("n_steps", "n_episodes", "reward", "fingerprint", "source", "splits")
+    meta = {name: getattr(store.record, name) for name in used}
+    return [*columns, *episodes, states.embeddings.numpy(), states.reward_high, *ids, repr(meta)]
+
+
+def read_run(path: Path) -> list[Any]:
+    """All that ucfrec reads of a run."""
+    from ucfrec.fitting.metrics_log import read_metrics
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    parts: list[Any] = []
+    for checkpoint in ("best", "last"):
+        trained = TrainedPolicy.load(path, checkpoint)
+        parts += [tensor.numpy() for tensor in trained.policy.state_dict().values()]
+        parts += [trained.item_ids, trained.user_ids]
+    used = ("config", "sizes", "return_quantiles", "reward", "fingerprint", "train_steps")
+    parts.append(repr({name: getattr(trained.record, name) for name in used}))
+    return [*parts, repr(read_metrics(path / "policy"))]
+
+
+def act(path: Path) -> object:
+    """Load the policy of a run, and let it act."""
+    from ucfrec.runs.trained_policy import TrainedPolicy
+
+    trained = TrainedPolicy.load(path)
+    observations = np.zeros((2, trained.record.observation_size), dtype=np.float32)
+    return trained.actor(2).act(observations, np.array([True, False]))

@@ -13,9 +13,9 @@ import pytest
 
 from ucfrec.errors import InputError
 from ucfrec.files.locks import SCRATCH
-from ucfrec.logs import LogMapping, PrepareOptions, prepare, validate
+from ucfrec.logs import LogMapping, PrepareOptions, validate
 from ucfrec.logs.engine import engine
-from ucfrec.logs.tables import Table, glob_pattern, open_tables, text
+from ucfrec.logs.tables import open_tables, text
 
 SECRET = "the content of a file that was not named"
 
@@ -181,11 +181,6 @@ def test_relative_and_linked_paths_are_read(
     assert not list(Path().iterdir())
 
 
-def test_a_pattern_finds_one_file() -> None:
-    assert glob_pattern(Path("a/[1]*?.csv")) == "a/[[]1][*][?].csv"
-    assert "read_parquet(['it''s.parquet'], " in Table((Path("it's.parquet"),), ()).sql
-
-
 def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     folder = tmp_path / "it's a folder"
     folder.mkdir()
@@ -232,27 +227,6 @@ def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
         options = PrepareOptions(reward=reward)
         assert validate([tmp_path / "log.parquet"], LogMapping(), options)["steps"] == rows
     assert [path.name for path in tmp_path.iterdir()] == ["log.parquet"]
-
-
-def test_an_output_folder_needs_no_opening(tmp_path: Path) -> None:
-    """`users.parquet` and `items.parquet` are written although DuckDB may not write there."""
-    rows = 40
-    frame = pd.DataFrame(
-        {
-            "user_id": [f"u{n % 7}" for n in range(rows)],
-            "item_id": [n % 5 for n in range(rows)],
-            "timestamp": [1_700_000_000_000 + n for n in range(rows)],
-            "reward": [n % 3 for n in range(rows)],
-        }
-    )
-    frame.to_parquet(tmp_path / "log.parquet")
-    out = tmp_path / "a store's [folder]"
-    prepare([tmp_path / "log.parquet"], LogMapping(), out)
-    users = pd.read_parquet(out / "users.parquet")
-    assert list(users["user_id"]) == [f"u{n}" for n in range(7)]
-    assert list(users.columns) == ["user_id", "train_count"]
-    report = prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "again", like=out)
-    assert report["steps"] == rows
 
 
 def test_every_connection_is_closed_to_the_environment() -> None:

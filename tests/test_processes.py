@@ -13,10 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from tests.support import killed_run
 from tests.support.signals import wait_until_handled
+from ucfrec.counterfactual.augmentation import counterfactual_augmentation
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulated_store import simulated_store
+from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -215,6 +222,19 @@ def unnoticed() -> Iterator[None]:
     assert drawn == (random.random(), float(np.random.random()))  # noqa: NPY002
 
 
+def linear_fit(folder: Path, rate: float = 0.1) -> nn.Linear:
+    module = nn.Linear(2, 1)
+
+    def loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return nn.functional.dropout(module(batch)).square().mean() * rate, {}
+
+    def draw(generator: np.random.Generator) -> Tensor:
+        return torch.from_numpy(generator.random((4, 2), dtype=np.float32))
+
+    fit(module, draw, loss, LoopConfig(steps=4, validate_every=2), folder, seed=1)
+    return module
+
+
 def test_what_is_kept_is_kept_when_it_raises_too() -> None:
     def spoil() -> None:
         random.seed(0)
@@ -228,6 +248,33 @@ def test_what_is_kept_is_kept_when_it_raises_too() -> None:
         random_state_kept()(spoil)()
 
 
+def test_the_loop(tmp_path: Path) -> None:
+    with unnoticed():
+        state = torch.get_rng_state()
+        module = nn.Linear(2, 1)
+        after = torch.get_rng_state()
+        assert not torch.equal(state, after)
+        torch.set_rng_state(state)
+        fitted = linear_fit(tmp_path / "a")
+        assert torch.equal(torch.get_rng_state(), after)
+        torch.set_rng_state(state)
+    assert not torch.equal(fitted.weight, module.weight)
+    torch.manual_seed(5)
+    with pytest.raises(InputError, match="is nan"):
+        linear_fit(tmp_path / "b", float("nan"))
+    assert torch.equal(torch.get_rng_state(), after)
+
+
+@pytest.mark.parametrize("kind", ["tangent", "noise"])
+def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
+    config = resolve_config("ucf", None, {"crm.epochs": 1, "csg.epochs": 1, "csg.kind": kind})
+    tables = (config.crm, config.csg, config.augment)
+    with unnoticed():
+        counterfactual_augmentation(
+            store.split("train"), store.split("validation"), *tables, tmp_path, 0
+        )
+
+
 @pytest.mark.parametrize("name", ["ucf", "dt", "edt4rec"])
 def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: str) -> None:
     quick = {"policy.cql_steps": 3} if name == "edt4rec" else {}
@@ -237,6 +284,19 @@ def test_a_run_and_reading_it_back(store: EpisodeStore, tmp_path: Path, name: st
         new_policy(store, config)
         train_run(store, tmp_path / "run", config)
         TrainedPolicy.load(tmp_path / "run")
+
+
+@pytest.mark.parametrize("environment", ["synthetic-catalog"])
+def test_collecting_and_evaluating(environment: str, tmp_path: Path) -> None:
+    at = Environment(environment)
+    with unnoticed():
+        simulated_store(at, tmp_path, 60, 0)
+    config = resolve_config("bc", None, {"train.steps": 2, "policy.dim": 8})
+    train_run(EpisodeStore.open(tmp_path / "store"), tmp_path / "run", config)
+    trained = TrainedPolicy.load(tmp_path / "run")
+    with unnoticed():
+        evaluate_policy(at, trained, "bc", 20, 0)
+        evaluate_behavior(at, "mixture", 20, 0)
 
 
 def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(

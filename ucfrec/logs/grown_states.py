@@ -20,8 +20,8 @@ from ucfrec.logs.items import (
     EXPOSURE,
     PRIOR_COUNT,
     TrainingSteps,
-    join_steps,
-    predict_from_features,
+    joined_steps,
+    predicted_from_features,
     steps_of_shards,
 )
 from ucfrec.logs.prepare import PreparedLog
@@ -77,7 +77,7 @@ def _extended(old: Float32Array, features: sparse.csr_matrix | None, counts: Int
     mean = old[known].mean(axis=0) if len(known) else np.zeros(old.shape[1])
     rows = np.tile(mean, (len(counts), 1)).astype(np.float64)
     if features is not None and len(known) and old.shape[1]:
-        rows += predict_from_features(features, known, old[known] - mean, counts[known])
+        rows += predicted_from_features(features, known, old[known] - mean, counts[known])
         # Of an id without any feature nothing is predicted.
         rows[np.diff(features.indptr) == 0] = mean
     rows[: len(old)] = old
@@ -98,7 +98,7 @@ def _moved(
     """
     if not shown.any():
         return vectors
-    new = join_steps(steps)
+    new = joined_steps(steps)
     _, rows = np.unique(new.users, return_inverse=True)
     liking = np.clip((new.rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
     weights = sparse.csr_matrix(

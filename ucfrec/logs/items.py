@@ -54,7 +54,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         held.append(batch)
         if sum(len(batch.users) for batch in held) < BLOCK_STEPS:
             continue
-        joined = join_steps(held)
+        joined = joined_steps(held)
         changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
         if not len(changes):
             held = [joined]
@@ -63,7 +63,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         yield _part(joined, slice(end))
         held = [_part(joined, slice(end, None))]
     if held:
-        yield join_steps(held)
+        yield joined_steps(held)
 
 
 def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSteps]:
@@ -91,7 +91,7 @@ def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSte
             begin = end
 
 
-def join_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
+def joined_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
     """The steps of all batches as one."""
     return TrainingSteps(
         np.concatenate([batch.users for batch in batches]),
@@ -231,14 +231,14 @@ def item_embeddings(
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
     combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
-        combined = predict_from_features(features, trained, cooccurrence, counts)
+        combined = predicted_from_features(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
 
 
-def predict_from_features(
+def predicted_from_features(
     features: sparse.csr_matrix,
     trained: IntArray,
     cooccurrence: Float64Array,

@@ -136,11 +136,11 @@ def check_arguments(
         signature = inspect.signature(function)
 
         @wraps(function)
-        def call(*args: _Parameters.args, **named: _Parameters.kwargs) -> _Result:
+        def call(*args: _Parameters.args, **keywords: _Parameters.kwargs) -> _Result:
             try:
-                bound = signature.bind(*args, **named)
+                bound = signature.bind(*args, **keywords)
             except TypeError:
-                return function(*args, **named)  # raises the same with the function's name
+                return function(*args, **keywords)  # raises the same with the function's name
             for name, value in bound.arguments.items():
                 if name in checks and not (
                     value is None and signature.parameters[name].default is None

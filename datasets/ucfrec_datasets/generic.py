@@ -34,30 +34,30 @@ def _resolve(
 
 
 def official_files(
-    paths: Sequence[str | Path], log: str, others: Collection[str]
+    paths: Sequence[str | Path], log: str, features: Collection[str]
 ) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """The logs among files and folders of a release, and the files that may hold features.
 
     Args:
         log: name of the log's file in the release; another file is a log if it is named by itself.
-        others: names of the other files in the release.
+        features: names of the other files in the release.
 
     Raises:
         InputError: there is no log.
     """
-    named = log_files(paths)
+    files = log_files(paths)
     folders = [Path(path) for path in paths if Path(path).is_dir()]
     logs = tuple(
         file
-        for file in named
-        if stem(file) == log or (stem(file) not in others and file.parent not in folders)
+        for file in files
+        if stem(file) == log or (stem(file) not in features and file.parent not in folders)
     )
     if not logs:
         raise InputError(
-            f"no log among {len(named)} file(s) such as {named[0]}; name a folder or file with "
+            f"no log among {len(files)} file(s) such as {files[0]}; name a folder or file with "
             f"{log}, or the log by itself"
         )
-    return logs, (*named, *log_files([logs[0].parent]))
+    return logs, (*files, *log_files([logs[0].parent]))
 
 
 def official_table(

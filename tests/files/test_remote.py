@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -148,20 +147,6 @@ def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, nam
         with local_paths(argparse.Namespace(log=Input("memory://names-that-lead-out"))):
             raise AssertionError("the block must not run")
     system.rm(folder, recursive=True)
-
-
-def test_whole_files_are_copied_both_ways(tmp_path: Path, place: str) -> None:
-    n = 3_000
-    rewards = np.random.default_rng(0).normal(size=n).astype(np.float32)
-    steps = {"reward": rewards, "item": np.zeros(n), "timestamp": np.arange(n)}
-    EpisodeStore.write(tmp_path / "store", steps, np.full(n // 10, 10), shard_steps=n // 2)
-    with local_paths(argparse.Namespace(out=Output(f"{place}/store"))) as options:
-        shutil.copytree(tmp_path / "store", options.out)
-    with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
-        copies = {p.relative_to(options.store) for p in options.store.rglob("*") if p.is_file()}
-        for name in copies:
-            assert (options.store / name).read_bytes() == (tmp_path / "store" / name).read_bytes()
-    assert len(copies) == sum(path.is_file() for path in (tmp_path / "store").rglob("*"))
 
 
 def test_a_file_that_changes_meanwhile_is_an_error(

@@ -37,9 +37,6 @@ def rewards_of(columns: dict[str, object], reward: str, folder: Path) -> list[fl
     return found
 
 
-NARROW = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
-
-
 OVERFLOWING = {
     "a * b": [10_000.0, 30.0],
     "a * a * a * a * a": [1e10, 243.0],
@@ -52,8 +49,8 @@ OVERFLOWING = {
     ("kind", "reward"),
     [
         *(("int8", reward) for reward in OVERFLOWING),
-        *((kind, "a * a * a * a * a") for kind in NARROW[1:]),
-        *((kind, "a - 2 * b") for kind in NARROW if kind.startswith("u")),
+        *((kind, "a * a * a * a * a") for kind in ("int32", "uint64")),
+        *((kind, "a - 2 * b") for kind in ("uint8", "uint32")),
     ],
 )
 def test_integers_of_any_width_do_not_overflow(kind: str, reward: str, tmp_path: Path) -> None:
@@ -66,22 +63,11 @@ def test_lists_of_narrow_integers_do_not_overflow(tmp_path: Path) -> None:
     assert rewards_of({"n": counts}, "n[1] * n[2]", tmp_path) == [10_000.0, 6.0]
 
 
-def test_narrow_seconds_are_times(tmp_path: Path) -> None:
-    frame = pd.DataFrame({"user_id": 1, "item_id": [2, 3], "reward": [0.0, 1.0]})
-    frame["seconds"] = np.array([START // 1000] * 2, dtype="int32")
-    frame.to_parquet(tmp_path / "log.parquet")
-    mapping = LogMapping({"timestamp": "seconds * 1000"})
-    (batch,) = read_histories([tmp_path / "log.parquet"], mapping, "reward", last=2)
-    assert batch["timestamps"][0].as_py() == [START, START]
-
-
 @pytest.mark.parametrize(
     ("reward", "wanted"),
     [
         ("x", [0.25, 1.0]),
         ("x > 0.5", [0.0, 1.0]),
-        ("NOT x > 0.5", [1.0, 0.0]),
-        ("x BETWEEN 0.5 AND 100", [0.0, 1.0]),
         ("if(x > 0.5, 2, 1)", [1.0, 2.0, 1.0, 1.0]),
         ("coalesce(x, 7)", [0.25, 1.0, 7.0, 7.0]),
         ("if(isnan(x), 7, x)", [0.25, 1.0, 7.0, 7.0]),
@@ -94,7 +80,6 @@ def test_narrow_seconds_are_times(tmp_path: Path) -> None:
         ("if(isnan(y), 7, y)", [0.75, 1.0, 7.0, 2.0]),
         ("clicks / views > 0.1", [1.0, 0.0, 1.0]),
         ("coalesce(clicks / views, 7)", [7.0, 0.5, 0.0, 1.5]),
-        ("ln(views)", [0.6931472, 0.0, 0.6931472]),
         ("ln(views) > 0.5", [1.0, 0.0, 1.0]),
         ("ln(views) + ln(views)", [1.3862944, 0.0, 1.3862944]),
         ("least(ln(views), 5)", [0.6931472, 0.0, 0.6931472]),
@@ -170,8 +155,6 @@ def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
     ("first", "later", "reward", "wanted"),
     [
         ("1", "0.25", "x", 0.25),
-        ("1", "25e-2", "x", 0.25),
-        ("1", "2.0", "x", 2.0),
         ("2024-01-01", "2024-01-01 12:30:00", "hour(x::TIMESTAMP)", 12.0),
         ("2024-01-01 00:00:00", "2024-01-01 12:30:00+02:00", "hour(x::TIMESTAMP)", 10.0),
     ],
@@ -201,7 +184,7 @@ def test_the_line_is_named_where_an_identifier_is_also_in_an_expression(tmp_path
         list(read_histories([path], mapping, "1", last=1))
 
 
-@pytest.mark.parametrize("later", ["u7", "99999999999999999999", "9" * 100_000])
+@pytest.mark.parametrize("later", ["u7", "9" * 100_000])
 def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
     path = csv_of(tmp_path, "visit", "1", later)
     with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet") as caught:

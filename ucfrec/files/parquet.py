@@ -120,12 +120,12 @@ def read_ids(path: Path, column: str) -> Array:
 
 
 def write_frames(
-    out: Path, frames: "Iterable[pd.DataFrame]", about: Mapping[str, str] | None = None
+    out: Path, frames: "Iterable[pd.DataFrame]", metadata: Mapping[str, str] | None = None
 ) -> int:
     """Write `frames` one after the other as a single Parquet file, atomically.
 
     Args:
-        about: added to the metadata of the schema.
+        metadata: added to the metadata of the schema.
 
     Returns:
         The number of rows.
@@ -137,8 +137,8 @@ def write_frames(
     with atomic_file(out) as scratch:
         for frame in frames:
             table = pa.Table.from_pandas(frame, preserve_index=False)
-            metadata = {**(table.schema.metadata or {}), **(about or {})}
-            table = table.replace_schema_metadata(metadata)
+            entries = {**(table.schema.metadata or {}), **(metadata or {})}
+            table = table.replace_schema_metadata(entries)
             writer = writer or pq.ParquetWriter(scratch, table.schema)
             writer.write_table(table)
             rows += len(frame)

@@ -18,9 +18,9 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import (
     NotScalarError,
+    cast_truth_values,
     columns_of,
-    refused,
-    with_numbers_for_truth_values,
+    refusal,
 )
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
 from ucfrec.logs.tables import Table, fault_of_line, first_line, quoted
@@ -67,19 +67,19 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
         for name in reads:
             if name.casefold() not in names:
                 raise _missing(table, what, name)
-        used = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
+        read_columns = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
         try:
             sql = f"({expression}\n)"
-            kind = _type_of(connection, sql, {name: columns[name] for name in used})
+            kind = _type_of(connection, sql, {name: columns[name] for name in read_columns})
         except duckdb.BinderException:
-            truth = {name for name in used if columns[name] == "BOOLEAN"}
+            truth = {name for name in read_columns if columns[name] == "BOOLEAN"}
             if not truth:
                 raise
-            sql = f"({with_numbers_for_truth_values(connection, expression, truth)}\n)"
-            kind = _type_of(connection, sql, {name: columns[name] for name in used})
+            sql = f"({cast_truth_values(connection, expression, truth)}\n)"
+            kind = _type_of(connection, sql, {name: columns[name] for name in read_columns})
     except (duckdb.Error, NotScalarError) as error:
-        raise refused(what, expression, str(table.files[0]), first_line(error)) from None
-    return Bound(sql, kind, used, False)
+        raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
+    return Bound(sql, kind, read_columns, False)
 
 
 def _type_of(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping[str, str]) -> str:

@@ -67,8 +67,8 @@ def engine(
             if memory_limit is not None:
                 _set_memory_limit(connection, memory_limit)
                 if (limit := bytes_of(memory_limit)) and shared:
-                    rest = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
-                    _set_memory_limit(connection, f"{rest} B")
+                    size = max(limit - anonymous_bytes() - _BESIDE, limit // 2)
+                    _set_memory_limit(connection, f"{size} B")
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)

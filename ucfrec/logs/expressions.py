@@ -33,16 +33,6 @@ _MAX_QUOTED: Final = 120
 
 _KINDS = "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
 _NODES: Final = frozenset(_KINDS.split())
-_OTHER_NODES: Final = {
-    "COLLATE": "a COLLATE",
-    "DEFAULT": "the word DEFAULT",
-    "LAMBDA": "a lambda, a list comprehension or -> (for JSON use ->>)",
-    "PARAMETER": "a parameter ($ or ?)",
-    "POSITIONAL_REFERENCE": "a position (#)",
-    "STAR": "a star or COLUMNS",
-    "SUBQUERY": "a subquery",
-    "WINDOW": "a window function",
-}
 _SCALARS = """
     BOOLEAN BOOL LOGICAL TINYINT SMALLINT INTEGER BIGINT HUGEINT UTINYINT USMALLINT UINTEGER UBIGINT
     UHUGEINT INT1 INT2 INT4 INT8 SHORT LONG SIGNED UINT8 UINT16 UINT32 UINT64 FLOAT FLOAT4 FLOAT8
@@ -97,14 +87,10 @@ _JOINING: Final = frozenset(
 )
 """What they return is as long as all their arguments together."""
 _QUOTING: Final = frozenset(
-    {
-        "string_split",
-        "str_split",
-        "string_split_regex",
-        "json_extract",
-        "json_extract_string",
-        "->>",
-    }
+    (
+        *("string_split", "str_split", "string_split_regex"),
+        *("json_extract", "json_extract_string", "->>"),
+    )
 )
 """What they return is longer than an argument once it is text: lists have quotes and commas."""
 _QUOTES: Final = 3
@@ -122,21 +108,11 @@ _ALLOWED: Final = (
 
 
 class Expression(str):
-    """SQL text with its origin, for messages."""
+    """SQL text, not parsed, with its origin for messages: the file or option that it comes from."""
 
     origin: str
-    """File or option that the text comes from."""
 
     def __new__(cls, text: object, origin: str) -> Self:
-        """Make an expression of `text`.
-
-        Args:
-            text: SQL; not parsed here.
-            origin: file or option that it comes from.
-
-        Raises:
-            InputError: `text` is not a string.
-        """
         if not isinstance(text, str):
             raise InputError(f"{origin}: {_quote(text)} is not text; write a SQL expression")
         expression = super().__new__(cls, text)
@@ -144,10 +120,10 @@ class Expression(str):
         return expression
 
 
-def computes_with_reward(given: str) -> bool:
+def computes_with_reward(expression: str) -> bool:
     """Whether an expression is more than the column `reward` but reads it, so that rewards have to
     be computed from a column of this name."""
-    text = given.strip().casefold()
+    text = expression.strip().casefold()
     return text != schema.REWARD and schema.REWARD in re.findall(r"\w+", text)
 
 
@@ -155,23 +131,22 @@ class NotScalarError(Exception):
     """A text is not an allowed scalar expression; the message says why."""
 
 
-def refused(what: str, given: str, over: str, reason: str) -> InputError:
+def refusal(what: str, expression: str, source: str, reason: str) -> InputError:
     """One-line error for an expression that cannot be used.
 
     Args:
         what: purpose of the expression, e.g. "for the reward".
-        over: file or table whose columns it may use.
+        source: file or table whose columns it may use.
     """
-    origin = f"{given.origin}: " if isinstance(given, Expression) else ""
-    reason = "".join(char if char.isprintable() else " " for char in reason)
+    origin = f"{expression.origin}: " if isinstance(expression, Expression) else ""
     return InputError(
-        f"{origin}{what.partition(';')[0]}: {_quote(given)} is not a scalar SQL expression over "
-        f"the columns of {over}: {reason}"
+        f"{origin}{what.partition(';')[0]}: {_quote(expression)} is not a scalar SQL expression "
+        f"over the columns of {source}: {reason}"
     )
 
 
-def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str, ...]:
-    """Check that `given` is one allowed scalar expression, without evaluating it.
+def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tuple[str, ...]:
+    """Check that `expression` is one allowed scalar expression, without evaluating it.
 
     Whether its columns exist and its types match is not checked.
 
@@ -181,10 +156,13 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str
     Raises:
         NotScalarError: it is anything else, too long, too large, or nested too deep.
     """
-    _require_small(given)
+    _require_small(expression)
     # Parsed alone and in the brackets in which it will be used: a text with an unmatched bracket,
     # quote or comment cannot give the same tree both times.
-    alone, bracketed = _parse(connection, f"{given}\n"), _parse(connection, f"({given}\n)")
+    alone, bracketed = (
+        _parse(connection, f"{expression}\n"),
+        _parse(connection, f"({expression}\n)"),
+    )
     if alone != bracketed:
         raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
     columns: dict[str, None] = {}
@@ -198,17 +176,17 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", given: str) -> tuple[str
     return tuple(columns)
 
 
-def with_numbers_for_truth_values(
-    connection: "duckdb.DuckDBPyConnection", given: str, columns: Collection[str]
+def cast_truth_values(
+    connection: "duckdb.DuckDBPyConnection", expression: str, columns: Collection[str]
 ) -> str:
     """The same expression with 0 and 1 in place of the truth values of some columns.
 
     Args:
-        given: as `columns_of` allows it.
+        expression: as `columns_of` allows it.
     """
     query = "SELECT json_serialize_sql(?)"
-    (tree,) = connection.execute(query, [f"SELECT {given}\n"]).fetchall()[0]
-    text, folded = f"SELECT {given}".encode(), {name.casefold() for name in columns}
+    (tree,) = connection.execute(query, [f"SELECT {expression}\n"]).fetchall()[0]
+    text, folded = f"SELECT {expression}".encode(), {name.casefold() for name in columns}
     # Places are in bytes; from the last one, those before it stay as they are.
     for begin, length, name in sorted(_references(json.loads(tree)), reverse=True):
         if name.casefold() in folded:
@@ -219,30 +197,32 @@ def with_numbers_for_truth_values(
 
 def _references(tree: Any) -> Iterator[tuple[int, int, str]]:
     """Begin, length and name of each column of a syntax tree."""
-    if isinstance(tree, list):
-        for part in tree:
-            yield from _references(part)
-    elif isinstance(tree, dict):
-        if tree.get("class") == "COLUMN_REF":
-            place = tree["query_location"], tree["query_location_length"]
-            yield *place, tree["column_names"][0]
-        for part in tree.values():
-            yield from _references(part)
+    if isinstance(tree, dict) and tree.get("class") == "COLUMN_REF":
+        yield tree["query_location"], tree["query_location_length"], tree["column_names"][0]
+    for part in _parts(tree):
+        yield from _references(part)
 
 
-def _require_small(given: str) -> None:
+def _parts(tree: Any) -> Collection[Any]:
+    """What a node of a syntax tree holds."""
+    if isinstance(tree, dict):
+        return tree.values()
+    return tree if isinstance(tree, list) else ()
+
+
+def _require_small(expression: str) -> None:
     """Refuse text that would make the parser slow: long, deeply bracketed, or nested CASE."""
-    if len(given) > MAX_LENGTH:
-        raise NotScalarError(f"it has {len(given):,} characters; {MAX_LENGTH:,} are allowed")
+    if len(expression) > MAX_LENGTH:
+        raise NotScalarError(f"it has {len(expression):,} characters; {MAX_LENGTH:,} are allowed")
     depth = 0
-    for char in given:
+    for char in expression:
         depth += (char in "([{") - (char in ")]}")
         if depth > MAX_NESTING:
             raise _too_deep()
     # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
     # largest if every CASE has the same number of WHENs.
-    cases, whens = len(_SIMPLE_CASE.findall(given)), len(_WHEN.findall(given))
-    if cases and (whens / cases) ** cases * len(given) > _MAX_COPIED:
+    cases, whens = len(_SIMPLE_CASE.findall(expression)), len(_WHEN.findall(expression))
+    if cases and (whens / cases) ** cases * len(expression) > _MAX_COPIED:
         raise NotScalarError(
             f"it has {cases} CASE x WHEN … with {whens} WHEN; write CASE WHEN x = … instead"
         )
@@ -257,9 +237,9 @@ def _too_large() -> NotScalarError:
     return NotScalarError(f"it is too large; nest fewer of CASE x WHEN, {copying}")
 
 
-def _parse(connection: "duckdb.DuckDBPyConnection", given: str) -> dict[str, Any]:
-    """Syntax tree of the single value of `SELECT given`."""
-    node, value = _select(connection, given)
+def _parse(connection: "duckdb.DuckDBPyConnection", expression: str) -> dict[str, Any]:
+    """Syntax tree of the single value of `SELECT expression`."""
+    node, value = _select(connection, expression)
     plain, _ = _select(connection, "1")
     if node != plain or value["alias"]:
         raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
@@ -267,17 +247,17 @@ def _parse(connection: "duckdb.DuckDBPyConnection", given: str) -> dict[str, Any
 
 
 def _select(
-    connection: "duckdb.DuckDBPyConnection", given: str
+    connection: "duckdb.DuckDBPyConnection", expression: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Syntax trees of `SELECT given`: the query without its value, and the value."""
+    """Syntax trees of `SELECT expression`: the query without its value, and the value."""
     from duckdb import Error
 
     try:
         query = "SELECT json_serialize_sql(?)"
-        (tree,) = connection.execute(query, [f"SELECT {given}"]).fetchall()[0]
+        (tree,) = connection.execute(query, [f"SELECT {expression}"]).fetchall()[0]
         if len(tree) > _MAX_TREE:
             raise _too_large()
-        parsed = _without_locations(json.loads(tree))
+        parsed = _remove_locations(json.loads(tree))
     except RecursionError:
         raise _too_deep() from None
     except (Error, UnicodeError) as error:
@@ -293,13 +273,13 @@ def _select(
     return {**node, "statement": parsed["statements"][0]}, values[0]
 
 
-def _without_locations(tree: Any) -> Any:
+def _remove_locations(tree: Any) -> Any:
     """A tree without locations in the text, so that equal expressions have equal trees."""
     if isinstance(tree, list):
-        return [_without_locations(part) for part in tree]
+        return [_remove_locations(part) for part in tree]
     if isinstance(tree, dict):
         locations = ("query_location", "query_location_length")
-        return {k: _without_locations(part) for k, part in tree.items() if k not in locations}
+        return {k: _remove_locations(part) for k, part in tree.items() if k not in locations}
     return tree
 
 
@@ -312,12 +292,8 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
     Returns:
         Number of its nodes, counting every copy of those that DuckDB copies.
     """
-    if isinstance(tree, list):
-        return sum(_walk(part, depth, columns) for part in tree)
-    if not isinstance(tree, dict):
-        return 0
-    if "class" not in tree:
-        return sum(_walk(part, depth, columns) for part in tree.values())
+    if not isinstance(tree, dict) or "class" not in tree:
+        return sum(_walk(part, depth, columns) for part in _parts(tree))
     if depth == MAX_NESTING:
         raise _too_deep()
     _require_listed(tree)
@@ -331,15 +307,12 @@ def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
 
 def _growth(tree: Any) -> int:
     """How many times as long as the text of the columns the text of a tree can be, at most."""
-    if isinstance(tree, list):
-        return max(map(_growth, tree), default=1)
-    if not isinstance(tree, dict):
-        return 1
-    if tree.get("class") == "CAST":
+    kind = tree.get("class") if isinstance(tree, dict) else None
+    if kind == "CAST":
         name = str(tree["type_expr"]["type_name"]).upper()
         return _growth(tree["child"]) * (_QUOTES if name in _TEXTS_AND_LISTS else 1)
-    if tree.get("class") != "FUNCTION":
-        return max(map(_growth, tree.values()), default=1)
+    if kind != "FUNCTION":
+        return max(map(_growth, _parts(tree)), default=1)
     name = tree["function_name"].lower()
     arguments = [argument["expression"] for argument in tree["arguments"]]
     grown = [_growth(argument) for argument in arguments] or [1]
@@ -358,8 +331,8 @@ def _growth(tree: Any) -> int:
 
 def _length_of_separator(arguments: Sequence[Any]) -> int:
     """Characters of the separator of `array_to_string`, which may not come from a column."""
-    given = arguments[1] if len(arguments) > 1 else {}
-    literal = given["literal"] if given.get("class") == "CONSTANT" else {}
+    expression = arguments[1] if len(arguments) > 1 else {}
+    literal = expression["literal"] if expression.get("class") == "CONSTANT" else {}
     if literal.get("kind") != "STRING":
         raise NotScalarError("the separator of array_to_string is not quoted text; write one")
     return len(literal["text"])
@@ -369,7 +342,7 @@ def _require_listed(node: dict[str, Any]) -> None:
     """Refuse a node of a kind, type or function that is not allowed."""
     kind = node["class"]
     if kind not in _NODES:
-        raise NotScalarError(f"it has {_OTHER_NODES.get(kind, f'a {kind.lower()}')}; {_ALLOWED}")
+        raise NotScalarError(f"it has a {kind.lower().replace('_', ' ')}; {_ALLOWED}")
     if kind == "OPERATOR" and node["type"] == "GROUPING_FUNCTION":
         raise NotScalarError(f"it calls 'grouping'; {_ALLOWED}")
     if kind == "TYPE" and (node["type_name"].upper() not in TYPES or _is_qualified(node)):
@@ -390,6 +363,6 @@ def _is_qualified(node: dict[str, Any]) -> bool:
     return bool(node["catalog"] or node["schema"] or len(node["qualified_name"]["path"]) != 1)
 
 
-def _quote(given: object) -> str:
-    quoted = repr(str(given)) if isinstance(given, str) else repr(given)
+def _quote(expression: object) -> str:
+    quoted = repr(str(expression)) if isinstance(expression, str) else repr(expression)
     return quoted if len(quoted) <= _MAX_QUOTED else f"{quoted[: _MAX_QUOTED - 1]}…"

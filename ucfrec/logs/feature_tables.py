@@ -248,11 +248,11 @@ def note_lacking(
             f"{count:,} new {ids}s begin at the mean"
         )
     for table, name in zip(tables, names, strict=True):
-        lacking = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
-        if lacking:
+        without_row = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
+        if without_row:
             notes.append(
-                f"{', '.join(map(str, table.files))}: {lacking:,} of {count:,} new {ids}s have no "
-                f"row in the {ids} features; their {what} say nothing of them"
+                f"{', '.join(map(str, table.files))}: {without_row:,} of {count:,} new {ids}s have "
+                f"no row in the {ids} features; their {what} say nothing of them"
             )
     for note in notes:
         warnings.warn(f"{note}; give a current table with --mapping", InputNote, stacklevel=3)

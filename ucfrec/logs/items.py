@@ -52,7 +52,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
     held: list[TrainingSteps] = []
     for batch in steps_of_shards(folder, range(StoreRecord.read(folder).n_shards)):
         held.append(batch)
-        if sum(len(each.users) for each in held) < BLOCK_STEPS:
+        if sum(len(batch.users) for batch in held) < BLOCK_STEPS:
             continue
         joined = joined_steps(held)
         changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
@@ -147,9 +147,9 @@ def write_item_states(
     embeddings = item_embeddings(matrix, item_features, size)
     user_vectors = np.zeros((n_users, 0), dtype=np.float32)
     if user_features is not None:
-        known = np.flatnonzero(trained)
-        user_vectors = _reduced(user_features, known, USER_SIZE)
-        spread = user_vectors[known].std(axis=0)
+        trained_rows = np.flatnonzero(trained)
+        user_vectors = _reduce(user_features, trained_rows, USER_SIZE)
+        spread = user_vectors[trained_rows].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
     write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, tags)
 
@@ -225,7 +225,7 @@ def item_embeddings(
     """
     trained = exposure.trained
     counts = exposure.counts[trained]
-    content = None if features is None else _unit_rows(_reduced(features, trained, size // 2))
+    content = None if features is None else _unit_rows(_reduce(features, trained, size // 2))
     remaining = size if content is None else max(size - content.shape[1], 1)
     cooccurrence = exposure.cooccurrence(remaining)
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
@@ -246,31 +246,35 @@ def predicted_from_features(
 ) -> Float64Array:
     """(n_items, size) co-occurrence part predicted from features, by ridge regression."""
     axes = _axes(features[trained], CONTENT_RANK)
-    known = np.asarray(features[trained] @ axes, dtype=np.float64)
+    trained_rows = np.asarray(features[trained] @ axes, dtype=np.float64)
     weights = counts / (counts + PRIOR_COUNT)
-    gram = known.T @ (weights[:, None] * known) + RIDGE * np.eye(known.shape[1])
-    slopes = np.linalg.solve(gram, known.T @ (weights[:, None] * cooccurrence))
+    gram = trained_rows.T @ (weights[:, None] * trained_rows) + RIDGE * np.eye(
+        trained_rows.shape[1]
+    )
+    slopes = np.linalg.solve(gram, trained_rows.T @ (weights[:, None] * cooccurrence))
     # Sparse times dense is computed row by row, so an item's result does not depend on other items.
     return np.asarray(features @ (axes @ slopes), dtype=np.float64)
 
 
-def _reduced(features: sparse.csr_matrix, known: IntArray, size: int) -> Float32Array:
-    """(n, ≤ size) features on the singular axes of the rows `known`, centred on their mean."""
-    rows: Array = np.asarray(features @ _axes(features[known], max(size, 1)))
-    rows -= rows[known].mean(axis=0)
+def _reduce(features: sparse.csr_matrix, trained_rows: IntArray, size: int) -> Float32Array:
+    """(n, ≤ size) features on the singular axes of the trained rows, centred on their mean."""
+    rows: Array = np.asarray(features @ _axes(features[trained_rows], max(size, 1)))
+    rows -= rows[trained_rows].mean(axis=0)
     # A row without any feature is at the mean.
     rows[np.diff(features.indptr) == 0] = 0
     return np.asarray(rows, dtype=np.float32)
 
 
-def _axes(known: sparse.csr_matrix, size: int) -> Array:
+def _axes(trained_rows: sparse.csr_matrix, size: int) -> Array:
     """(F, D ≤ `size`) right singular vectors of the rows; the identity if F ≤ `size`."""
-    if known.shape[1] <= size:
-        return np.eye(known.shape[1])
+    if trained_rows.shape[1] <= size:
+        return np.eye(trained_rows.shape[1])
     from sklearn.utils.extmath import randomized_svd  # takes seconds to import
 
     require_blas_memory()
-    _, _, directions = randomized_svd(known, min(size, known.shape[0]), random_state=0)
+    _, _, directions = randomized_svd(
+        trained_rows, min(size, trained_rows.shape[0]), random_state=0
+    )
     return np.asarray(directions.T)
 
 

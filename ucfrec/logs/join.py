@@ -210,9 +210,9 @@ def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -
             values[key] = f"coalesce({value}, '')" if key == schema.ARM else value
         elif key in _OTHERS or key in further:
             columns.append(name)
-            other = key in _OTHERS
-            values[key if other else further[key].alias] = (
-                f"CAST({quoted(name)} AS {_OTHERS[key]})" if other else quoted(name)
+            is_other = key in _OTHERS
+            values[key if is_other else further[key].alias] = (
+                f"CAST({quoted(name)} AS {_OTHERS[key]})" if is_other else quoted(name)
             )
     selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
     return f"{selects} FROM {keys.with_texts(columns, texts).sql}"
@@ -251,7 +251,8 @@ def _make_feedback(
             n: names[key] for n, key in enumerate(map(str.casefold, columns)) if key in names
         }
         values = [
-            f"{_as_number(name, whole.columns[name])} AS {_value(n)}" for n, name in present.items()
+            f"{_cast_number(name, whole.columns[name])} AS {_value(n)}"
+            for n, name in present.items()
         ]
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
@@ -283,7 +284,7 @@ def _feedback_columns(
     """
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
-    others = []
+    not_numbers = []
     for table in tables:
         for key, name in _names_of(table).items():
             kind = table.columns[name]
@@ -292,12 +293,12 @@ def _feedback_columns(
             if key in _OTHERS:
                 left_out[name] = "of the exposures, too"
             elif not _holds_feedback(kind):
-                others.append((table, key, name, kind))
+                not_numbers.append((table, key, name, kind))
             elif key == FEEDBACK:
                 left_out[name] = "the log has its own, the number of rows; rename it"
             else:
                 columns.setdefault(key, (name, table.files[0]))
-    for table, key, name, kind in others:
+    for table, key, name, kind in not_numbers:
         if key not in columns and kind != "VARCHAR":
             continue
         ((values, words, sample),) = connection.sql(
@@ -305,14 +306,14 @@ def _feedback_columns(
             "NOT coalesce(isfinite(TRY_CAST(x AS DOUBLE)), false) AS n FROM (SELECT "
             f"trim(CAST({quoted(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
         ).fetchall()
-        told = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
+        found_words = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
         if words and key in columns:
             raise InputError(
                 f"{table.files[0]}: column {name} has numbers in {columns[key][1]}, but here "
-                f"{told}; {_WRITE_NUMBERS}, or remove the column"
+                f"{found_words}; {_WRITE_NUMBERS}, or remove the column"
             )
         if values and key not in columns:
-            left_out[name] = f"text, {told if words else 'though all are numbers'}"
+            left_out[name] = f"text, {found_words if words else 'though all are numbers'}"
     if left_out:
         files = first_and_more([file for table in tables for file in table.files])
         names = ", ".join(f"{name} ({why})" for name, why in left_out.items())
@@ -329,7 +330,7 @@ def _value(n: int) -> str:
     return f"value_{n}"
 
 
-def _as_number(name: str, kind: str) -> str:
+def _cast_number(name: str, kind: str) -> str:
     """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
     value = quoted(name) if _holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
     return f"CAST({value} AS DOUBLE)"
@@ -387,11 +388,11 @@ def _are_users_numbers(connection: duckdb.DuckDBPyConnection) -> bool:
 
 
 def _count(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
-    ((shown, written, rows, matched, with_feedback),) = connection.sql(
+    ((exposures, written, rows, matched, with_feedback),) = connection.sql(
         "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
         "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
     ).fetchall()
-    return Joined(shown, written - shown, with_feedback, matched, rows - matched, columns)
+    return Joined(exposures, written - exposures, with_feedback, matched, rows - matched, columns)
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:

@@ -276,9 +276,9 @@ def _require_keys(where: str, table: object, kind: type) -> None:
 
 def _beside(mapping: Path, file: str | Path) -> Path:
     """A file or glob that a mapping file names, relative to its folder."""
-    named = mapping.parent / file
-    if named.exists() or not glob.has_magic(str(file)):
-        return named
+    path = mapping.parent / file
+    if path.exists() or not glob.has_magic(str(file)):
+        return path
     # The folder is not a pattern, even if it is called "logs [1]".
     return Path(glob.escape(str(mapping.parent))) / file
 

@@ -62,7 +62,7 @@ class Table:
     """(name, DuckDB type) of each column in the files."""
     partitions: tuple[tuple[str, str], ...] = ()
     """(name, DuckDB type) of the columns that are read from the names of folders."""
-    used: tuple[str, ...] | None = None
+    selected: tuple[str, ...] | None = None
     """Columns that are read; None for all."""
     raw: tuple[str, ...] = ()
     """Columns of CSV files that are read as text, too, as the columns `raw_name` of them."""
@@ -70,23 +70,23 @@ class Table:
     @property
     def columns(self) -> dict[str, str]:
         """Column name to DuckDB type, as `sql` gives it."""
-        return {name: _computed_as(kind) for name, kind in (*self.types, *self.partitions)}
+        return {name: _wider_type(kind) for name, kind in (*self.types, *self.partitions)}
 
     @property
     def columnar(self) -> bool:
         """Whether reading a column again is cheap, because text need not be parsed."""
         return self.files[0].suffix.lower() == ".parquet"
 
-    def of(self, used: Iterable[str], raw: Iterable[str] = ()) -> "Table":
+    def of(self, selected: Iterable[str], raw: Iterable[str] = ()) -> "Table":
         """The same table with some of its columns, so that others cost nothing."""
-        return replace(self, used=tuple(dict.fromkeys(used)), raw=tuple(dict.fromkeys(raw)))
+        return replace(self, selected=tuple(dict.fromkeys(selected)), raw=tuple(dict.fromkeys(raw)))
 
-    def with_texts(self, used: Iterable[str], texts: Iterable[str]) -> "Table":
+    def with_texts(self, selected: Iterable[str], texts: Iterable[str]) -> "Table":
         """The same table with more columns, and with those that `text_of` needs."""
-        used = [*(self.used or ()), *used]
+        selected = [*(self.selected or ()), *selected]
         if self.columnar:
-            return self.of([*used, *texts], self.raw)
-        return self.of(used, [*self.raw, *texts])
+            return self.of([*selected, *texts], self.raw)
+        return self.of(selected, [*self.raw, *texts])
 
     def text_of(self, name: str) -> str:
         """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
@@ -96,17 +96,17 @@ class Table:
     def sql(self) -> str:
         """SQL of the rows: NaN is missing, integers of fewer than 64 bits have 64."""
         kinds, folders = dict(self.types), dict(self.partitions)
-        used = [*kinds, *folders] if self.used is None else self.used
+        selected = [*kinds, *folders] if self.selected is None else self.selected
         values = []
-        for name in (name for name in used if name in kinds):
+        for name in (name for name in selected if name in kinds):
             column, kind = quoted(name), kinds[name]
             if name in self.raw and kind != "VARCHAR":
                 column = f"CAST({column} AS {kind})"
-            values.append(f"{_computed(column, kind)} AS {quoted(name)}")
+            values.append(f"{_value_of(column, kind)} AS {quoted(name)}")
         values += [f"{quoted(name)} AS {quoted(raw_name(name))}" for name in self.raw]
         values += [
             f"{_folder_value(name, folders[name])} AS {quoted(name)}"
-            for name in used
+            for name in selected
             if name in folders
         ]
         return f"(SELECT {', '.join(values) or '1'} FROM {self.source})"
@@ -143,7 +143,7 @@ def _folder_value(name: str, kind: str = "VARCHAR") -> str:
     return f"CAST(nullif({value}, {text(_NO_VALUE)}) AS {kind})"
 
 
-def _computed_as(kind: str) -> str:
+def _wider_type(kind: str) -> str:
     """The DuckDB type that expressions compute with, given that of a column.
 
     DuckDB multiplies two columns of 8 bits in 8 bits, and takes unsigned numbers from each other
@@ -154,7 +154,7 @@ def _computed_as(kind: str) -> str:
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
 
 
-def _computed(column: str, kind: str) -> str:
+def _value_of(column: str, kind: str) -> str:
     """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
     if kind in ("FLOAT", "DOUBLE"):
         # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would exclude
@@ -162,7 +162,7 @@ def _computed(column: str, kind: str) -> str:
         return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
     if kind == NOTHING:
         return "NULL"
-    wider = _computed_as(kind)
+    wider = _wider_type(kind)
     return column if wider == kind else f"CAST({column} AS {wider})"
 
 
@@ -235,8 +235,8 @@ def open_tables(
         opened = Table((file,), columns)
         if partitions:
             opened = replace(opened, partitions=_partitions(connection, opened))
-        like = replace(tables[-1], files=opened.files) if tables else None
-        if like == opened and tables[-1].files[0].suffix == file.suffix:
+        same = replace(tables[-1], files=opened.files) if tables else None
+        if same == opened and tables[-1].files[0].suffix == file.suffix:
             tables[-1] = replace(opened, files=(*tables[-1].files, file))
         else:
             tables.append(opened)
@@ -408,8 +408,8 @@ def _types_of_all_rows(
             changes.append((name, "VARCHAR", f"bool_or(regexp_full_match({column}, '-?0\\d+'))"))
     as_text = {name: "VARCHAR" for name, _, _ in changes}
     source = Table((file,), tuple((kinds | as_text).items()))
-    found = _first_row(connection, source, [condition for *_, condition in changes])
-    for (name, kind, _), holds in zip(changes, found, strict=False):
+    holding = _first_row(connection, source, [condition for *_, condition in changes])
+    for (name, kind, _), holds in zip(changes, holding, strict=False):
         kinds[name] = kind if holds else kinds[name]
     return tuple(kinds.items())
 

@@ -206,14 +206,14 @@ def _present(
     return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
 
 
-def _note_partial(tables: Sequence[Table], settled: set[str]) -> None:
+def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
     """Warn of optional columns that some files have and others do not.
 
     Args:
-        settled: columns that every file has, and those that the mapping names.
+        excluded: columns that every file has, and those that the mapping names.
     """
     count = sum(len(table.files) for table in tables)
-    for name in [name for name in OPTIONAL_COLUMNS if name not in settled]:
+    for name in [name for name in OPTIONAL_COLUMNS if name not in excluded]:
         having = [t for t in tables if name in {column.casefold() for column in t.columns}]
         files = [file for table in having for file in table.files]
         if files:
@@ -272,7 +272,7 @@ def _select(
         sources.append(condition)
     narrow = table.of((column for value in sources for column in value.columns), raw.values())
     values = {
-        name: _typed_value(connection, narrow, name, texts[name], value, mapping.time_format)
+        name: _cast_value(connection, narrow, name, texts[name], value, mapping.time_format)
         for name, value in bound.items()
     }
     return _Select(narrow, {**values, **extra})
@@ -314,7 +314,7 @@ _TYPES: Final = {
 }
 
 
-def _typed_value(
+def _cast_value(
     connection: duckdb.DuckDBPyConnection,
     table: Table,
     name: str,

@@ -110,16 +110,16 @@ class Scorer:
         Raises:
             InputError: the rule needs what the run lacks.
         """
-        other = copy.copy(self)
-        other.rule, other._engine = rule, None
-        other._require_parts()
-        return other
+        scorer = copy.copy(self)
+        scorer.rule, scorer._engine = rule, None
+        scorer._require_parts()
+        return scorer
 
     def answering_one_with(self, engine: Engine) -> "Scorer":
         """The same, but the scores of a single session are computed by `engine`."""
-        other = copy.copy(self)
-        other._engine = engine
-        return other
+        scorer = copy.copy(self)
+        scorer._engine = engine
+        return scorer
 
     def _require_parts(self) -> None:
         rule, tags = self.rule, None if self.states is None else self.states.tags

@@ -55,8 +55,8 @@ class Uniform(Memoryless):
             return chosen, np.full(count, 1.0 / n_items, dtype=np.float32)
         assert isinstance(self._space, spaces.Box)
         low, high = self._space.low, self._space.high
-        drawn = self._generator.uniform(low, high, size=(count, *low.shape))
-        return drawn.astype(np.float32), None
+        vectors = self._generator.uniform(low, high, size=(count, *low.shape))
+        return vectors.astype(np.float32), None
 
     def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, Float32Array]:
         """Draw uniformly among the allowed items; `forbidden` (N, L) is padded with −1.

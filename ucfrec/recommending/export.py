@@ -64,8 +64,8 @@ def export(
         _write(graph, scratch / GRAPH, trained.name)
         difference = max(_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
         sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
-        about = _description(graph, trained) | {"files": list(sizes)}
-        write_json(scratch / DESCRIPTION, about)
+        description = _description(graph, trained) | {"files": list(sizes)}
+        write_json(scratch / DESCRIPTION, description)
     return Exported(sum(sizes.values()), difference)
 
 
@@ -84,13 +84,13 @@ def _arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
 def _write(graph: RuleGraph, path: Path, kind: str) -> None:
     arguments = _arguments(graph, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
-    shapes: dict[str, Any] = {each: {0: batch} for each in arguments}
+    shapes: dict[str, Any] = {name: {0: batch} for name in arguments}
     shapes[EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
-    given: tuple[Any, ...] = tuple(arguments.values())
+    inputs: tuple[Any, ...] = tuple(arguments.values())
     if INPUTS[-1] not in arguments:
         shapes[INPUTS[-1]] = None
-        given = (*given, None)
-    write_graph(graph, given, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
+        inputs = (*inputs, None)
+    write_graph(graph, inputs, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
 
 
 def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
@@ -135,12 +135,12 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
 
 def _inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
     b, length = "batch", scorer.length
-    shown = "index of each item shown in the session, the latest last; -1 before the session began"
+    items = "index of each item shown in the session, the latest last; -1 before the session began"
     excluded = (
         "items that may not be shown, e.g. those already seen; padded with -1, at least one column"
     )
     inputs = [
-        _entry("items", "int64", [b, length], shown),
+        _entry("items", "int64", [b, length], items),
         _entry("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
         _entry("steps", "int64", [b], "number of items that the session has shown"),
         _entry("collected", "float64", [b], "sum of the rewards of the session"),

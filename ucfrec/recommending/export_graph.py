@@ -129,10 +129,10 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     assert states is not None
     rng = np.random.default_rng(seed)
     steps = rng.integers(0, 2 * length + 1, size=sessions)
-    shown = np.arange(length) >= length - steps[:, None]
-    items = np.where(shown, rng.integers(len(states.embeddings), size=shown.shape), -1)
-    rewards = rng.choice([states.reward_low, states.reward_high], size=shown.shape)
-    rewards = np.where(shown, rewards, 0.0).astype(np.float32)
+    inside = np.arange(length) >= length - steps[:, None]
+    items = np.where(inside, rng.integers(len(states.embeddings), size=inside.shape), -1)
+    rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
+    rewards = np.where(inside, rewards, 0.0).astype(np.float32)
     users = rng.integers(-1, max(1, len(states.user_features)), size=sessions)
     observed, observations = scorer.policy.state_mean.shape[0] - states.size, None
     if observed:
@@ -156,10 +156,10 @@ def inputs_of(sessions: Sessions) -> dict[str, Tensor]:
 
 def run_graph(session: Any, inputs: dict[str, Tensor]) -> list[Array]:
     """All outputs of an `onnxruntime.InferenceSession`."""
-    found: list[Array] = session.run(
+    outputs: list[Array] = session.run(
         None, {name: value.contiguous().numpy() for name, value in inputs.items()}
     )
-    return found
+    return outputs
 
 
 def magnitude(scorer: Scorer) -> float:
@@ -176,7 +176,7 @@ def magnitude(scorer: Scorer) -> float:
 
 
 def require_close(
-    found: Iterable[Array], expected: Iterable[Tensor], remedy: str, size: float
+    outputs: Iterable[Array], expected: Iterable[Tensor], remedy: str, size: float
 ) -> float:
     """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
 
@@ -187,7 +187,7 @@ def require_close(
         InputError: it is beyond the tolerance.
     """
     largest = 0.0
-    for theirs, tensor in zip(found, expected, strict=True):
+    for theirs, tensor in zip(outputs, expected, strict=True):
         ours = tensor.numpy()
         same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
         finite = np.isfinite(ours) & np.isfinite(theirs)
@@ -269,14 +269,14 @@ def write_graph(
 @contextlib.contextmanager
 def _quiet() -> Any:
     """Keep the exporter from printing."""
-    before = logging.root.manager.disable
+    level = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logging.disable(before)
+        logging.disable(level)
 
 
 class ScoreGraph:
@@ -333,7 +333,7 @@ def _example(scorer: Scorer, seed: int) -> tuple[Sessions, Tensor]:
 
 def _modules(scorer: Scorer) -> nn.ModuleList:
     models = (scorer.policy, scorer.reward_model)
-    return nn.ModuleList(each for each in models if each is not None)
+    return nn.ModuleList(model for model in models if model is not None)
 
 
 class _Network(nn.Module):

@@ -96,7 +96,7 @@ class Histories:
         if by_id:
             table["session"] = sessions[0]
         order = kept_in_order(table, duplicates)
-        rewards, users, items, times, *sessions = (each[order] for each in columns)
+        rewards, users, items, times, *sessions = (values[order] for values in columns)
         same_user = users[1:] == users[:-1]
         owner = np.concatenate([[0], np.cumsum(~same_user)])
         ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
@@ -258,18 +258,18 @@ def of_some_users(batches: Iterable[Histories], users: Array) -> Iterator[Histor
     Raises:
         InputError: one of them has no rows; once all are read.
     """
-    wanted = IdLookup(pd.unique(users))
-    found = np.zeros(len(wanted), dtype=bool)
+    lookup = IdLookup(pd.unique(users))
+    has_rows = np.zeros(len(lookup), dtype=bool)
     for batch in batches:
-        numbers = wanted.numbers(batch.users)
-        found[numbers[numbers >= 0]] = True
+        numbers = lookup.numbers(batch.users)
+        has_rows[numbers[numbers >= 0]] = True
         if (numbers >= 0).any():
             yield batch.of_users(np.flatnonzero(numbers >= 0))
-    if not found.all():
-        lacking = wanted.ids[~found]
+    if not has_rows.all():
+        missing = lookup.ids[~has_rows]
         raise InputError(
-            f"{len(lacking):,} of {len(wanted):,} users have no rows in the histories, such as "
-            f"{lacking[0]}; leave them out, or add rows"
+            f"{len(missing):,} of {len(lookup):,} users have no rows in the histories, such as "
+            f"{missing[0]}; leave them out, or add rows"
         )
 
 
@@ -290,7 +290,7 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     if frame.shape[1] != len(names) + 1 or not {*names, schema.REWARD} <= {*frame.columns}:
         return None
     keys, rewards = [frame[name].to_numpy() for name in names], frame[schema.REWARD].to_numpy()
-    if any(each.dtype != np.int64 for each in keys):
+    if any(values.dtype != np.int64 for values in keys):
         return None
     if rewards.dtype not in (np.float64, np.float32, np.int64, np.bool_):
         return None

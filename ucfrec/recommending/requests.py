@@ -182,16 +182,16 @@ def _describe(errors: Sequence[Any]) -> str:
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_lower(first['msg'])})"
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
-    wanted = dict.fromkeys(
+    messages = dict.fromkeys(
         _lower(error["msg"])
         for error, place in zip(errors, places, strict=True)
         if place == places[0]
     )
     value = json.dumps(first.get("input"), default=str)
     value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
-    shown = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
+    actual = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
     return (
-        f"{where}: {' or '.join(wanted)}{shown}"
+        f"{where}: {' or '.join(messages)}{actual}"
         f"{f'; {more} more fault' + 's' * (more > 1) if more else ''}"
     )
 
@@ -199,8 +199,8 @@ def _describe(errors: Sequence[Any]) -> str:
 def _place(error: Any) -> tuple[str | int, ...]:
     """Where an error is, whichever of the types that the place takes it is about."""
     place: tuple[str | int, ...] = error["loc"]
-    named = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
-    return place if named else place[:-1]
+    is_entry = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
+    return place if is_entry else place[:-1]
 
 
 _TYPES: Final = ("constrained-str", "float", "constrained-int")

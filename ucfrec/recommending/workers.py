@@ -195,8 +195,8 @@ class Workers:
     def _start(self) -> None:
         ours, theirs = _SPAWN.Pipe()
         first, self._first = self._first, False
-        given = self._work, self._listening, theirs, first, self._folder.name
-        process = _SPAWN.Process(target=_begin, args=given, daemon=True)
+        arguments = self._work, self._listening, theirs, first, self._folder.name
+        process = _SPAWN.Process(target=_begin, args=arguments, daemon=True)
         self._workers.append(_Worker(process, ours))
         with block_ctrl_c():  # it reaches every process of a terminal; this one ends the others
             process.start()
@@ -214,7 +214,7 @@ class Workers:
 
         self._workers.remove(worker)
         mark_process_dead(worker.process.pid, self._folder.name)  # type: ignore[no-untyped-call]
-        if not worker.ready and not any(each.ready for each in self._workers):
+        if not worker.ready and not any(other_worker.ready for other_worker in self._workers):
             raise InputError(worker.failure)
         pause = 0.0 if worker.ready else _PAUSE
         self._missing.append(time.monotonic() + pause)

@@ -225,7 +225,7 @@ class DecisionRule:
         return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
 
 
-def _saved(value: object) -> DecisionRule:
+def _read_saved(value: object) -> DecisionRule:
     if isinstance(value, DecisionRule):
         return value
     if not isinstance(value, Mapping):
@@ -233,7 +233,9 @@ def _saved(value: object) -> DecisionRule:
     return DecisionRule.from_dict(value, "the rule")
 
 
-SavedRule = Annotated[DecisionRule, PlainValidator(_saved), PlainSerializer(DecisionRule.as_dict)]
+SavedRule = Annotated[
+    DecisionRule, PlainValidator(_read_saved), PlainSerializer(DecisionRule.as_dict)
+]
 """A rule as an entry of a record."""
 
 

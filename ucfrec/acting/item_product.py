@@ -126,7 +126,7 @@ class ItemProduct:
 
     def shown(self, recent: Shown) -> Tensor:
         """(B, N) the items that repetition and likeness refer to."""
-        return _padded(recent.items, self._columns, -1)
+        return _pad(recent.items, self._columns, -1)
 
     def policy_part(self, windows: Windows, recent: Shown) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from windows with their target returns."""
@@ -137,13 +137,13 @@ class ItemProduct:
         part = Part(features / features.shape[-1] ** 0.5, nothing, nothing)
         if self._exposure is not None:
             exposed = Exposed(
-                _padded(recent.items, self.lags, -1).to(device),
-                _padded(recent.rewards, self.lags, 0).to(device),
+                _pad(recent.items, self.lags, -1).to(device),
+                _pad(recent.rewards, self.lags, 0).to(device),
                 normalized.returns_to_go[:, -1],
             )
             repeated, alike = self._exposure.weights(exposed)
             part = part._replace(
-                repeated=_padded(repeated, self._columns, 0), alike=_padded(alike, self._columns, 0)
+                repeated=_pad(repeated, self._columns, 0), alike=_pad(alike, self._columns, 0)
             )
         if device.type != "cpu":
             return features.cpu(), Part(*(values.cpu() for values in part))
@@ -157,8 +157,8 @@ class ItemProduct:
         _, repeated, alike = model.exposures(recent)
         return Part(
             F.pad(query, (0, 1), value=1.0),
-            _padded(repeated, self._columns, 0),
-            _padded(alike, self._columns, 0),
+            _pad(repeated, self._columns, 0),
+            _pad(alike, self._columns, 0),
         )
 
     def _counts(self, policy: bool, rewards: bool) -> bool:
@@ -273,7 +273,7 @@ def _columns(blocks: list[Tensor]) -> Tensor:
     return matrix
 
 
-def _padded(values: Tensor, length: int, padding: int) -> Tensor:
+def _pad(values: Tensor, length: int, padding: int) -> Tensor:
     """The first `length` columns of values (B, N), with more columns where there are fewer."""
     missing = max(0, length - values.shape[1])
     values = values[:, :length]

@@ -98,7 +98,7 @@ class PolicyActor:
             numbers = torch.from_numpy(lookup.numbers(users))
             self._sessions = replace(self._sessions, users=numbers)
         forbidden = info.get(FORBIDDEN)
-        self._forbidden = None if forbidden is None else self._in_store(forbidden)
+        self._forbidden = None if forbidden is None else self._find_in_store(forbidden)
 
     @torch.no_grad()
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
@@ -173,7 +173,7 @@ class PolicyActor:
             parts.append(forbidden.scatter_(1, self._forbidden, True)[:, :-1])
         return torch.stack(parts).any(0) if parts else None
 
-    def _in_store(self, items: IntArray) -> Tensor:
+    def _find_in_store(self, items: IntArray) -> Tensor:
         """The store's indices of the environment's items (N, L); n_items for items it lacks."""
         ids = self._item_ids
         if ids is None:

@@ -277,7 +277,7 @@ class Scorer:
             outputs = query.outputs
             scores = self._items.scores(query.items, part, outputs, self.has_factors, rewards)
         else:
-            scores = self._composed(query)
+            scores = self._compose(query)
         if not torch.compiler.is_exporting():
             _require_scores(scores, empty=True)
         if left_out is not None:
@@ -318,7 +318,7 @@ class Scorer:
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
-    def _composed(self, query: Query) -> Tensor:
+    def _compose(self, query: Query) -> Tensor:
         """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
         rule, product, scores = self.rule, self._items, torch.zeros(())
         if rule.policy_weight:

@@ -60,7 +60,7 @@ class UserRows:
 
     def values(self, name: str, rows: IntArray) -> Array:
         """Values of a step column at rows of any shape."""
-        return _joined(name, self.later, self.earlier, self.source[rows])
+        return _join(name, self.later, self.earlier, self.source[rows])
 
     def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
         """(rows, items), each (M,): the known items in all rows of the user before later steps
@@ -134,9 +134,7 @@ def _earlier_rows(
     return owner, times, source
 
 
-def _joined(
-    name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray
-) -> Array:
+def _join(name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray) -> Array:
     """Values of a step column at sources of any shape; see `UserRows.source`."""
     values = later.step_values(name, *later.locate(np.maximum(source, 0)))
     is_earlier: BoolArray = source < 0
@@ -157,7 +155,7 @@ class _JoinedColumn(StepColumn):
 
     def take(self, index: IntArray) -> Array:
         """A copy of the values at the indices `index`, of any shape."""
-        return _joined(self._name, self._rows.later, self._rows.earlier, self._source[index])
+        return _join(self._name, self._rows.later, self._rows.earlier, self._source[index])
 
     def between(self, begin: int, end: int) -> Array:
         """The values from index `begin` to before `end`."""
@@ -181,7 +179,7 @@ class _ContinuedColumns(Columns):
         source = np.where(
             inside >= 0, numbers, rows.source[np.repeat(begin, lengths) + inside.clip(max=0)]
         )
-        rewards = _joined(schema.REWARD, later, rows.earlier, source)
+        rewards = _join(schema.REWARD, later, rows.earlier, source)
         arrays = {
             name: later.episode_values(name)
             for name in schema.EPISODE_DTYPES

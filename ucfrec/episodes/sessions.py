@@ -167,7 +167,7 @@ class Sessions:
         numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
         if self.states is None:
             assert states is not None
-            window_states = self._built_states(states, numbers.clamp(min=0))
+            window_states = self._build_states(states, numbers.clamp(min=0))
         else:
             window_states = self.states[:, -context:]
         first = self.actions.shape[1] - context + 1
@@ -178,7 +178,7 @@ class Sessions:
             F.pad(self.rewards[:, first:], (0, 1)),
         )
 
-    def _built_states(self, states: ItemStates, steps: Tensor) -> Tensor:
+    def _build_states(self, states: ItemStates, steps: Tensor) -> Tensor:
         """States (B, K, S) of steps (B, K), the last ones."""
         context = steps.shape[1]
         reach = context - 1 + states.window

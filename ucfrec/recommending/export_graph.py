@@ -123,7 +123,7 @@ def _best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return torch.where(left, items, -1), torch.where(left, values - total, -torch.inf)
 
 
-def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
+def draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     """Random sessions of at most twice as many steps as the scorer reads."""
     states, length = scorer.states, scorer.length
     assert states is not None
@@ -148,7 +148,7 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     )
 
 
-def inputs_of(sessions: Sessions) -> dict[str, Tensor]:
+def name_inputs(sessions: Sessions) -> dict[str, Tensor]:
     """The inputs of a graph, by name."""
     values = {"items": sessions.actions} | {name: getattr(sessions, name) for name in INPUTS[1:]}
     return {name: value for name, value in values.items() if value is not None}
@@ -162,7 +162,7 @@ def run_graph(session: Any, inputs: dict[str, Tensor]) -> list[Array]:
     return outputs
 
 
-def magnitude(scorer: Scorer) -> float:
+def measure_magnitude(scorer: Scorer) -> float:
     """Size of what is added up to a score under the scorer's rule, at least 1.
 
     A sum is rounded relative to its terms, even if what is left of them is about 0.
@@ -181,7 +181,7 @@ def require_close(
     """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
 
     Args:
-        size: see `magnitude`.
+        size: see `measure_magnitude`.
 
     Raises:
         InputError: it is beyond the tolerance.
@@ -300,7 +300,7 @@ class ScoreGraph:
         import onnxruntime
 
         session, excluded = _example(scorer, seed=0)
-        example = {**inputs_of(session), EXCLUDED: excluded}
+        example = {**name_inputs(session), EXCLUDED: excluded}
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         with tempfile.TemporaryDirectory() as folder:
@@ -310,7 +310,7 @@ class ScoreGraph:
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
-        size = magnitude(scorer)
+        size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = _example(scorer, seed=number)
             expected = scorer.scores(session, excluded=excluded, empty=True)
@@ -319,7 +319,7 @@ class ScoreGraph:
     def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
         """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be
         shown."""
-        inputs = {**inputs_of(session), EXCLUDED: excluded}
+        inputs = {**name_inputs(session), EXCLUDED: excluded}
         return torch.from_numpy(run_graph(self._session, inputs)[0])
 
 
@@ -328,7 +328,7 @@ def _example(scorer: Scorer, seed: int) -> tuple[Sessions, Tensor]:
     assert scorer.states is not None
     rng, items = np.random.default_rng(seed), len(scorer.states.embeddings)
     excluded = rng.random((1, items)) < rng.uniform(0, _MOST_EXCLUDED)
-    return random_sessions(scorer, 1, seed), torch.from_numpy(excluded)
+    return draw_sessions(scorer, 1, seed), torch.from_numpy(excluded)
 
 
 def _modules(scorer: Scorer) -> nn.ModuleList:

@@ -116,9 +116,9 @@ class ServingMetrics:
     def collect(self) -> Iterator[Metric]:
         """All metrics, as `prometheus_client` asks for them."""
         metrics = {metric.name: metric for metric in self._collector.collect()}
-        weights = _by_measure(metrics.pop(_WEIGHT).samples)
+        weights = _map_by_measure(metrics.pop(_WEIGHT).samples)
         drift = metrics[_DRIFT]
-        totals = _by_measure(drift.samples)
+        totals = _map_by_measure(drift.samples)
         # A measure of a run that answered before is not removed from the files.
         drift.samples = [
             Sample(_DRIFT, {"measure": name}, Mean(totals[name], weights[name]).value)
@@ -138,5 +138,5 @@ class ServingMetrics:
             self._cpu.inc(self._used - seconds)
 
 
-def _by_measure(samples: Iterable[Sample]) -> dict[str, float]:
+def _map_by_measure(samples: Iterable[Sample]) -> dict[str, float]:
     return {sample.labels["measure"]: sample.value for sample in samples}

@@ -177,7 +177,7 @@ def application(
     )
 
     @app.exception_handler(HTTPException)
-    async def refused(_: HTTPRequest, error: HTTPException) -> Response:
+    async def refuse(_: HTTPRequest, error: HTTPException) -> Response:
         return _response(error.status_code, {"error": str(error.detail)}, error.headers)
 
     faults: dict[int | str, dict[str, Any]] = {
@@ -188,7 +188,7 @@ def application(
     async def recommendations(http: HTTPRequest) -> Response:
         """The next items for one user."""
         began = time.perf_counter()
-        status, body = await _answered(http, responder, batcher, limits, exposures)
+        status, body = await _answer_http(http, responder, batcher, limits, exposures)
         metrics.request(status, time.perf_counter() - began)
         return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
 
@@ -209,7 +209,7 @@ def application(
     return app
 
 
-async def _answered(
+async def _answer_http(
     http: HTTPRequest,
     responder: Responder | Served,
     batcher: Batcher,
@@ -268,14 +268,14 @@ def _inline(schema: dict[str, Any]) -> dict[str, Any]:
     """A JSON schema without references, which lie elsewhere in OpenAPI."""
     definitions = schema.pop("$defs", {})
 
-    def inlined(value: Any) -> Any:
+    def inline(value: Any) -> Any:
         if isinstance(value, dict):
             if "$ref" in value:
-                return inlined(definitions[value["$ref"].rpartition("/")[2]])
-            return {name: inlined(entry) for name, entry in value.items()}
-        return [inlined(entry) for entry in value] if isinstance(value, list) else value
+                return inline(definitions[value["$ref"].rpartition("/")[2]])
+            return {name: inline(entry) for name, entry in value.items()}
+        return [inline(entry) for entry in value] if isinstance(value, list) else value
 
-    result: dict[str, Any] = inlined(schema)
+    result: dict[str, Any] = inline(schema)
     return result
 
 

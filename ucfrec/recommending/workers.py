@@ -153,7 +153,7 @@ class Workers:
         for _ in range(count):
             self._start()
         while not all(worker.ready for worker in self._workers):
-            for worker in self._with_news(None):
+            for worker in self._wait_for_news(None):
                 if worker.news() != "ready":
                     raise InputError(worker.failure)
         return self._workers[0].what
@@ -166,7 +166,7 @@ class Workers:
         """
         while True:
             again = min(self._missing, default=None)
-            for worker in self._with_news(again):
+            for worker in self._wait_for_news(again):
                 if worker.news() == "ended":
                     self._lose(worker)
             now = time.monotonic()
@@ -202,7 +202,7 @@ class Workers:
             process.start()
         theirs.close()
 
-    def _with_news(self, until: float | None) -> "list[_Worker]":
+    def _wait_for_news(self, until: float | None) -> "list[_Worker]":
         """Workers that reported something or ended, once there are any, or at a time."""
         seconds = None if until is None else max(0.0, until - time.monotonic())
         having = wait([worker.connection for worker in self._workers], seconds)

@@ -120,11 +120,6 @@ def test_lines_are_bounded_however_they_arrive(trained: TrainedPolicy, size: int
     assert "more than 1,000 bytes" in found[1]["error"]
 
 
-def test_a_last_line_without_an_end_is_answered(trained: TrainedPolicy) -> None:
-    (answer,) = streamed(trained, b'{"user_id": 1, "k": 2}')
-    assert len(answer["items"]) == 2
-
-
 def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolicy) -> None:
     whole = requests_of(histories(users=2))
     one, two = whole
@@ -144,14 +139,6 @@ def test_interactions_are_added_to_what_the_stream_has_had(trained: TrainedPolic
     forgot = streamed(trained, lines(parts), remember=len(two["history"]))
     alone = streamed(trained, lines([{"user_id": one["user_id"], "history": rows[3:]}]))
     pd.testing.assert_frame_equal(shown(forgot[3:4]), shown(alone), rtol=1e-5)
-
-
-def test_identifiers_with_the_same_text_are_one_user(trained: TrainedPolicy) -> None:
-    row = {"item_id": 3, "timestamp": 1_700_000_000_000, "reward": 1.0}
-    asked = [{"user_id": 7, "interactions": [row]}, {"user_id": "7"}, {"user_id": 7}]
-    _, *later = streamed(trained, lines(asked), k=40)
-    for answer in later:
-        assert 3 not in [item["item_id"] for item in answer["items"]]
 
 
 def test_a_history_replaces_what_the_stream_has_had(trained: TrainedPolicy) -> None:

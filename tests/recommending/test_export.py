@@ -176,6 +176,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(info.parent))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("example")
 def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None:
     store = store_of(tagged_log(), tmp_path, reward="reward", session_by="gap", embedding_size=6)

@@ -21,9 +21,15 @@ from ucfrec.recommending import histories
 from ucfrec.recommending.histories import histories_of_files
 from ucfrec.recommending.recommend import uniforms
 
-SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
+SETTINGS = [
+    "train.steps=30",
+    "policy.dim=16",
+    "policy.context=4",
+    "augment.copies=0",
+    "rule.choose=false",
+]
 
-SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
+SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4", "rule.choose=false"]
 
 
 def random_log(users: int = 40, items: int = 30, rows: int = 1500) -> pd.DataFrame:

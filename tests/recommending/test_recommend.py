@@ -29,7 +29,8 @@ SETTINGS = [
     "rule.choose=false",
 ]
 
-SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4", "rule.choose=false"]
+SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
+FAST = [*SMALL, "rule.choose=false"]
 
 
 def random_log(users: int = 40, items: int = 30, rows: int = 1500) -> pd.DataFrame:
@@ -98,7 +99,7 @@ def test_scores_are_the_policys_at_the_next_step(
     if observed:
         log["observation"] = list(rng.normal(size=(len(log), 2)).astype(np.float32))
     log.to_parquet(tmp_path / "log.parquet")
-    policy = Recommender("dt", settings=SMALL).fit(
+    policy = Recommender("dt", settings=FAST).fit(
         tmp_path / "log.parquet",
         tmp_path / "run",
         reward="reward",
@@ -261,7 +262,7 @@ def test_the_reward_is_the_runs_expression_unless_there_is_a_column(
     log: pd.DataFrame, tmp_path: Path
 ) -> None:
     feedback = log.rename(columns={"reward": "is_click"}).assign(seconds=range(len(log)))
-    policy = Recommender("dt", settings=SMALL).fit(feedback, reward="1 - 2 * is_click")
+    policy = Recommender("dt", settings=FAST).fit(feedback, reward="1 - 2 * is_click")
     evaluated = policy.recommend(feedback)
     given = log.assign(reward=1 - 2 * log.reward)
     pd.testing.assert_frame_equal(evaluated, policy.recommend(given))
@@ -410,7 +411,7 @@ def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.Dat
 
 def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
     sessions = log.assign(session_id=log.index % 7)
-    policy = Recommender("dt", settings=SMALL).fit(sessions, session_by="session_id")
+    policy = Recommender("dt", settings=FAST).fit(sessions, session_by="session_id")
     with pytest.raises(InputError, match="no column 'session_id'"):
         policy.recommend(log)
     with pytest.warns(InputNote, match=r"\(9: user, .* or session is missing"):
@@ -445,7 +446,7 @@ def test_items_of_many_requests_are_as_frequent_as_their_propensities(n: int) ->
 
 
 def test_later_rows_draw_again_and_a_replay_is_exact(log: pd.DataFrame) -> None:
-    policy = Recommender("dt", settings=SMALL).fit(log)
+    policy = Recommender("dt", settings=FAST).fit(log)
     rule = replace(policy.trained.rule, temperature=5.0)
     first, again, other = (policy.recommend(log, k=4, rule=rule, seed=seed) for seed in (0, 0, 1))
     pd.testing.assert_frame_equal(first, again)
@@ -467,7 +468,7 @@ def test_frames_files_and_the_store_have_the_same_histories(
     place = log.groupby("user_id").cumcount()
     log = log.assign(reward=5.0 * log.reward, session_id=100 * log.user_id + place // 7)
     log.to_parquet(tmp_path / "log.parquet")
-    policy = Recommender("dt", settings=SMALL).fit(
+    policy = Recommender("dt", settings=FAST).fit(
         tmp_path / "log.parquet", tmp_path / "run", reward="1 - reward / 5", session_by=session_by
     )
     command = ["recommend", *map(str, (tmp_path / "run", tmp_path / "log.parquet")), "--keep-seen"]

@@ -14,9 +14,6 @@ from ucfrec.acting.item_index import ItemIndex
 from ucfrec.commands.cli import main
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.recommending.histories import histories_of_frame
-from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 pytest.importorskip("faiss")
@@ -79,19 +76,6 @@ def test_what_is_found_has_its_score_and_the_recall_is_told(
     assert index.sampled == 40
     assert index.wanted == 80
     assert index.found == found < 80
-
-
-def test_recommendations_are_those_of_the_exact_search(trained: TrainedPolicy) -> None:
-    def recommended(index: ItemIndex | None) -> pd.DataFrame:
-        batches = histories_of_frame(trained, histories(), LogMapping())
-        return pd.concat(recommend(trained, batches, 5, rule=RULES[0], index=index))
-
-    exact = recommended(None)
-    found = recommended(ItemIndex(trained.scorer(RULES[0]), "ucf"))
-    columns = ["user_id", "rank", "item_id"]
-    pd.testing.assert_frame_equal(found[columns], exact[columns])
-    first = exact.groupby("user_id").score.transform("max")
-    assert (found.score - (exact.score - first)).abs().max() < 1e-4
 
 
 def test_the_command_tells_the_recall(

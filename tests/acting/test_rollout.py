@@ -94,9 +94,9 @@ def test_pooled_and_episode_averages_differ_as_defined() -> None:
 
 
 def test_bootstrap_interval_is_the_normal_one_for_many_episodes() -> None:
-    values = np.random.default_rng(0).normal(3.0, 2.0, size=4000)
+    values = np.random.default_rng(0).normal(3.0, 2.0, size=1000)
     low, high = bootstrap_interval(values, seed=1)
     error = 1.96 * values.std() / np.sqrt(len(values))
-    assert low == pytest.approx(values.mean() - error, abs=0.01)
-    assert high == pytest.approx(values.mean() + error, abs=0.01)
+    assert low == pytest.approx(values.mean() - error, abs=0.02)
+    assert high == pytest.approx(values.mean() + error, abs=0.02)
     assert bootstrap_interval(values, seed=1) == (low, high)

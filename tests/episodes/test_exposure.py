@@ -167,11 +167,6 @@ def test_gradients_are_those_of_differences(kind: str) -> None:
     assert torch.autograd.gradcheck(additions, leaves)
 
 
-def test_an_untrained_term_adds_nothing() -> None:
-    made = ExposureTerm(LAGS, KNOTS, Likeness.of(item_states("tags")))
-    assert (to_all(made, exposed(5, 0)) == 0).all()
-
-
 @given(kinds, seeds)
 def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
     made = term(kind, seed)
@@ -205,27 +200,6 @@ def test_knots_rise_and_cover_the_returns(returns: list[float]) -> None:
     for end in (0, -1):
         torch.testing.assert_close(disliked[:, end], plain[:, end])
         torch.testing.assert_close(liked[:, end], (plain + by_liking)[:, end])
-
-
-@pytest.mark.parametrize("reward", [LOW, 2.0, HIGH])
-def test_weights_are_linear_between_the_knots_and_constant_beyond(reward: float) -> None:
-    made = term("tags", 1)
-    low, high = made.knots[1], made.knots[2]
-    at = torch.stack([low, low + 0.25 * (high - low), high])
-    left, between, right = weights_at(made, at, reward).unbind(1)
-    torch.testing.assert_close(between, 0.75 * left + 0.25 * right, rtol=1e-4, atol=1e-5)
-    beyond = weights_at(made, torch.stack([made.knots[0], made.knots[0] - 5]), reward)
-    torch.testing.assert_close(beyond[:, 0], beyond[:, 1])
-
-
-def test_weights_are_linear_in_the_reward_and_constant_beyond_its_scale() -> None:
-    made, returns = term("tags", 1), torch.linspace(-3, 3, 7)
-    disliked, liked = weights_at(made, returns, LOW), weights_at(made, returns, HIGH)
-    assert (liked - disliked).abs().amax((1, 2)).min() > 0.5
-    between = weights_at(made, returns, LOW + 0.25 * (HIGH - LOW))
-    torch.testing.assert_close(between, 0.75 * disliked + 0.25 * liked, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(weights_at(made, returns, LOW - 7), disliked)
-    torch.testing.assert_close(weights_at(made, returns, HIGH + 7), liked)
 
 
 # Windows.
@@ -276,19 +250,6 @@ def test_neither_the_step_nor_what_follows_is_seen(seed: int, t: int, kind: str)
         to_all(made, Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
     )
     assert torch.equal(first[:, : t + 1], second[:, : t + 1])
-
-
-@given(seeds, st.integers(0, K - 2))
-def test_the_reward_of_a_step_is_seen_by_the_steps_after_it(seed: int, t: int) -> None:
-    before, made = windows(seed, (0,) * B), term("tags", seed)
-    rewards = before.rewards.clone()
-    rewards[:, t] = torch.where(rewards[:, t] < (LOW + HIGH) / 2, HIGH, LOW)
-    after = replace(before, rewards=rewards)
-    first, second = (
-        to_all(made, Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
-    )
-    changed = (first != second).any(2).any(0)
-    assert changed.tolist() == [t < step <= t + LAGS for step in range(K)]
 
 
 @given(seeds, kinds)

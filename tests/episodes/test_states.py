@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -62,6 +62,7 @@ def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]
     return [torch.stack(states_of_one) for states_of_one in seen]
 
 
+@settings(max_examples=50)
 @given(
     lengths=lengths_of_episodes,
     rows=st.integers(1, 9),
@@ -110,6 +111,7 @@ def test_bits_do_not_depend_on_the_batch(batch: int) -> None:
     assert torch.equal(torch.cat(parts), whole)
 
 
+@settings(max_examples=40)
 @given(
     length=st.integers(1, 15),
     window=st.integers(1, 6),

@@ -29,7 +29,7 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.export import DESCRIPTION, GRAPH, export
-from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, RuleGraph, _best
+from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, _best
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -127,12 +127,6 @@ CASES = [
 """Run, whether sessions show tastes, rule."""
 
 
-def test_a_rule_of_tags_needs_a_store_with_tags(plain: TrainedPolicy, tmp_path: Path) -> None:
-    for rule in TAGGED:
-        with pytest.raises(InputError, match="the store has none"):
-            export(plain, tmp_path / "out", rule=RULES[rule])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("run", "tastes", "rule"), CASES)
 def test_the_graph_recommends_what_the_policy_does(
@@ -182,6 +176,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(info.parent))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("example")
 def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None:
     store = store_of(tagged_log(), tmp_path, reward="reward", session_by="gap", embedding_size=6)
@@ -201,10 +196,6 @@ def test_the_graph_of_a_recurrent_plug_in_has_its_scores(tmp_path: Path) -> None
             found, expected[[*found.columns]].reset_index(drop=True),
             check_dtype=False, rtol=1e-4, atol=1e-4,
         )  # fmt: skip
-
-
-def test_by_default_all_items_of_a_small_catalogue_are_chosen(trained: TrainedPolicy) -> None:
-    assert RuleGraph(trained.scorer(), trained.name, None).k == 24
 
 
 def test_the_command_writes_it_whole_or_not_at_all(

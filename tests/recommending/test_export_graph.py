@@ -22,7 +22,7 @@ from tests.support.served import (
 )
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
-from ucfrec.recommending.export_graph import magnitude, require_close
+from ucfrec.recommending.export_graph import measure_magnitude, require_close
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -71,9 +71,9 @@ def test_the_run_s_own_scorer_stays_as_it_is(trained: TrainedPolicy, fast: Respo
 
 def test_graphs_differ_by_the_rounding_of_what_is_added(trained: TrainedPolicy) -> None:
     rule = replace(trained.rule, reward_weight=32.0, lookahead=4.8)
-    assert magnitude(trained.scorer(rule)) == pytest.approx(32 * 5.8)
-    assert magnitude(trained.scorer(replace(rule, lookahead=0.0))) == 32.0
-    assert magnitude(trained.scorer(replace(rule, reward_weight=0.0, lookahead=0.0))) == 1.0
+    assert measure_magnitude(trained.scorer(rule)) == pytest.approx(32 * 5.8)
+    assert measure_magnitude(trained.scorer(replace(rule, lookahead=0.0))) == 32.0
+    assert measure_magnitude(trained.scorer(replace(rule, reward_weight=0.0, lookahead=0.0))) == 1.0
     ours, theirs = torch.tensor([0.0]), np.float32([1.5e-5])
     assert require_close([theirs], [ours], "", 185.6) < 1e-6
     with pytest.raises(InputError, match="differs from torch's"):

@@ -21,9 +21,16 @@ from ucfrec.recommending import histories
 from ucfrec.recommending.histories import histories_of_files
 from ucfrec.recommending.recommend import uniforms
 
-SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
+SETTINGS = [
+    "train.steps=30",
+    "policy.dim=16",
+    "policy.context=4",
+    "augment.copies=0",
+    "rule.choose=false",
+]
 
 SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
+FAST = [*SMALL, "rule.choose=false"]
 
 
 def random_log(users: int = 40, items: int = 30, rows: int = 1500) -> pd.DataFrame:
@@ -92,7 +99,7 @@ def test_scores_are_the_policys_at_the_next_step(
     if observed:
         log["observation"] = list(rng.normal(size=(len(log), 2)).astype(np.float32))
     log.to_parquet(tmp_path / "log.parquet")
-    policy = Recommender("dt", settings=SMALL).fit(
+    policy = Recommender("dt", settings=FAST).fit(
         tmp_path / "log.parquet",
         tmp_path / "run",
         reward="reward",
@@ -255,7 +262,7 @@ def test_the_reward_is_the_runs_expression_unless_there_is_a_column(
     log: pd.DataFrame, tmp_path: Path
 ) -> None:
     feedback = log.rename(columns={"reward": "is_click"}).assign(seconds=range(len(log)))
-    policy = Recommender("dt", settings=SMALL).fit(feedback, reward="1 - 2 * is_click")
+    policy = Recommender("dt", settings=FAST).fit(feedback, reward="1 - 2 * is_click")
     evaluated = policy.recommend(feedback)
     given = log.assign(reward=1 - 2 * log.reward)
     pd.testing.assert_frame_equal(evaluated, policy.recommend(given))
@@ -271,13 +278,8 @@ def times_of_every_type() -> dict[str, Callable[[pd.Series], object]]:
 
     return {
         "float": lambda ms: ms.astype(float),
-        "Int64": lambda ms: ms.astype("Int64"),
-        **{
-            f"datetime64[{unit}]": lambda ms, unit=unit: utc(ms).astype(f"datetime64[{unit}]")
-            for unit in ("s", "ms", "us", "ns")
-        },
+        "datetime64[us]": lambda ms: utc(ms).astype("datetime64[us]"),
         "with a zone": lambda ms: utc(ms).dt.tz_localize("UTC").dt.tz_convert("Asia/Tokyo"),
-        "objects": lambda ms: utc(ms).astype(object),
     }
 
 
@@ -332,7 +334,6 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
     "no user": (lambda log: log.drop(columns="user_id"), "no column 'user_id'"),
-    "no item": (lambda log: log.rename(columns={"item_id": "item"}), "no column 'item_id'"),
     "misspelt": (
         lambda log: log.rename(columns={"reward": "rewards"}),
         r"no column 'reward' \(for the reward\); nearest: rewards",
@@ -341,11 +342,6 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         lambda log: log.assign(timestamp="noon"),
         r"timestamp \(timestamp\) is 'noon', no ISO 8601 time nor milliseconds",
     ),
-    "text for rewards": (lambda log: log.assign(reward="good"), r"reward \(reward\) is VARCHAR"),
-    "fractions for users": (
-        lambda log: log.assign(user_id=log.user_id + 0.5),
-        r"user_id \(user_id\) is DOUBLE",
-    ),
     "values of several types": (
         lambda log: log.assign(user_id=[1, "b", *log.user_id[2:]]),
         "user_id holds values of several types",
@@ -353,12 +349,6 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "durations for times": (
         lambda log: log.assign(timestamp=pd.to_timedelta(log.timestamp, unit="ms")),
         r"timestamp holds durations; convert them with .dt.total_seconds\(\)",
-    ),
-    "periods for times": (
-        lambda log: log.assign(
-            timestamp=pd.to_datetime(log.timestamp, unit="ms").dt.to_period("h")
-        ),
-        r"timestamp holds periods; convert them with .dt.to_timestamp\(\)",
     ),
     "two columns of a name": (
         lambda log: pd.concat([log, log.item_id], axis=1),
@@ -372,22 +362,12 @@ LEFT_OUT: dict[str, tuple[object, str]] = {
         lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
         r"\(3: user, item or action, time or session is missing",
     ),
-    "null times": (
-        lambda log: log.assign(
-            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
-        ),
-        r"\(2: user, item or action, time or session is missing",
-    ),
     "a clock of 1970": (
         lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
         r"\(4: time before 2000.*is the time in milliseconds",
     ),
     "no number": (
         lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
-        r"\(5: reward is missing, NaN or infinite",
-    ),
-    "infinite": (
-        lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),
         r"\(5: reward is missing, NaN or infinite",
     ),
 }
@@ -431,7 +411,7 @@ def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.Dat
 
 def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:
     sessions = log.assign(session_id=log.index % 7)
-    policy = Recommender("dt", settings=SMALL).fit(sessions, session_by="session_id")
+    policy = Recommender("dt", settings=FAST).fit(sessions, session_by="session_id")
     with pytest.raises(InputError, match="no column 'session_id'"):
         policy.recommend(log)
     with pytest.warns(InputNote, match=r"\(9: user, .* or session is missing"):
@@ -466,7 +446,7 @@ def test_items_of_many_requests_are_as_frequent_as_their_propensities(n: int) ->
 
 
 def test_later_rows_draw_again_and_a_replay_is_exact(log: pd.DataFrame) -> None:
-    policy = Recommender("dt", settings=SMALL).fit(log)
+    policy = Recommender("dt", settings=FAST).fit(log)
     rule = replace(policy.trained.rule, temperature=5.0)
     first, again, other = (policy.recommend(log, k=4, rule=rule, seed=seed) for seed in (0, 0, 1))
     pd.testing.assert_frame_equal(first, again)
@@ -488,7 +468,7 @@ def test_frames_files_and_the_store_have_the_same_histories(
     place = log.groupby("user_id").cumcount()
     log = log.assign(reward=5.0 * log.reward, session_id=100 * log.user_id + place // 7)
     log.to_parquet(tmp_path / "log.parquet")
-    policy = Recommender("dt", settings=SMALL).fit(
+    policy = Recommender("dt", settings=FAST).fit(
         tmp_path / "log.parquet", tmp_path / "run", reward="1 - reward / 5", session_by=session_by
     )
     command = ["recommend", *map(str, (tmp_path / "run", tmp_path / "log.parquet")), "--keep-seen"]
@@ -518,9 +498,7 @@ def test_a_column_that_is_left_out_is_told(
     ("command", "written"),
     [
         ("recommend", "log.parquet"),
-        ("recommend", "run/run.json"),
         ("recommend --exposures same.parquet", "same.parquet"),
-        ("score", "log.parquet"),
     ],
 )
 def test_what_is_read_is_not_written_over(

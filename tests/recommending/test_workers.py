@@ -256,34 +256,3 @@ def test_a_number_of_workers_out_of_range_is_one_line(
     assert main(["serve", str(trained.folder), "--workers", str(workers)]) == 2
     line = f"ucfrec serve: --workers is {workers}; give a number from 1 to 256\n"
     assert capfd.readouterr() == ("", line)
-
-
-def test_a_taken_port_is_refused_before_workers_start(
-    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert main(["serve", str(trained.folder), "--port", port, "--workers", "2"]) == 2
-    printed, errors = capfd.readouterr()
-    assert printed == ""
-    assert errors.startswith(f"ucfrec serve: cannot listen on 127.0.0.1, port {port}: ")
-    assert errors.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_a_damaged_run_is_the_same_line_as_with_one_worker(
-    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str]
-) -> None:
-    items = trained.folder / "items.parquet"
-    content = items.read_bytes()
-    try:
-        items.write_bytes(content[:-1] + b"?")
-        for workers in ("1", "3"):
-            given = ["serve", str(trained.folder), "--port", "0", "--workers", workers]
-            assert main(given) == 2
-    finally:
-        items.write_bytes(content)
-    printed, errors = capfd.readouterr()
-    one, several = errors.splitlines()
-    assert "items.parquet has another content" in one
-    assert (printed, several) == ("", one)

@@ -186,12 +186,12 @@ class DecisionRule:
             logs = torch.where(uniforms[:, -1:] < self.explore, modes[1][1], logs)
         # The largest sums of log-probability and Gumbel noise are draws without replacement.
         noise = uniforms[:, :-1].double().clamp(min=1e-300)
-        drawn = logs - torch.log(-torch.log(noise))
-        found = drawn.topk(k, dim=-1)
-        items = found.indices
+        perturbed = logs - torch.log(-torch.log(noise))
+        highest = perturbed.topk(k, dim=-1)
+        items = highest.indices
         by_score = scores.argsort(dim=-1, descending=True, stable=True)
-        if torch.isneginf(found.values).any():
-            places = drawn.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
+        if torch.isneginf(highest.values).any():
+            places = perturbed.gather(1, by_score).argsort(dim=-1, descending=True, stable=True)
             items = by_score.gather(1, places)[:, :k]
         if len(modes) == 1:
             return items, _conditional(logs, items).exp()
@@ -225,7 +225,7 @@ class DecisionRule:
         return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
 
 
-def _saved(value: object) -> DecisionRule:
+def _read_saved(value: object) -> DecisionRule:
     if isinstance(value, DecisionRule):
         return value
     if not isinstance(value, Mapping):
@@ -233,7 +233,9 @@ def _saved(value: object) -> DecisionRule:
     return DecisionRule.from_dict(value, "the rule")
 
 
-SavedRule = Annotated[DecisionRule, PlainValidator(_saved), PlainSerializer(DecisionRule.as_dict)]
+SavedRule = Annotated[
+    DecisionRule, PlainValidator(_read_saved), PlainSerializer(DecisionRule.as_dict)
+]
 """A rule as an entry of a record."""
 
 
@@ -254,14 +256,14 @@ def _conditional(logs: Tensor, items: Tensor, follows: Tensor | None = None) -> 
         follows: (B, k) whether the item is next once none is left to draw; None for always.
     """
     of_items = logs.gather(1, items)
-    rest = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
+    remainder = logs.scatter(1, items, -torch.inf).logsumexp(-1, keepdim=True)
     # What is left before each draw is summed from the end, so that nothing cancels.
-    left = torch.cat([rest, of_items.flip(1)], dim=1).logcumsumexp(1).flip(1)[:, :-1]
-    given = (of_items - left).clamp(max=0.0)
-    after = torch.zeros_like(given)
+    left = torch.cat([remainder, of_items.flip(1)], dim=1).logcumsumexp(1).flip(1)[:, :-1]
+    conditional = (of_items - left).clamp(max=0.0)
+    exhausted = torch.zeros_like(conditional)
     if follows is not None:
-        after = after.masked_fill(~follows, -torch.inf)
-    return torch.where(torch.isneginf(left), after, given)
+        exhausted = exhausted.masked_fill(~follows, -torch.inf)
+    return torch.where(torch.isneginf(left), exhausted, conditional)
 
 
 def _next_best(by_score: Tensor, items: Tensor) -> Tensor:
@@ -287,15 +289,15 @@ def best_items(scores: Tensor, k: int) -> Tensor:
     """
     if k == 1:
         return _best(scores).unsqueeze(1)
-    highest, found = _some_best(scores, k)
+    highest, numbers = _some_best(scores, k)
     tied = highest[:, 0] == highest[:, 1]
     if tied.any():
         first = _best(scores[tied]).unsqueeze(1)
         # The first comes in front, and excludes itself further back or else the last.
-        joined = torch.cat([first, found[tied]], dim=1)
+        joined = torch.cat([first, numbers[tied]], dim=1)
         again = (joined == first).index_fill(1, torch.tensor([0]), False)
-        found[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])
-    return found
+        numbers[tied] = joined.gather(1, again.int().argsort(dim=1, stable=True)[:, :k])
+    return numbers
 
 
 def _best(scores: Tensor) -> Tensor:
@@ -318,7 +320,7 @@ def _some_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
     maxima = scores[:, : blocks * size].view(len(scores), blocks, size).amax(-1)
     first = maxima.topk(k, dim=-1, sorted=False).indices * size
     numbers = (first.unsqueeze(-1) + torch.arange(size)).flatten(1)
-    rest = torch.arange(blocks * size, n).expand(len(scores), -1)
-    numbers = torch.cat([numbers, rest], dim=1)
+    remainder = torch.arange(blocks * size, n).expand(len(scores), -1)
+    numbers = torch.cat([numbers, remainder], dim=1)
     values, places = scores.gather(1, numbers).topk(k, dim=-1)
     return values, numbers.gather(1, places)

@@ -97,10 +97,10 @@ class ItemIndex:
         exactly = torch.nonzero(short | sampled)[:, 0]
         for row in exactly.tolist():
             of_row = torch.tensor([row])
-            own = left_out[1][left_out[0] == row]
-            exact = self._scorer.scores(
-                sessions.at(of_row), (torch.zeros_like(own), own), excluded, empty=True
-            ).topk(k)
+            items_out = left_out[1][left_out[0] == row]
+            row_out = torch.zeros_like(items_out), items_out
+            scores_of_row = self._scorer.scores(sessions.at(of_row), row_out, excluded, empty=True)
+            exact = scores_of_row.topk(k)
             if sampled[row]:
                 self._compare(items[row], scores[row], exact.indices[0], exact.values[0])
             if short[row]:
@@ -112,9 +112,9 @@ class ItemIndex:
         if torch.isneginf(scores[-1]):
             # The exact search answers it.
             items = exact
-        wanted = exact[~torch.isneginf(values)]
-        self.found += int(torch.isin(wanted, items).sum())
-        self.wanted += len(wanted)
+        best = exact[~torch.isneginf(values)]
+        self.found += int(torch.isin(best, items).sum())
+        self.wanted += len(best)
         self.sampled += 1
 
     def _candidates(
@@ -127,8 +127,8 @@ class ItemIndex:
         """The best k of the candidates and their scores, (B, k) each."""
         scorer, n_items = self._scorer, self._index.ntotal
         query = scorer.query(sessions)
-        part, many = scorer.weighted(query), min(n_items, 4 * k + _MORE)
-        products, numbers = self._index.search(multipliers(part), many)
+        part, count = scorer.weighted(query), min(n_items, 4 * k + _MORE)
+        products, numbers = self._index.search(multipliers(part), count)
         items, missing = torch.from_numpy(numbers), torch.from_numpy(numbers < 0)
         items = items.clamp(min=0)
         scores = scorer.scores_of_some(query, part, items, torch.from_numpy(products))

@@ -65,7 +65,7 @@ class ItemProduct:
             self._head is None
             or kind.act is not SequencePolicy.act
             or kind.act_and_features is not SequencePolicy.act_and_features
-            or not all(_are_equal(likeness[0], other) for other in likeness)
+            or not all(_are_equal(likeness[0], second) for second in likeness)
         )
         """Whether the policy scores items in a way of its own."""
         self._exposure = None if self.own else exposure
@@ -124,11 +124,11 @@ class ItemProduct:
         assert self._states is not None
         return MainTags.of(self._states)
 
-    def shown(self, shown: Shown) -> Tensor:
+    def shown(self, recent: Shown) -> Tensor:
         """(B, N) the items that repetition and likeness refer to."""
-        return _padded(shown.items, self._columns, -1)
+        return _pad(recent.items, self._columns, -1)
 
-    def policy_part(self, windows: Windows, shown: Shown) -> tuple[Tensor, Part]:
+    def policy_part(self, windows: Windows, recent: Shown) -> tuple[Tensor, Part]:
         """The policy's features (B, d) and its part, from windows with their target returns."""
         device = self._policy.state_mean.device
         normalized = self._policy.normalize(windows.to(device))
@@ -137,13 +137,13 @@ class ItemProduct:
         part = Part(features / features.shape[-1] ** 0.5, nothing, nothing)
         if self._exposure is not None:
             exposed = Exposed(
-                _padded(shown.items, self.lags, -1).to(device),
-                _padded(shown.rewards, self.lags, 0).to(device),
+                _pad(recent.items, self.lags, -1).to(device),
+                _pad(recent.rewards, self.lags, 0).to(device),
                 normalized.returns_to_go[:, -1],
             )
             repeated, alike = self._exposure.weights(exposed)
             part = part._replace(
-                repeated=_padded(repeated, self._columns, 0), alike=_padded(alike, self._columns, 0)
+                repeated=_pad(repeated, self._columns, 0), alike=_pad(alike, self._columns, 0)
             )
         if device.type != "cpu":
             return features.cpu(), Part(*(values.cpu() for values in part))
@@ -151,14 +151,14 @@ class ItemProduct:
 
     def model_part(self, sessions: Sessions, states: Tensor) -> Part:
         """The reward model's part, in states (B, S) before the steps to decide."""
-        model, shown = self._model, sessions.shown
+        model, recent = self._model, sessions.shown
         assert model is not None
-        query = model.query(states, sessions.users, model.tastes_after(shown))
-        _, repeated, alike = model.exposures(shown)
+        query = model.query(states, sessions.users, model.tastes_after(recent))
+        _, repeated, alike = model.exposures(recent)
         return Part(
             F.pad(query, (0, 1), value=1.0),
-            _padded(repeated, self._columns, 0),
-            _padded(alike, self._columns, 0),
+            _pad(repeated, self._columns, 0),
+            _pad(alike, self._columns, 0),
         )
 
     def _counts(self, policy: bool, rewards: bool) -> bool:
@@ -257,8 +257,8 @@ class ItemProduct:
         return matrix[first:last], bias if policy else torch.zeros(())
 
 
-def _are_equal(one: Likeness, other: Likeness) -> bool:
-    pairs = ((one.tags, other.tags), (one.directions, other.directions))
+def _are_equal(likeness: Likeness, reference: Likeness) -> bool:
+    pairs = ((likeness.tags, reference.tags), (likeness.directions, reference.directions))
     return all(torch.equal(first.cpu(), second.cpu()) for first, second in pairs)
 
 
@@ -273,7 +273,7 @@ def _columns(blocks: list[Tensor]) -> Tensor:
     return matrix
 
 
-def _padded(values: Tensor, length: int, padding: int) -> Tensor:
+def _pad(values: Tensor, length: int, padding: int) -> Tensor:
     """The first `length` columns of values (B, N), with more columns where there are fewer."""
     missing = max(0, length - values.shape[1])
     values = values[:, :length]

@@ -56,9 +56,9 @@ class PolicyActor:
         places = np.arange(observation_size + len(dropped))
         self._observed = torch.from_numpy(np.setdiff1d(places, dropped)[:observation_size])
         self._item_ids = item_ids
-        known = item_states is not None and len(item_states.user_features) > 0
-        known = known and user_ids is not None and user_ids.dtype.kind in "iu"
-        self._user_ids = IdLookup(user_ids) if known and user_ids is not None else None
+        has_users = item_states is not None and len(item_states.user_features) > 0
+        has_users = has_users and user_ids is not None and user_ids.dtype.kind in "iu"
+        self._user_ids = IdLookup(user_ids) if has_users and user_ids is not None else None
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
         length = max(policy.config.context - 1, 1)
@@ -93,12 +93,12 @@ class PolicyActor:
         Raises:
             InputError: items are forbidden, but the policy's actions are vectors.
         """
-        users, known = info.get(USER_IDS), self._user_ids
-        if users is not None and known is not None:
-            numbers = torch.from_numpy(known.numbers(users))
+        users, lookup = info.get(USER_IDS), self._user_ids
+        if users is not None and lookup is not None:
+            numbers = torch.from_numpy(lookup.numbers(users))
             self._sessions = replace(self._sessions, users=numbers)
         forbidden = info.get(FORBIDDEN)
-        self._forbidden = None if forbidden is None else self._in_store(forbidden)
+        self._forbidden = None if forbidden is None else self._find_in_store(forbidden)
 
     @torch.no_grad()
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
@@ -173,7 +173,7 @@ class PolicyActor:
             parts.append(forbidden.scatter_(1, self._forbidden, True)[:, :-1])
         return torch.stack(parts).any(0) if parts else None
 
-    def _in_store(self, items: IntArray) -> Tensor:
+    def _find_in_store(self, items: IntArray) -> Tensor:
         """The store's indices of the environment's items (N, L); n_items for items it lacks."""
         ids = self._item_ids
         if ids is None:

@@ -110,16 +110,16 @@ class Scorer:
         Raises:
             InputError: the rule needs what the run lacks.
         """
-        other = copy.copy(self)
-        other.rule, other._engine = rule, None
-        other._require_parts()
-        return other
+        scorer = copy.copy(self)
+        scorer.rule, scorer._engine = rule, None
+        scorer._require_parts()
+        return scorer
 
     def answering_one_with(self, engine: Engine) -> "Scorer":
         """The same, but the scores of a single session are computed by `engine`."""
-        other = copy.copy(self)
-        other._engine = engine
-        return other
+        scorer = copy.copy(self)
+        scorer._engine = engine
+        return scorer
 
     def _require_parts(self) -> None:
         rule, tags = self.rule, None if self.states is None else self.states.tags
@@ -277,7 +277,7 @@ class Scorer:
             outputs = query.outputs
             scores = self._items.scores(query.items, part, outputs, self.has_factors, rewards)
         else:
-            scores = self._composed(query)
+            scores = self._compose(query)
         if not torch.compiler.is_exporting():
             _require_scores(scores, empty=True)
         if left_out is not None:
@@ -318,7 +318,7 @@ class Scorer:
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
-    def _composed(self, query: Query) -> Tensor:
+    def _compose(self, query: Query) -> Tensor:
         """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
         rule, product, scores = self.rule, self._items, torch.zeros(())
         if rule.policy_weight:

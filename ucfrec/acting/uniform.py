@@ -50,15 +50,15 @@ class Uniform(Memoryless):
         if isinstance(self._space, spaces.Discrete):
             n_items = int(self._space.n)
             if self._forbidden is not None:
-                return self._allowed_items(self._forbidden, n_items)
+                return self._draw_allowed(self._forbidden, n_items)
             chosen = self._generator.integers(n_items, size=count)
             return chosen, np.full(count, 1.0 / n_items, dtype=np.float32)
         assert isinstance(self._space, spaces.Box)
         low, high = self._space.low, self._space.high
-        drawn = self._generator.uniform(low, high, size=(count, *low.shape))
-        return drawn.astype(np.float32), None
+        vectors = self._generator.uniform(low, high, size=(count, *low.shape))
+        return vectors.astype(np.float32), None
 
-    def _allowed_items(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, Float32Array]:
+    def _draw_allowed(self, forbidden: IntArray, n_items: int) -> tuple[IntArray, Float32Array]:
         """Draw uniformly among the allowed items; `forbidden` (N, L) is padded with −1.
 
         A rank among the allowed items is drawn, then raised by one per forbidden item up to it.

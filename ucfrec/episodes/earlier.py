@@ -46,8 +46,8 @@ class UserRows:
         if earlier is not None and later.has_users and earlier.has_users:
             begins = np.full(len(users), np.iinfo(np.int64).max)
             np.minimum.at(begins, owner, times)
-            known = later.episode_values(schema.USER).astype(np.int64)
-            more = _earlier_rows(earlier, known, owners, begins)
+            users_earlier = later.episode_values(schema.USER).astype(np.int64)
+            more = _earlier_rows(earlier, users_earlier, owners, begins)
             owner, times, source = (
                 np.concatenate(pair) for pair in zip(more, (owner, times, source), strict=True)
             )
@@ -60,7 +60,7 @@ class UserRows:
 
     def values(self, name: str, rows: IntArray) -> Array:
         """Values of a step column at rows of any shape."""
-        return _joined(name, self.later, self.earlier, self.source[rows])
+        return _join(name, self.later, self.earlier, self.source[rows])
 
     def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
         """(rows, items), each (M,): the known items in all rows of the user before later steps
@@ -107,41 +107,39 @@ def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray
 
 
 def _earlier_rows(
-    earlier: EpisodeStore, known: IntArray, owners: IntArray, begins: IntArray
+    earlier: EpisodeStore, users_earlier: IntArray, owners: IntArray, begins: IntArray
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Owner, time (ms) and source of the earlier rows of users, in the order of the store.
 
     Args:
-        known: (E,) its number of the user of each later episode; −1 for others.
+        users_earlier: (E,) its number of the user of each later episode; −1 for others.
         owners: (E,) that user's number among the later ones.
         begins: (U,) time at which the user's later rows begin.
     """
-    numbers = np.full(max(int(known.max(initial=-1)), 0) + 2, -1)
-    numbers[known[known >= 0]] = owners[known >= 0]
+    numbers = np.full(max(int(users_earlier.max(initial=-1)), 0) + 2, -1)
+    numbers[users_earlier[users_earlier >= 0]] = owners[users_earlier >= 0]
     users = earlier.episode_values(schema.USER).astype(np.int64)
     owner_of = numbers[np.where((users >= 0) & (users < len(numbers) - 1), users, -1)]
     parts = []
     taken = 0
     for episodes, steps in earlier.step_batches():
         owner = owner_of[episodes]
-        wanted = np.flatnonzero(owner >= 0)
-        times = _times(earlier, episodes[wanted], steps[wanted])
-        before = times < begins[owner[wanted]]
-        rows = wanted[before]
-        parts.append((owner[rows], times[before], -1 - (taken + rows)))
+        candidates = np.flatnonzero(owner >= 0)
+        times = _times(earlier, episodes[candidates], steps[candidates])
+        is_earlier = times < begins[owner[candidates]]
+        rows = candidates[is_earlier]
+        parts.append((owner[rows], times[is_earlier], -1 - (taken + rows)))
         taken += len(steps)
-    owner, times, source = (np.concatenate(each) for each in zip(*parts, strict=True))
+    owner, times, source = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return owner, times, source
 
 
-def _joined(
-    name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray
-) -> Array:
+def _join(name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray) -> Array:
     """Values of a step column at sources of any shape; see `UserRows.source`."""
     values = later.step_values(name, *later.locate(np.maximum(source, 0)))
-    before: BoolArray = source < 0
-    if earlier is not None and before.any():
-        values[before] = earlier.step_values(name, *earlier.locate(-1 - source[before]))
+    is_earlier: BoolArray = source < 0
+    if earlier is not None and is_earlier.any():
+        values[is_earlier] = earlier.step_values(name, *earlier.locate(-1 - source[is_earlier]))
     return values
 
 
@@ -157,7 +155,7 @@ class _JoinedColumn(StepColumn):
 
     def take(self, index: IntArray) -> Array:
         """A copy of the values at the indices `index`, of any shape."""
-        return _joined(self._name, self._rows.later, self._rows.earlier, self._source[index])
+        return _join(self._name, self._rows.later, self._rows.earlier, self._source[index])
 
     def between(self, begin: int, end: int) -> Array:
         """The values from index `begin` to before `end`."""
@@ -177,11 +175,11 @@ class _ContinuedColumns(Columns):
         lengths = later.lengths + counts
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
-        own = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
+        numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
         source = np.where(
-            inside >= 0, own, rows.source[np.repeat(begin, lengths) + inside.clip(max=0)]
+            inside >= 0, numbers, rows.source[np.repeat(begin, lengths) + inside.clip(max=0)]
         )
-        rewards = _joined(schema.REWARD, later, rows.earlier, source)
+        rewards = _join(schema.REWARD, later, rows.earlier, source)
         arrays = {
             name: later.episode_values(name)
             for name in schema.EPISODE_DTYPES

@@ -50,12 +50,12 @@ class Shown(NamedTuple):
             length: N.
         """
         earlier = steps[:, None] - np.arange(1, length + 1)
-        before, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
+        missing, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
         items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
         rewards = store.step_values(schema.REWARD, *places)
         return cls(
-            torch.from_numpy(np.where(before, -1, items)),
-            torch.from_numpy(np.where(before, np.float32(0), rewards)),
+            torch.from_numpy(np.where(missing, -1, items)),
+            torch.from_numpy(np.where(missing, np.float32(0), rewards)),
         )
 
     def at(self, rows: slice | int | Tensor) -> "Shown":
@@ -91,11 +91,11 @@ class Exposed:
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
         """For the last step of B windows, as `before`, (B, lags)."""
-        shown = Shown.before_last(windows.last(lags + 1))
-        missing = lags - shown.items.shape[1]
+        recent = Shown.before_last(windows.last(lags + 1))
+        missing = lags - recent.items.shape[1]
         return cls(
-            nn.functional.pad(shown.items, (0, missing), value=-1),
-            nn.functional.pad(shown.rewards, (0, missing)),
+            nn.functional.pad(recent.items, (0, missing), value=-1),
+            nn.functional.pad(recent.rewards, (0, missing)),
             windows.returns_to_go[:, -1],
         )
 
@@ -152,8 +152,8 @@ class Likeness(nn.Module):
             self.directions.copy_(nn.functional.normalize(states.embeddings, dim=1))
         self._forget()
 
-    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        super()._load_from_state_dict(*arguments, **options)
         self._forget()
 
     def _count(self) -> int:
@@ -223,8 +223,8 @@ class Likeness(nn.Module):
             return flat.view(shape)
         tags = self.tags[items]
         places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
-        read = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
-        return read.view(*shape, tags.shape[2]).sum(3)
+        gathered = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
+        return gathered.view(*shape, tags.shape[2]).sum(3)
 
     def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
         """Likeness (M, D) by tags to the D different sets of tags, and the set of every item.

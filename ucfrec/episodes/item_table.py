@@ -53,12 +53,14 @@ def write_item_table(
     if tags is not None and tags.shape[1]:
         arrays["tags"] = tags
     plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    about = json.dumps(numbers)
+    metadata = json.dumps(numbers)
     with atomic_file(path) as scratch:
         scratch.touch()
         mode = scratch.stat().st_mode
         try:
-            save_file(plain, scratch, metadata={"about": f"{about}\n{_checksum(plain, about)}"})
+            save_file(
+                plain, scratch, metadata={"about": f"{metadata}\n{_checksum(plain, metadata)}"}
+            )
             # safetensors restricts its files to their owner; give them the usual permissions.
             scratch.chmod(mode)
         except SafetensorError as error:
@@ -67,9 +69,9 @@ def write_item_table(
             ) from None
 
 
-def _checksum(arrays: Mapping[str, Array], about: str) -> str:
+def _checksum(arrays: Mapping[str, Array], metadata: str) -> str:
     """The checksum that `ucfrec.fitting.checkpoint.load_tensors` verifies."""
-    digest = xxhash.xxh3_64(about.encode())
+    digest = xxhash.xxh3_64(metadata.encode())
     for name in sorted(arrays):
         array = arrays[name]
         digest.update(f"\n{name} torch.{array.dtype.name} {list(array.shape)}\n".encode())
@@ -93,17 +95,17 @@ class IdLookup:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def numbers(self, wanted: Array) -> IntArray:
+    def numbers(self, ids: Array) -> IntArray:
         """Number of each of the identifiers (N,), int64; −1 for those that are not listed."""
-        if not (len(wanted) and len(self.ids)):
-            return np.full(len(wanted), -1)
-        if self._whole and np.can_cast(wanted.dtype, np.int64):
+        if not (len(ids) and len(self.ids)):
+            return np.full(len(ids), -1)
+        if self._whole and np.can_cast(ids.dtype, np.int64):
             # One search costs less than a table for as few as a request has.
-            places = np.minimum(np.searchsorted(self._sorted, wanted), len(self._sorted) - 1)
-            return np.where(self._sorted[places] == wanted, self._order[places], -1)
+            places = np.minimum(np.searchsorted(self._sorted, ids), len(self._sorted) - 1)
+            return np.where(self._sorted[places] == ids, self._order[places], -1)
         table = self._of_text
-        return np.array([table.get(str(each), -1) for each in wanted.tolist()], dtype=np.int64)
+        return np.array([table.get(str(value), -1) for value in ids.tolist()], dtype=np.int64)
 
     @cached_property
     def _of_text(self) -> dict[str, int]:
-        return {str(each): number for number, each in enumerate(self.ids.tolist())}
+        return {str(value): number for number, value in enumerate(self.ids.tolist())}

@@ -23,5 +23,5 @@ def of_people(view: "EpisodeStore") -> "EpisodeStore":
     """
     if not view.n_episodes:
         return view
-    kept = view.lengths <= LONG * np.median(view.lengths)
-    return view if kept.all() else view.select(np.flatnonzero(kept))
+    usual = view.lengths <= LONG * np.median(view.lengths)
+    return view if usual.all() else view.select(np.flatnonzero(usual))

@@ -77,12 +77,12 @@ class Sessions:
         places = np.arange(len(owner)) - np.cumsum(counts)[owner] + length
         recent = places >= 0
         at = owner[recent], places[recent]
-        shown = np.full((len(users), length), -1)
+        recent_items = np.full((len(users), length), -1)
         received = np.zeros((len(users), length), dtype=np.float32)
-        shown[at], received[at] = items[recent], rewards[recent]
+        recent_items[at], received[at] = items[recent], rewards[recent]
         collected = np.bincount(owner, rewards, minlength=len(users)).astype(np.float64)
         return cls(
-            torch.from_numpy(shown),
+            torch.from_numpy(recent_items),
             torch.from_numpy(received),
             torch.from_numpy(counts),
             torch.from_numpy(collected),
@@ -105,13 +105,13 @@ class Sessions:
             length: L, items that are read one by one; as many as the context has in any case.
         """
         context = min(context, int(steps.max(initial=0)) + 1)
-        shown = Shown.before(store, episodes, steps, max(length, context - 1))
+        recent = Shown.before(store, episodes, steps, max(length, context - 1))
         users = np.full(len(steps), -1)
         if store.has_users:
             users = store.episode_values(schema.USER).astype(np.int64)[episodes]
         return cls(
-            shown.items.flip(1),
-            shown.rewards.flip(1),
+            recent.items.flip(1),
+            recent.rewards.flip(1),
             torch.from_numpy(steps),
             torch.from_numpy(store.rewards_before(episodes, steps)),
             torch.from_numpy(users),
@@ -167,18 +167,18 @@ class Sessions:
         numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
         if self.states is None:
             assert states is not None
-            known = self._built_states(states, numbers.clamp(min=0))
+            window_states = self._build_states(states, numbers.clamp(min=0))
         else:
-            known = self.states[:, -context:]
+            window_states = self.states[:, -context:]
         first = self.actions.shape[1] - context + 1
         return Windows.of(
             numbers,
-            known,
+            window_states,
             F.pad(self.actions[:, first:], (0, 0, 0, 1) if vectors else (0, 1)),
             F.pad(self.rewards[:, first:], (0, 1)),
         )
 
-    def _built_states(self, states: ItemStates, steps: Tensor) -> Tensor:
+    def _build_states(self, states: ItemStates, steps: Tensor) -> Tensor:
         """States (B, K, S) of steps (B, K), the last ones."""
         context = steps.shape[1]
         reach = context - 1 + states.window

@@ -70,8 +70,8 @@ class ItemStates:
                 "reward_low must be below reward_high"
             )
         # Index −1 ("no item", "unknown user") selects this last row of zeros.
-        object.__setattr__(self, "_items", _with_zero_row(self.embeddings))
-        object.__setattr__(self, "_users", _with_zero_row(self.user_features))
+        object.__setattr__(self, "_items", _add_zero_row(self.embeddings))
+        object.__setattr__(self, "_users", _add_zero_row(self.user_features))
         decays = [self.decay**lag for lag in reversed(range(self.window))]
         object.__setattr__(self, "_decays", torch.tensor(decays))
 
@@ -151,5 +151,5 @@ def _is_real(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _with_zero_row(table: Tensor) -> Tensor:
+def _add_zero_row(table: Tensor) -> Tensor:
     return torch.cat([table.float(), torch.zeros(1, table.shape[1])])

@@ -204,13 +204,13 @@ def _as_array(values: "pd.Series[Any]") -> pa.Array:
     if pa.types.is_duration(array.type):
         raise _UnusableError("holds durations; convert them with .dt.total_seconds()")
     dates = values.dtype == object and pa.types.is_date(array.type)
-    if dates and any(isinstance(each, datetime) for each in values):
+    if dates and any(isinstance(value, datetime) for value in values):
         # Arrow would cut off the time of day.
         raise _UnusableError("holds dates and times; convert them with pandas.to_datetime")
     if pa.types.is_float16(array.type):
         return array.cast(pa.float32())
-    for lacking in filter(_is_lacking, _types_in(array.type)):
-        raise _UnusableError(f"is of type {lacking}, which is not read; convert it")
+    for unsupported in filter(_is_lacking, _types_in(array.type)):
+        raise _UnusableError(f"is of type {unsupported}, which is not read; convert it")
     return array
 
 
@@ -226,8 +226,14 @@ def _types_in(kind: pa.DataType) -> Iterator[pa.DataType]:
 def _is_lacking(kind: pa.DataType) -> bool:
     """Whether the engine or Parquet lacks a type of Arrow."""
     of = pa.types
-    lacking = (of.is_float16, of.is_decimal256, of.is_interval, of.is_run_end_encoded, of.is_union)
-    return any(each(kind) for each in lacking) or (of.is_struct(kind) and not kind.num_fields)
+    unsupported = (
+        of.is_float16,
+        of.is_decimal256,
+        of.is_interval,
+        of.is_run_end_encoded,
+        of.is_union,
+    )
+    return any(each(kind) for each in unsupported) or (of.is_struct(kind) and not kind.num_fields)
 
 
 def _require_items(log: TypedLog) -> None:
@@ -250,11 +256,11 @@ def _histories(
     log, codes = sorted_rows.log, rows[USER]
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
     ends = np.append(first[1:], len(codes))
-    kept = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
-    offsets = np.append(0, np.cumsum(kept)[ends - 1])
+    recent = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
+    offsets = np.append(0, np.cumsum(recent)[ends - 1])
 
     def lists(name: str, of: Callable[[Array], pa.Array]) -> pa.ListArray:
-        return _lists(offsets, of(rows[name][kept]))
+        return _lists(offsets, of(rows[name][recent]))
 
     query = (
         f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "

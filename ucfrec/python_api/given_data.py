@@ -27,7 +27,7 @@ from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
 from ucfrec.logs.summary import MANY
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
-from ucfrec.recommending.histories import Histories, histories_of_frame, of_some_users
+from ucfrec.recommending.histories import Histories, histories_of_frame, select_users
 from ucfrec.runs.later_logs import later_logs
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -223,7 +223,7 @@ def histories_given(
         frame = _stored(trained, wanted)
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
     histories = histories_of_frame(trained, frame, _mapping(mapping), stored)
-    return histories if wanted is None else of_some_users(histories, wanted)
+    return histories if wanted is None else select_users(histories, wanted)
 
 
 def _stored(trained: TrainedPolicy, users: Array | None) -> pd.DataFrame:

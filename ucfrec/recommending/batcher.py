@@ -75,7 +75,7 @@ class Batcher:
     async def _run(self) -> None:
         while batch := self._next():
             began = time.perf_counter()
-            requests = [each.request for each in batch]
+            requests = [waiting.request for waiting in batch]
             loop = asyncio.get_running_loop()
             try:
                 outcomes: Sequence[Outcome | Exception] = await loop.run_in_executor(
@@ -84,13 +84,13 @@ class Batcher:
             except Exception as error:  # a bug, or out of memory; every caller receives it
                 outcomes = [error] * len(batch)
             self._metrics.batch(len(batch), time.perf_counter() - began)
-            for each, outcome in zip(batch, outcomes, strict=True):
-                if each.outcome.done():
+            for waiting, outcome in zip(batch, outcomes, strict=True):
+                if waiting.outcome.done():
                     continue
                 if isinstance(outcome, Exception) and not isinstance(outcome, InputError):
-                    each.outcome.set_exception(outcome)
+                    waiting.outcome.set_exception(outcome)
                 else:
-                    each.outcome.set_result(outcome)
+                    waiting.outcome.set_result(outcome)
 
     def _next(self) -> list[_Waiting]:
         batch: list[_Waiting] = []

@@ -18,9 +18,9 @@ from ucfrec.recommending.export_graph import (
     INPUTS,
     OUTPUTS,
     RuleGraph,
-    inputs_of,
-    magnitude,
-    random_sessions,
+    draw_sessions,
+    measure_magnitude,
+    name_inputs,
     require_close,
     require_installed,
     run_graph,
@@ -62,19 +62,19 @@ def export(
     graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
     with atomic_folder(out) as scratch:
         _write(graph, scratch / GRAPH, trained.name)
-        difference = max(_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
+        difference = max(_measure_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
         sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
-        about = _description(graph, trained) | {"files": list(sizes)}
-        write_json(scratch / DESCRIPTION, about)
+        description = _describe_graph(graph, trained) | {"files": list(sizes)}
+        write_json(scratch / DESCRIPTION, description)
     return Exported(sum(sizes.values()), difference)
 
 
-def _arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
+def _draw_arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
     """Random inputs of the graph, in the order of its arguments."""
     states = graph.scorer.states
     assert states is not None
     n, rng = len(states.embeddings), np.random.default_rng(seed)
-    values = inputs_of(random_sessions(graph.scorer, sessions, seed))
+    values = name_inputs(draw_sessions(graph.scorer, sessions, seed))
     left_out = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
     values[EXCLUDED] = torch.from_numpy(left_out)
     names = (*INPUTS[:-1], EXCLUDED, INPUTS[-1])
@@ -82,39 +82,39 @@ def _arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
 
 
 def _write(graph: RuleGraph, path: Path, kind: str) -> None:
-    arguments = _arguments(graph, 3, seed=0)
+    arguments = _draw_arguments(graph, 3, seed=0)
     batch = torch.export.Dim("batch", min=1, max=2**20)
-    shapes: dict[str, Any] = {each: {0: batch} for each in arguments}
+    shapes: dict[str, Any] = {name: {0: batch} for name in arguments}
     shapes[EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
-    given: tuple[Any, ...] = tuple(arguments.values())
+    inputs: tuple[Any, ...] = tuple(arguments.values())
     if INPUTS[-1] not in arguments:
         shapes[INPUTS[-1]] = None
-        given = (*given, None)
-    write_graph(graph, given, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
+        inputs = (*inputs, None)
+    write_graph(graph, inputs, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
 
 
-def _difference(graph: RuleGraph, path: Path, sessions: int) -> float:
+def _measure_difference(graph: RuleGraph, path: Path, sessions: int) -> float:
     """Largest difference of the graph's scores to torch's; see `require_close`."""
     import onnxruntime
 
-    arguments = _arguments(graph, sessions, seed=sessions)
+    arguments = _draw_arguments(graph, sessions, seed=sessions)
     runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     scores, _, top_scores = run_graph(runner, arguments)
     with torch.no_grad():
         expected, _, top_expected = graph(*arguments.values())
-    size = magnitude(graph.scorer)
+    size = measure_magnitude(graph.scorer)
     return require_close((scores, top_scores), (expected, top_expected), _REMEDY, size)
 
 
-def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
+def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
     rule, record = graph.scorer.rule, trained.record
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
-        "inputs": _inputs(graph.scorer, record.observation_size),
-        "outputs": _outputs(len(trained.items), graph.k),
+        "inputs": _describe_inputs(graph.scorer, record.observation_size),
+        "outputs": _describe_outputs(len(trained.items), graph.k),
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, policy_weight, reward_weight, "
@@ -133,28 +133,28 @@ def _description(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     }
 
 
-def _inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
+def _describe_inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
     b, length = "batch", scorer.length
-    shown = "index of each item shown in the session, the latest last; -1 before the session began"
+    items = "index of each item shown in the session, the latest last; -1 before the session began"
     excluded = (
         "items that may not be shown, e.g. those already seen; padded with -1, at least one column"
     )
     inputs = [
-        _entry("items", "int64", [b, length], shown),
-        _entry("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
-        _entry("steps", "int64", [b], "number of items that the session has shown"),
-        _entry("collected", "float64", [b], "sum of the rewards of the session"),
-        _entry("users", "int64", [b], "index of the user in user_ids; -1 for others"),
-        _entry("excluded", "int64", [b, "excluded_items"], excluded),
+        _describe("items", "int64", [b, length], items),
+        _describe("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
+        _describe("steps", "int64", [b], "number of items that the session has shown"),
+        _describe("collected", "float64", [b], "sum of the rewards of the session"),
+        _describe("users", "int64", [b], "index of the user in user_ids; -1 for others"),
+        _describe("excluded", "int64", [b, "excluded_items"], excluded),
     ]
     if observed:
         shape: list[int | str] = [b, scorer.policy.config.context, observed]
         last = "of the last steps, the one to decide included; `ucfrec recommend` repeats the last"
-        inputs.append(_entry("observations", "float32", shape, last))
+        inputs.append(_describe("observations", "float32", shape, last))
     return inputs
 
 
-def _outputs(items: int, k: int) -> list[dict[str, Any]]:
+def _describe_outputs(items: int, k: int) -> list[dict[str, Any]]:
     b = "batch"
     scores = (
         "policy_weight times the policy's log-probability plus reward_weight times what the reward "
@@ -162,11 +162,13 @@ def _outputs(items: int, k: int) -> list[dict[str, Any]]:
         "`excluded`, tag_window or tag_run leave out"
     )
     return [
-        _entry("scores", "float32", [b, items], scores),
-        _entry("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
-        _entry("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
+        _describe("scores", "float32", [b, items], scores),
+        _describe("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
+        _describe(
+            "top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"
+        ),
     ]
 
 
-def _entry(name: str, dtype: str, shape: list[int | str], meaning: str) -> dict[str, Any]:
+def _describe(name: str, dtype: str, shape: list[int | str], meaning: str) -> dict[str, Any]:
     return {"name": name, "dtype": dtype, "shape": shape, "meaning": meaning}

@@ -123,16 +123,16 @@ def _best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return torch.where(left, items, -1), torch.where(left, values - total, -torch.inf)
 
 
-def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
+def draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     """Random sessions of at most twice as many steps as the scorer reads."""
     states, length = scorer.states, scorer.length
     assert states is not None
     rng = np.random.default_rng(seed)
     steps = rng.integers(0, 2 * length + 1, size=sessions)
-    shown = np.arange(length) >= length - steps[:, None]
-    items = np.where(shown, rng.integers(len(states.embeddings), size=shown.shape), -1)
-    rewards = rng.choice([states.reward_low, states.reward_high], size=shown.shape)
-    rewards = np.where(shown, rewards, 0.0).astype(np.float32)
+    inside = np.arange(length) >= length - steps[:, None]
+    items = np.where(inside, rng.integers(len(states.embeddings), size=inside.shape), -1)
+    rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
+    rewards = np.where(inside, rewards, 0.0).astype(np.float32)
     users = rng.integers(-1, max(1, len(states.user_features)), size=sessions)
     observed, observations = scorer.policy.state_mean.shape[0] - states.size, None
     if observed:
@@ -148,7 +148,7 @@ def random_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
     )
 
 
-def inputs_of(sessions: Sessions) -> dict[str, Tensor]:
+def name_inputs(sessions: Sessions) -> dict[str, Tensor]:
     """The inputs of a graph, by name."""
     values = {"items": sessions.actions} | {name: getattr(sessions, name) for name in INPUTS[1:]}
     return {name: value for name, value in values.items() if value is not None}
@@ -156,13 +156,13 @@ def inputs_of(sessions: Sessions) -> dict[str, Tensor]:
 
 def run_graph(session: Any, inputs: dict[str, Tensor]) -> list[Array]:
     """All outputs of an `onnxruntime.InferenceSession`."""
-    found: list[Array] = session.run(
+    outputs: list[Array] = session.run(
         None, {name: value.contiguous().numpy() for name, value in inputs.items()}
     )
-    return found
+    return outputs
 
 
-def magnitude(scorer: Scorer) -> float:
+def measure_magnitude(scorer: Scorer) -> float:
     """Size of what is added up to a score under the scorer's rule, at least 1.
 
     A sum is rounded relative to its terms, even if what is left of them is about 0.
@@ -176,18 +176,18 @@ def magnitude(scorer: Scorer) -> float:
 
 
 def require_close(
-    found: Iterable[Array], expected: Iterable[Tensor], remedy: str, size: float
+    outputs: Iterable[Array], expected: Iterable[Tensor], remedy: str, size: float
 ) -> float:
     """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
 
     Args:
-        size: see `magnitude`.
+        size: see `measure_magnitude`.
 
     Raises:
         InputError: it is beyond the tolerance.
     """
     largest = 0.0
-    for theirs, tensor in zip(found, expected, strict=True):
+    for theirs, tensor in zip(outputs, expected, strict=True):
         ours = tensor.numpy()
         same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
         finite = np.isfinite(ours) & np.isfinite(theirs)
@@ -269,14 +269,14 @@ def write_graph(
 @contextlib.contextmanager
 def _quiet() -> Any:
     """Keep the exporter from printing."""
-    before = logging.root.manager.disable
+    level = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logging.disable(before)
+        logging.disable(level)
 
 
 class ScoreGraph:
@@ -300,7 +300,7 @@ class ScoreGraph:
         import onnxruntime
 
         session, excluded = _example(scorer, seed=0)
-        example = {**inputs_of(session), EXCLUDED: excluded}
+        example = {**name_inputs(session), EXCLUDED: excluded}
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         with tempfile.TemporaryDirectory() as folder:
@@ -310,7 +310,7 @@ class ScoreGraph:
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
-        size = magnitude(scorer)
+        size = measure_magnitude(scorer)
         for number in range(1, 1 + _COMPARED):
             session, excluded = _example(scorer, seed=number)
             expected = scorer.scores(session, excluded=excluded, empty=True)
@@ -319,7 +319,7 @@ class ScoreGraph:
     def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
         """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be
         shown."""
-        inputs = {**inputs_of(session), EXCLUDED: excluded}
+        inputs = {**name_inputs(session), EXCLUDED: excluded}
         return torch.from_numpy(run_graph(self._session, inputs)[0])
 
 
@@ -328,12 +328,12 @@ def _example(scorer: Scorer, seed: int) -> tuple[Sessions, Tensor]:
     assert scorer.states is not None
     rng, items = np.random.default_rng(seed), len(scorer.states.embeddings)
     excluded = rng.random((1, items)) < rng.uniform(0, _MOST_EXCLUDED)
-    return random_sessions(scorer, 1, seed), torch.from_numpy(excluded)
+    return draw_sessions(scorer, 1, seed), torch.from_numpy(excluded)
 
 
 def _modules(scorer: Scorer) -> nn.ModuleList:
     models = (scorer.policy, scorer.reward_model)
-    return nn.ModuleList(each for each in models if each is not None)
+    return nn.ModuleList(model for model in models if model is not None)
 
 
 class _Network(nn.Module):

@@ -55,15 +55,15 @@ def exposures_written(
         frames: of `recommend`.
     """
     columns, now = exposure_schema(trained), int(time.time() * 1000)
-    about: dict[str, str | int] = {
+    constants: dict[str, str | int] = {
         schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
     }  # fmt: skip
 
     def passed() -> Iterator[pd.DataFrame]:
         for frame in frames:
-            shown = frame.rename(columns={RANK: schema.POSITION}).assign(**about)
-            shown[schema.USER_ID] = shown[schema.USER_ID].astype(str)
-            table = pa.Table.from_pandas(shown[columns.names], columns, preserve_index=False)
+            exposures = frame.rename(columns={RANK: schema.POSITION}).assign(**constants)
+            exposures[schema.USER_ID] = exposures[schema.USER_ID].astype(str)
+            table = pa.Table.from_pandas(exposures[columns.names], columns, preserve_index=False)
             writer.write_table(table)
             yield frame
 
@@ -155,10 +155,10 @@ class ExposureLog:
     def _table(self, waiting: list[tuple[str, int, Answer]]) -> pa.Table:
         columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
         for user_id, now, answer in waiting:
-            shown = len(answer.items)
+            size = len(answer.items)
             columns[schema.ITEM_ID] += answer.items
             columns[schema.PROPENSITY] += answer.propensities
-            columns[schema.POSITION] += range(1, shown + 1)
+            columns[schema.POSITION] += range(1, size + 1)
             for name, value in (
                 (schema.USER_ID, user_id),
                 (schema.TIMESTAMP, now),
@@ -167,7 +167,7 @@ class ExposureLog:
                 (schema.RULE, answer.rule),
                 (schema.ARM, answer.arm),
             ):
-                columns[name] += [value] * shown
+                columns[name] += [value] * size
         return pa.table(columns, self._schema)
 
 

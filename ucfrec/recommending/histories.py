@@ -55,11 +55,11 @@ class Histories:
     @classmethod
     def from_batch(cls, batch: pa.RecordBatch) -> Self:
         """Convert a batch of `ucfrec.logs.histories.read_histories`, one row per user."""
-        owner, item_ids = _flat(batch.column("item_ids"))
-        seen_owner, seen_ids = _flat(batch.column("seen"))
+        owner, item_ids = _flatten(batch.column("item_ids"))
+        seen_owner, seen_ids = _flatten(batch.column("seen"))
         session_ids = observations = None
         if "session_ids" in batch.schema.names:
-            session_ids = _flat(batch.column("session_ids"))[1]
+            session_ids = _flatten(batch.column("session_ids"))[1]
         if schema.OBSERVATION in batch.schema.names:
             column = batch.column(schema.OBSERVATION)
             observations = np.asarray(column.flatten(), np.float32).reshape(len(column), -1)
@@ -67,8 +67,8 @@ class Histories:
             users=np.asarray(batch.column(schema.USER_ID)),
             owner=owner,
             item_ids=item_ids,
-            rewards=_flat(batch.column("rewards"))[1].astype(np.float32),
-            timestamps=_flat(batch.column("timestamps"))[1].astype(np.int64),
+            rewards=_flatten(batch.column("rewards"))[1].astype(np.float32),
+            timestamps=_flatten(batch.column("timestamps"))[1].astype(np.int64),
             session_ids=session_ids,
             seen_owner=seen_owner,
             seen_ids=seen_ids,
@@ -82,7 +82,7 @@ class Histories:
         Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
         int64, and `reward`, a number; no row is out of range.
         """
-        columns = _plain_columns(frame, by_id)
+        columns = _read_plain_columns(frame, by_id)
         if columns is None:
             return None
         rewards, users, items, times, *sessions = columns
@@ -96,7 +96,7 @@ class Histories:
         if by_id:
             table["session"] = sessions[0]
         order = kept_in_order(table, duplicates)
-        rewards, users, items, times, *sessions = (each[order] for each in columns)
+        rewards, users, items, times, *sessions = (values[order] for values in columns)
         same_user = users[1:] == users[:-1]
         owner = np.concatenate([[0], np.cumsum(~same_user)])
         ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
@@ -163,8 +163,8 @@ class Histories:
 
     def of_users(self, numbers: IntArray) -> "Histories":
         """The users with the given numbers (M,), in that order."""
-        owner, rows = _of_owners(self.owner, numbers)
-        seen_owner, seen = _of_owners(self.seen_owner, numbers)
+        owner, rows = _find_rows(self.owner, numbers)
+        seen_owner, seen = _find_rows(self.seen_owner, numbers)
         sessions, observations = self.session_ids, self.observations
         return Histories(
             users=self.users[numbers],
@@ -235,7 +235,7 @@ def histories_of_frame(
     """
     by_id = session_by(trained) == schema.SESSION_ID
     computed = not stored and computes_with_reward(trained.record.reward)
-    plain_names = mapping == LogMapping() and not _concerned(trained, frame)
+    plain_names = mapping == LogMapping() and not _is_concerned(trained, frame)
     if not (trained.record.observation_size or computed) and plain_names:
         plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
         if plain is not None:
@@ -252,28 +252,28 @@ def histories_of_frame(
     return map(Histories.from_batch, batches)
 
 
-def of_some_users(batches: Iterable[Histories], users: Array) -> Iterator[Histories]:
+def select_users(batches: Iterable[Histories], users: Array) -> Iterator[Histories]:
     """The histories of the named users only, in the order of `batches`.
 
     Raises:
         InputError: one of them has no rows; once all are read.
     """
-    wanted = IdLookup(pd.unique(users))
-    found = np.zeros(len(wanted), dtype=bool)
+    lookup = IdLookup(pd.unique(users))
+    has_rows = np.zeros(len(lookup), dtype=bool)
     for batch in batches:
-        numbers = wanted.numbers(batch.users)
-        found[numbers[numbers >= 0]] = True
+        numbers = lookup.numbers(batch.users)
+        has_rows[numbers[numbers >= 0]] = True
         if (numbers >= 0).any():
             yield batch.of_users(np.flatnonzero(numbers >= 0))
-    if not found.all():
-        lacking = wanted.ids[~found]
+    if not has_rows.all():
+        missing = lookup.ids[~has_rows]
         raise InputError(
-            f"{len(lacking):,} of {len(wanted):,} users have no rows in the histories, such as "
-            f"{lacking[0]}; leave them out, or add rows"
+            f"{len(missing):,} of {len(lookup):,} users have no rows in the histories, such as "
+            f"{missing[0]}; leave them out, or add rows"
         )
 
 
-def _of_owners(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
+def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
     """Of the rows of the users `numbers` (M,), user by user: the place of the user among the M, and
     the index in `owner`, which is sorted."""
     starts, ends = (np.searchsorted(owner, numbers, side=side) for side in ("left", "right"))
@@ -282,7 +282,7 @@ def _of_owners(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
     return place, np.arange(len(place)) + (ends - np.cumsum(lengths))[place]
 
 
-def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
+def _read_plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     """Rewards, users, items, times and perhaps sessions for `Histories.from_plain`, (N,) each."""
     if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
         return None
@@ -290,7 +290,7 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     if frame.shape[1] != len(names) + 1 or not {*names, schema.REWARD} <= {*frame.columns}:
         return None
     keys, rewards = [frame[name].to_numpy() for name in names], frame[schema.REWARD].to_numpy()
-    if any(each.dtype != np.int64 for each in keys):
+    if any(values.dtype != np.int64 for values in keys):
         return None
     if rewards.dtype not in (np.float64, np.float32, np.int64, np.bool_):
         return None
@@ -301,7 +301,7 @@ def _plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
     return [rewards, *keys] if fine else None
 
 
-def _concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
+def _is_concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
     """Whether what the run remembers of its training log may mean columns of the frame."""
     source, names = trained.record.data, {str(n).casefold() for n in getattr(frame, "columns", ())}
     texts = [*source.mapping.values(), source.where or ""]
@@ -315,7 +315,7 @@ def session_by(trained: TrainedPolicy) -> str:
     return schema.SESSION_ID if by_id else "user"
 
 
-def _flat(lists: pa.ListArray) -> tuple[IntArray, Array]:
+def _flatten(lists: pa.ListArray) -> tuple[IntArray, Array]:
     """Of a column of lists: the row index of each element, and the elements."""
     lengths = np.diff(np.asarray(lists.offsets))
     owner: IntArray = np.repeat(np.arange(len(lengths)), lengths)

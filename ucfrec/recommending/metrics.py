@@ -115,28 +115,28 @@ class ServingMetrics:
 
     def collect(self) -> Iterator[Metric]:
         """All metrics, as `prometheus_client` asks for them."""
-        found = {metric.name: metric for metric in self._collector.collect()}
-        weights = _by_measure(found.pop(_WEIGHT).samples)
-        drift = found[_DRIFT]
-        totals = _by_measure(drift.samples)
+        metrics = {metric.name: metric for metric in self._collector.collect()}
+        weights = _map_by_measure(metrics.pop(_WEIGHT).samples)
+        drift = metrics[_DRIFT]
+        totals = _map_by_measure(drift.samples)
         # A measure of a run that answered before is not removed from the files.
         drift.samples = [
             Sample(_DRIFT, {"measure": name}, Mean(totals[name], weights[name]).value)
             for name in self._set
         ]
-        yield from found.values()
+        yield from metrics.values()
 
     def _update(self) -> None:
         """Bring up to date what nothing else reports."""
-        before, self._set = self._set, dict(self._of_drift())
+        previous, self._set = self._set, dict(self._of_drift())
         for name, mean in self._set.items():
-            if before.get(name) != mean:
+            if previous.get(name) != mean:
                 self._totals.labels(name).set(mean.total)
                 self._weights.labels(name).set(mean.weight)
         if self._cpu is not None:
-            used, self._used = self._used, time.process_time()
-            self._cpu.inc(self._used - used)
+            seconds, self._used = self._used, time.process_time()
+            self._cpu.inc(self._used - seconds)
 
 
-def _by_measure(samples: Iterable[Sample]) -> dict[str, float]:
+def _map_by_measure(samples: Iterable[Sample]) -> dict[str, float]:
     return {sample.labels["measure"]: sample.value for sample in samples}

@@ -146,8 +146,8 @@ class Chooser:
             excluded: (n_items,) true for items that no user is recommended.
             candidates: of every user the only items to recommend, None for all; empty for all.
         """
-        known = histories.item_ids >= 0
-        histories = histories if known.all() else histories.with_rows(known)
+        in_catalogue = histories.item_ids >= 0
+        histories = histories if in_catalogue.all() else histories.with_rows(in_catalogue)
         latest = histories.latest_session(self.trained.record.session_gap_ms, new)
         at_once, count = _USERS_AT_ONCE, len(self.trained.items)
         if self.index is None:
@@ -179,10 +179,10 @@ class Chooser:
             items, values = self.index.best(sessions, left_out, excluded, k)
             return items.numpy(), values.numpy(), np.ones(items.shape)
         scores = self.scorer.scores(sessions, left_out, excluded, empty=True)
-        drawn = None
+        draws = None
         if rule.draws:
-            drawn = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
-        items, values, propensities = _choose_best(rule, scores, k, drawn)
+            draws = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
+        items, values, propensities = _choose_best(rule, scores, k, draws)
         return items.numpy(), values.numpy(), propensities.numpy()
 
 
@@ -198,7 +198,7 @@ def _exclude_all_but(candidates: Sequence[IntArray | None], n_items: int) -> Ten
 
 @torch.inference_mode()
 def _choose_best(
-    rule: DecisionRule, scores: Tensor, k: int, drawn: Tensor | None
+    rule: DecisionRule, scores: Tensor, k: int, draws: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`k` items (B, k), their log-probabilities (B, k) at temperature 1 among those left, −∞ for
     items that are excluded, and their propensities (B, k) float64.
@@ -206,7 +206,7 @@ def _choose_best(
     Args:
         scores: (B, n_items) of `Scorer.scores`; may be overwritten.
         k: number of items, at most n_items.
-        drawn: (B, n_items + 1) of `uniforms`; needed if the rule draws.
+        draws: (B, n_items + 1) of `uniforms`; needed if the rule draws.
     """
     # Exponentials that underflow take long, and what is lower adds nothing to a sum of 1 or more.
     lowest = scores.amax(-1, keepdim=True) - _NEGLIGIBLE
@@ -214,7 +214,7 @@ def _choose_best(
     none = torch.isneginf(total)
     if none.any():
         scores[none[:, 0]] = 0.0
-    items, propensities = rule.ranked(scores, k, drawn)
+    items, propensities = rule.ranked(scores, k, draws)
     values = scores.gather(1, items) - total
     return items, values.masked_fill(none, -torch.inf), propensities
 
@@ -229,15 +229,15 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
         InputError: the policy does not know some of them, or with `skip_unknown`, any.
     """
     numbers = index.numbers(ids)
-    known = numbers >= 0
-    if not (known.any() if skip_unknown else known.all()):
-        unknown = ids[~known].tolist()
+    in_catalogue = numbers >= 0
+    if not (in_catalogue.any() if skip_unknown else in_catalogue.all()):
+        unknown = ids[~in_catalogue].tolist()
         remedy = "name items of its catalogue" if skip_unknown else "leave them out"
         raise InputError(
             f"{len(unknown)} of {len(ids)} candidates are items that the policy does not know "
             f"({name_some(unknown)}); {remedy}"
         )
-    return numbers[known]
+    return numbers[in_catalogue]
 
 
 def _unknown_items(index: IdLookup, batches: Iterable[Histories]) -> InputError:
@@ -289,8 +289,8 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
 def _left_out(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:
     """Rows (N,) and items (N,) of what is not recommended: the known ones of `seen_ids`, and what
     the latest sessions have shown, if the rule excludes it."""
-    known = histories.seen_ids >= 0
-    rows, items = [histories.seen_owner[known]], [histories.seen_ids[known]]
+    in_catalogue = histories.seen_ids >= 0
+    rows, items = [histories.seen_owner[in_catalogue]], [histories.seen_ids[in_catalogue]]
     if rule.exclude_seen:
         rows.append(histories.owner)
         items.append(histories.item_ids)

@@ -47,7 +47,7 @@ _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
 
 
-def _milliseconds(value: float | str) -> float:
+def _parse_time(value: float | str) -> float:
     """A time of a request in milliseconds since 1970.
 
     Raises:
@@ -90,7 +90,7 @@ class Row(TypedDict):
     timestamp: Annotated[
         Number | Annotated[str, Field(max_length=64)],
         Field(description="Milliseconds since 1970, UTC; or ISO 8601 text, UTC without a zone."),
-        AfterValidator(_milliseconds),
+        AfterValidator(_parse_time),
     ]
     reward: NotRequired[
         Annotated[Number, Field(description="Without it, the run's reward of the feedback.")]
@@ -178,36 +178,36 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
 
 def _describe(errors: Sequence[Any]) -> str:
     """The first of pydantic's errors in one line, and how many there are: one a place."""
-    first, places = errors[0], [_place(error) for error in errors]
+    first, places = errors[0], [_find_place(error) for error in errors]
     if first["type"] == "json_invalid":
-        return f"the request is not JSON ({_lower(first['msg'])})"
+        return f"the request is not JSON ({_uncapitalise(first['msg'])})"
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
-    wanted = dict.fromkeys(
-        _lower(error["msg"])
+    messages = dict.fromkeys(
+        _uncapitalise(error["msg"])
         for error, place in zip(errors, places, strict=True)
         if place == places[0]
     )
     value = json.dumps(first.get("input"), default=str)
     value = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}…"
-    shown = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
+    actual = "" if isinstance(first.get("input"), (dict, list)) else f", not {value}"
     return (
-        f"{where}: {' or '.join(wanted)}{shown}"
+        f"{where}: {' or '.join(messages)}{actual}"
         f"{f'; {more} more fault' + 's' * (more > 1) if more else ''}"
     )
 
 
-def _place(error: Any) -> tuple[str | int, ...]:
+def _find_place(error: Any) -> tuple[str | int, ...]:
     """Where an error is, whichever of the types that the place takes it is about."""
     place: tuple[str | int, ...] = error["loc"]
-    named = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
-    return place if named else place[:-1]
+    is_entry = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
+    return place if is_entry else place[:-1]
 
 
 _TYPES: Final = ("constrained-str", "float", "constrained-int")
 """Last part of pydantic's place of an error in one of several types."""
 
 
-def _lower(message: str) -> str:
+def _uncapitalise(message: str) -> str:
     message = message.removeprefix("Value error, ")
     return message[:1].lower() + message[1:]
 

@@ -99,14 +99,9 @@ class Responder:
     ) -> None:
         """
         Args:
-            rule: the decision rule; None for the run's own.
             k: items for requests that do not say how many.
-            filter_seen: exclude every item that the user has seen.
-            skip_unknown: ignore rows of items that are not in the training data, and such
-                candidates where others are left.
-            seed: of the draws of a rule with a temperature, or that explores; they also depend on
-                user and request_id.
-            engine: what computes the scores of a request that comes alone, one of `ENGINES`.
+            engine: what computes the scores of a request that comes alone, one of `ENGINES`. The
+                others are as of `recommend`; draws depend on user and request_id.
 
         Raises:
             InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
@@ -160,10 +155,13 @@ class Responder:
             In the order of the requests: the answer, or what is wrong with the request.
         """
         with self._busy:
-            read = [self._read_or_refuse(request) for request in requests]
-            questions = [question for question in read if isinstance(question, _Question)]
+            outcomes = [self._read_or_refuse(request) for request in requests]
+            questions = [question for question in outcomes if isinstance(question, _Question)]
             answers = self._answer(questions) if questions else iter(())
-            return [one if isinstance(one, InputError) else next(answers) for one in read]
+            return [
+                outcome if isinstance(outcome, InputError) else next(answers)
+                for outcome in outcomes
+            ]
 
     def _read_or_refuse(self, request: Request) -> _Question | InputError:
         items = self.trained.items

@@ -49,31 +49,28 @@ class RowRewards:
         """
         if not rows:
             return []
-        given = [row.get(schema.REWARD) for row in rows]
-        if not self._computed and any(value is not None for value in given):
-            return _checked(given, f"no {schema.REWARD}, as other rows have")
+        rewards = [row.get(schema.REWARD) for row in rows]
+        if not self._computed and any(value is not None for value in rewards):
+            return _require_numbers(rewards, f"no {schema.REWARD}, as other rows have")
         name = str(self._expression)
         if _NAME.fullmatch(name):
             either = "no" if name == schema.REWARD else f"neither {schema.REWARD} nor"
-            return _checked(_column(rows, name), f"{either} {name}")
-        return _checked(self._evaluated(rows), "no reward")
+            return _require_numbers(_column(rows, name), f"{either} {name}")
+        return _require_numbers(self._evaluate(rows), "no reward")
 
-    def _evaluated(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
+    def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
         if self._connection is None:
             self._connection = self._stack.enter_context(engine_in_memory(_MEMORY))
         connection = self._connection
-        names = columns_of(connection, self._expression)
-        given = {each.casefold() for each in set().union(*rows)}
+        names = {name.casefold() for row in rows for name in row}
         columns = {}
-        for name in names:
+        for name in columns_of(connection, self._expression):
             values = _column(rows, name)
-            if name.casefold() not in given:
-                lacking, remedy = f"no {name}", "it"
-                if not self._computed:
-                    lacking, remedy = f"neither {schema.REWARD} nor {name}", "one of them"
+            if name.casefold() not in names:
+                what = f"no {name}" if self._computed else f"neither {schema.REWARD} nor {name}"
                 raise InputError(
-                    f"history has {lacking}, which the run's reward ({self._expression}) needs; "
-                    f"give {remedy}"
+                    f"history has {what}, which the run's reward ({self._expression}) needs; give "
+                    f"{'it' if self._computed else 'one of them'}"
                 )
             try:
                 columns[name] = pa.array(values)
@@ -111,14 +108,14 @@ def _column(rows: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
     values = [row.get(name) for row in rows]
     if any(value is None for value in values):
         folded = name.casefold()
-        for other in set().union(*rows) - {name}:
-            if other.casefold() == folded:
-                found = (row.get(other) for row in rows)
-                values = [b if a is None else a for a, b in zip(values, found, strict=True)]
+        for column in set().union(*rows) - {name}:
+            if column.casefold() == folded:
+                more = (row.get(column) for row in rows)
+                values = [b if a is None else a for a, b in zip(values, more, strict=True)]
     return values
 
 
-def _checked(values: Sequence[Any], missing: str) -> list[float]:
+def _require_numbers(values: Sequence[Any], missing: str) -> list[float]:
     for n, value in enumerate(values):
         if value is None:
             raise InputError(f"history.{n} has {missing}; give every row its reward")

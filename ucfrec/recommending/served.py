@@ -22,7 +22,7 @@ _UNITS: Final = 2**32
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Current:
     """What the pointer file says."""
 
     name: str
@@ -55,21 +55,21 @@ def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
     return len(shares) - 1
 
 
-def parse_split(given: str) -> dict[str, float]:
+def parse_split(text: str) -> dict[str, float]:
     """Read `A=0.9,B=0.1`: names of runs and their shares of the users.
 
     Raises:
         InputError: it is written otherwise, or the shares do not add up to 1.
     """
     shares: dict[str, float] = {}
-    for part in given.split(","):
+    for part in text.split(","):
         name, _, share = part.partition("=")
         try:
             shares[name.strip()] = float(share)
         except ValueError:
-            raise InputError(f"--split {given}: write RUN=SHARE,RUN=SHARE") from None
+            raise InputError(f"--split {text}: write RUN=SHARE,RUN=SHARE") from None
     if not all(0 < share <= 1 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
-        raise InputError(f"--split {given}: shares are above 0 and add up to 1")
+        raise InputError(f"--split {text}: shares are above 0 and add up to 1")
     return shares
 
 
@@ -95,10 +95,10 @@ class Served:
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
         self._refused: tuple[str, str] | None = None
-        self._wanted: _Wanted | None = None
+        self._known: _Current | None = None
         if shares is None:
-            self._wanted = self._current()
-            shares = {self._wanted.name: 1.0}
+            self._known = self._current()
+            shares = {self._known.name: 1.0}
         self._arms = [Arm(name, share, make(folder / name)) for name, share in shares.items()]
         for arm in self._arms[1:]:
             _require_alike(arm.responder.trained, self.trained)
@@ -120,27 +120,27 @@ class Served:
                 return self._arms[0].responder.answers(requests)
             shares = [arm.share for arm in self._arms]
             places = [arm_of(request.user_id, shares) for request in requests]
-            found: dict[int, Answer | InputError] = {}
+            answers: dict[int, Answer | InputError] = {}
             for number, arm in enumerate(self._arms):
                 rows = [row for row, place in enumerate(places) if place == number]
                 outcomes = arm.responder.answers([requests[row] for row in rows]) if rows else []
                 for row, outcome in zip(rows, outcomes, strict=True):
                     if isinstance(outcome, Answer):
                         outcome = outcome._replace(arm=arm.name)
-                    found[row] = outcome
-            return [found[row] for row in range(len(requests))]
+                    answers[row] = outcome
+            return [answers[row] for row in range(len(requests))]
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""
         arms = self._arms
-        found: dict[str, Any] = {**arms[0].responder.described(), "name": arms[0].name}
+        page: dict[str, Any] = {**arms[0].responder.described(), "name": arms[0].name}
         if len(arms) > 1:
-            found["arms"] = {
+            page["arms"] = {
                 arm.name: {**arm.responder.described(), "share": arm.share} for arm in arms
             }
         if self._refused is not None:
-            found["refused"] = dict(zip(("name", "error"), self._refused, strict=True))
-        return found
+            page["refused"] = dict(zip(("name", "error"), self._refused, strict=True))
+        return page
 
     def drift(self) -> dict[str, Mean]:
         """See `Responder.drift`; of the first arm."""
@@ -152,20 +152,21 @@ class Served:
         Raises:
             InputError: no run is current.
         """
-        wanted = self._current()
-        if wanted == self._wanted:
+        current = self._current()
+        if current == self._known:
             return
-        self._wanted = wanted
-        own = self._arms[0].name, self.trained.fingerprint
-        if wanted.name != own[0] or wanted.fingerprint not in ("", own[1]):
-            self._replace(wanted.name)
+        self._known = current
+        active = self._arms[0].name, self.trained.fingerprint
+        if current.name != active[0] or current.fingerprint not in ("", active[1]):
+            self._replace(current.name)
         else:
             self._refused = None
 
     def follow(self, seconds: float = SECONDS) -> None:
         """Look every so many seconds whether another run is current, in a thread of its own."""
-        given = (seconds,)
-        self._thread = threading.Thread(target=self._run, args=given, name="promoted", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(seconds,), name="promoted", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -177,30 +178,30 @@ class Served:
             for arm in self._arms:
                 arm.responder.close()
 
-    def _current(self) -> _Wanted:
-        found = promoted(self._folder)
-        if found is None:
+    def _current(self) -> _Current:
+        pointer = promoted(self._folder)
+        if pointer is None:
             raise InputError(
                 f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
                 "or ucfrec promote one"
             )
         written = (self._folder / POINTER).stat().st_mtime_ns
-        return _Wanted(found.run(self._folder).name, found.fingerprint, written)
+        return _Current(pointer.run(self._folder).name, pointer.fingerprint, written)
 
     def _run(self, seconds: float) -> None:
-        said = ""
+        message = ""
         while not self._closed.wait(seconds):
             try:
                 self.check()
             except Exception as error:
                 # Whatever is wrong with the pointer file, the run that answers goes on.
-                if str(error) != said:
-                    said = str(error)
-                    _say(said)
-                self._refused = POINTER, said
-                self._wanted = None
+                if str(error) != message:
+                    message = str(error)
+                    _say(message)
+                self._refused = POINTER, message
+                self._known = None
             else:
-                said = ""
+                message = ""
 
     def _replace(self, name: str) -> None:
         """Load a run, try it, and answer with it from the next batch on; or say why not."""

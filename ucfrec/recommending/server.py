@@ -79,8 +79,8 @@ class Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen."""
         await super().startup(sockets)
-        for each in sockets or []:
-            self._ready(each)
+        for bound in sockets or []:
+            self._ready(bound)
 
 
 class PrintingServer(Server):

@@ -39,19 +39,20 @@ def similar_items(
             something else.
     """
     k = require_whole("k", k)
-    given = None if items is None else require_ids("items", items, schema.ITEM_ID)
+    chosen = None if items is None else require_ids("items", items, schema.ITEM_ID)
     vectors = F.normalize(_vectors(trained), dim=1)
     ids = trained.items.ids
-    wanted = np.arange(len(ids)) if given is None else trained.items.numbers(given)
-    if given is not None and (wanted < 0).any():
+    items_asked = np.arange(len(ids)) if chosen is None else trained.items.numbers(chosen)
+    if chosen is not None and (items_asked < 0).any():
+        unknown = chosen[items_asked < 0]
         raise InputError(
-            f"{int((wanted < 0).sum())} of {len(wanted)} items are not in the training data, such "
-            f"as {given[wanted < 0][0]}; leave them out"
+            f"{len(unknown)} of {len(chosen)} items are not in the training data, such as "
+            f"{unknown[0]}; leave them out"
         )
     k = min(k, len(ids) - 1)
     frames = []
-    for begin in range(0, len(wanted), _ITEMS_AT_ONCE):
-        numbers = torch.from_numpy(wanted[begin : begin + _ITEMS_AT_ONCE])
+    for begin in range(0, len(items_asked), _ITEMS_AT_ONCE):
+        numbers = torch.from_numpy(items_asked[begin : begin + _ITEMS_AT_ONCE])
         cosines = (vectors[numbers] @ vectors.T).scatter(1, numbers.unsqueeze(1), -torch.inf)
         best = cosines.topk(k, dim=1)
         columns = {

@@ -62,10 +62,10 @@ def recommend_with_spark(
     trained.item_scorer(rule)
     require_whole("k", k)
     columns = columns_used(trained, mapping)
-    given = GivenLog(files, columns, reward_of(trained), session_by(trained))
+    log = GivenLog(files, columns, reward_of(trained), session_by(trained))
     with ExitStack() as stack:
         folders = [out] if exposures is None else [out, exposures]
-        parts = [stack.enter_context(atomic_folder(each)).absolute() for each in folders]
+        parts = [stack.enter_context(atomic_folder(folder)).absolute() for folder in folders]
         recommended = partial(
             recommend,
             k=k,
@@ -75,10 +75,10 @@ def recommend_with_spark(
             new_session=new_session,
             seed=seed,
         )
-        shown = None if exposures is None else parts[1]
+        exposed = None if exposures is None else parts[1]
         run = RunOnWorkers.of(trained, checkpoint)
-        part = _RecommendPart(run, parts[0], shown, memory_limit, rule.hash, recommended)
-        return sum(by_users(given, parts[0].parent, master, part))
+        part = _RecommendPart(run, parts[0], exposed, memory_limit, rule.hash, recommended)
+        return sum(by_users(log, parts[0].parent, master, part))
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,6 @@ class _RecommendPart:
         frames = self.recommend(trained, map(Histories.from_batch, histories))
         with ExitStack() as stack:
             if self.exposures is not None:
-                given = self.exposures / name, trained, self.rule, frames
-                frames = stack.enter_context(exposures_written(*given))
+                arguments = self.exposures / name, trained, self.rule, frames
+                frames = stack.enter_context(exposures_written(*arguments))
             return write_frames(self.out / name, frames)

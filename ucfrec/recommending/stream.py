@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import IO, Any, Final, Protocol
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
@@ -24,14 +24,6 @@ class Readable(Protocol):
     def read(self, size: int, /) -> bytes | None: ...
 
 
-class Writable(Protocol):
-    """A file of bytes."""
-
-    def write(self, data: bytes, /) -> Any: ...
-
-    def flush(self) -> None: ...
-
-
 @dataclass
 class Counts:
     """What a stream has answered."""
@@ -43,7 +35,7 @@ class Counts:
 def answer_stream(
     responder: Responder,
     source: Readable,
-    sink: Writable,
+    sink: IO[bytes],
     remember: int = REMEMBERED,
     exposures: ExposureLog | None = None,
 ) -> Counts:
@@ -59,8 +51,8 @@ def answer_stream(
         exposures: gets every answer; None for none.
     """
     counts, remembered = Counts(), _Remembered(remember, responder.limits)
-    for lines in _lines(source, responder.limits.bytes):
-        for answer in _answered(responder, remembered, lines, exposures):
+    for lines in _read_lines(source, responder.limits.bytes):
+        for answer in _answer(responder, remembered, lines, exposures):
             sink.write(json_text(answer).encode() + b"\n")
             counts.errors += "error" in answer
             counts.answers += "error" not in answer
@@ -72,7 +64,7 @@ Line = tuple[int, bytes | None]
 """Number of a line, from 1, and what it holds; None if it is too long."""
 
 
-def _answered(
+def _answer(
     responder: Responder,
     remembered: "_Remembered",
     lines: Sequence[Line],
@@ -82,20 +74,20 @@ def _answered(
     waiting: list[tuple[int, StreamRequest | InputError]] = []
     for number, line in lines:
         try:
-            request: StreamRequest | InputError = _parsed(line, responder.limits)
+            request: StreamRequest | InputError = _parse_line(line, responder.limits)
         except InputError as error:
             request = error
-        users = {str(each.user_id) for _, each in waiting if isinstance(each, StreamRequest)}
+        users = {str(one.user_id) for _, one in waiting if isinstance(one, StreamRequest)}
         # Whether rows are remembered is known once they have been answered.
         again = isinstance(request, StreamRequest) and str(request.user_id) in users
         if again or len(waiting) == _AT_ONCE:
-            yield from _together(responder, remembered, waiting, exposures)
+            yield from _answer_together(responder, remembered, waiting, exposures)
             waiting = []
         waiting.append((number, request))
-    yield from _together(responder, remembered, waiting, exposures)
+    yield from _answer_together(responder, remembered, waiting, exposures)
 
 
-def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
+def _parse_line(line: bytes | None, limits: Limits) -> StreamRequest:
     if line is None:
         raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
     if not line.strip():
@@ -104,7 +96,7 @@ def _parsed(line: bytes | None, limits: Limits) -> StreamRequest:
     return request
 
 
-def _together(
+def _answer_together(
     responder: Responder,
     remembered: "_Remembered",
     waiting: Sequence[tuple[int, StreamRequest | InputError]],
@@ -136,8 +128,8 @@ class _Remembered:
 
     def whole(self, request: StreamRequest) -> Request:
         """The request with all rows of its user as its history."""
-        given = "history" in request.model_fields_set
-        earlier = request.history if given else self._rows.get(str(request.user_id), [])
+        replaced = "history" in request.model_fields_set
+        earlier = request.history if replaced else self._rows.get(str(request.user_id), [])
         rows = [*earlier, *request.interactions]
         if len(rows) > self._limits.history:
             rows = sorted(rows, key=lambda row: row["timestamp"])[-self._limits.history :]
@@ -159,25 +151,25 @@ class _Remembered:
             self._count -= len(self._rows.popitem(last=False)[1])
 
 
-def _lines(source: Readable, most: int) -> Iterator[list[Line]]:
+def _read_lines(source: Readable, most: int) -> Iterator[list[Line]]:
     """Lines that arrive together; None for one of over `most` bytes."""
-    number, rest, too_long = 0, bytearray(), False
+    number, buffer, too_long = 0, bytearray(), False
     while block := source.read(_BLOCK):
-        first, *others = block.split(b"\n")
-        rest += first
+        first, *following_parts = block.split(b"\n")
+        buffer += first
         lines: list[Line] = []
-        for following in others:
+        for following in following_parts:
             number += 1
-            if too_long or len(rest) > most:
+            if too_long or len(buffer) > most:
                 lines.append((number, None))
             else:
-                lines.append((number, bytes(rest)))
-            rest, too_long = bytearray(following), False
-        if len(rest) > most:
-            rest, too_long = bytearray(), True
+                lines.append((number, bytes(buffer)))
+            buffer, too_long = bytearray(following), False
+        if len(buffer) > most:
+            buffer, too_long = bytearray(), True
         if lines:
             yield lines
-    if too_long or len(rest) > most:
+    if too_long or len(buffer) > most:
         yield [(number + 1, None)]
-    elif rest:
-        yield [(number + 1, bytes(rest))]
+    elif buffer:
+        yield [(number + 1, bytes(buffer))]

@@ -8,7 +8,7 @@ import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from ipaddress import IPv6Address
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NotRequired
 
 from fastapi import FastAPI, Response
 from fastapi import Request as HTTPRequest
@@ -18,6 +18,9 @@ from pydantic import Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
+
+# Of typing's TypedDict, pydantic cannot read the types before Python 3.12.
+from typing_extensions import TypedDict
 
 from ucfrec import __version__
 from ucfrec.errors import InputError
@@ -34,33 +37,32 @@ from ucfrec.settings import settings_table
 _HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
 _PATH: Final = "/recommendations"
 _JSON: Final = "application/json"
-_ERROR: Final = {
-    "type": "object",
-    "properties": {"error": {"type": "string"}},
-    "required": ["error"],
-}
-_ITEM: Final = {
-    "type": "object",
-    "properties": {
-        "item_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
-        "score": {"type": "number", "description": "Log-probability among the items left, nats."},
-        "propensity": {
-            "type": "number",
-            "description": "Probability of the item at its position, given those before it.",
-        },
-    },
-}
-_ANSWER: Final = {
-    "type": "object",
-    "properties": {
-        "user_id": {"anyOf": [{"type": "integer"}, {"type": "string"}]},
-        "request_id": {"type": "string"},
-        "run": {"type": "string", "description": "Fingerprint of the run."},
-        "rule": {"type": "string", "description": "Hash of the decision rule."},
-        "arm": {"type": "string", "description": "Run of the user's arm, if runs share the users."},
-        "items": {"type": "array", "items": _ITEM, "description": "In the order to show."},
-    },
-}
+
+
+class _Error(TypedDict):
+    error: str
+
+
+class _Item(TypedDict):
+    item_id: int | str
+    score: Annotated[float, Field(description="Log-probability among the items left, nats.")]
+    propensity: Annotated[
+        float,
+        Field(description="Probability of the item at its position, given those before it."),
+    ]
+
+
+class _Recommendations(TypedDict):
+    user_id: int | str
+    request_id: str
+    run: Annotated[str, Field(description="Fingerprint of the run.")]
+    rule: Annotated[str, Field(description="Hash of the decision rule.")]
+    arm: NotRequired[
+        Annotated[str, Field(description="Run of the user's arm, if runs share the users.")]
+    ]
+    items: Annotated[list[_Item], Field(description="In the order to show.")]
+
+
 _FAULTS: Final = {
     400: "Not JSON, no such request, or beyond a limit.",
     408: "The request's body did not arrive in time.",
@@ -93,16 +95,16 @@ class ServerLimits:
     """Seconds for a request to arrive and to be answered."""
 
 
-def _host(given: str) -> str:
+def _host(host: str) -> str:
     """A host as the header `Host` has it: addresses of IP version 6 are in brackets."""
     with suppress(ValueError):
-        return f"[{IPv6Address(given.strip('[]'))}]"
-    if not _HOST.fullmatch(given):
+        return f"[{IPv6Address(host.strip('[]'))}]"
+    if not _HOST.fullmatch(host):
         raise InputError(
-            f"--allowed-hosts: {given!r} is not a host; write names or addresses without a port, "
+            f"--allowed-hosts: {host!r} is not a host; write names or addresses without a port, "
             "*.example.org, or *"
         )
-    return given
+    return host
 
 
 class _HeaderLimits:
@@ -160,7 +162,7 @@ def application(
     Raises:
         InputError: a host is written otherwise.
     """
-    hosts = [_host(each) for each in allowed_hosts]
+    hosts = [_host(host) for host in allowed_hosts]
     metrics = ServingMetrics(responder.drift, shared_metrics)
     batcher = Batcher(responder.answers, metrics, limits.batch, limits.queue)
 
@@ -175,14 +177,18 @@ def application(
     )
 
     @app.exception_handler(HTTPException)
-    async def refused(_: HTTPRequest, error: HTTPException) -> Response:
+    async def refuse(_: HTTPRequest, error: HTTPException) -> Response:
         return _response(error.status_code, {"error": str(error.detail)}, error.headers)
 
-    @app.post(_PATH, openapi_extra=_DESCRIBED, responses=_RESPONSES)
+    faults: dict[int | str, dict[str, Any]] = {
+        status: {"description": text, "model": _Error} for status, text in _FAULTS.items()
+    }
+
+    @app.post(_PATH, openapi_extra=_DESCRIBED, responses=faults, response_model=_Recommendations)
     async def recommendations(http: HTTPRequest) -> Response:
         """The next items for one user."""
         began = time.perf_counter()
-        status, body = await _answered(http, responder, batcher, limits, exposures)
+        status, body = await _answer_http(http, responder, batcher, limits, exposures)
         metrics.request(status, time.perf_counter() - began)
         return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
 
@@ -203,7 +209,7 @@ def application(
     return app
 
 
-async def _answered(
+async def _answer_http(
     http: HTTPRequest,
     responder: Responder | Served,
     batcher: Batcher,
@@ -262,14 +268,14 @@ def _inline(schema: dict[str, Any]) -> dict[str, Any]:
     """A JSON schema without references, which lie elsewhere in OpenAPI."""
     definitions = schema.pop("$defs", {})
 
-    def inlined(value: Any) -> Any:
+    def inline(value: Any) -> Any:
         if isinstance(value, dict):
             if "$ref" in value:
-                return inlined(definitions[value["$ref"].rpartition("/")[2]])
-            return {name: inlined(each) for name, each in value.items()}
-        return [inlined(each) for each in value] if isinstance(value, list) else value
+                return inline(definitions[value["$ref"].rpartition("/")[2]])
+            return {name: inline(entry) for name, entry in value.items()}
+        return [inline(entry) for entry in value] if isinstance(value, list) else value
 
-    result: dict[str, Any] = inlined(schema)
+    result: dict[str, Any] = inline(schema)
     return result
 
 
@@ -278,11 +284,4 @@ _DESCRIBED: Final = {
         "required": True,
         "content": {_JSON: {"schema": _inline(Request.model_json_schema())}},
     }
-}
-_RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
-    200: {"description": "The items.", "content": {_JSON: {"schema": _ANSWER}}},
-    **{
-        status: {"description": text, "content": {_JSON: {"schema": _ERROR}}}
-        for status, text in _FAULTS.items()
-    },
 }

@@ -153,7 +153,7 @@ class Workers:
         for _ in range(count):
             self._start()
         while not all(worker.ready for worker in self._workers):
-            for worker in self._with_news(None):
+            for worker in self._wait_for_news(None):
                 if worker.news() != "ready":
                     raise InputError(worker.failure)
         return self._workers[0].what
@@ -166,7 +166,7 @@ class Workers:
         """
         while True:
             again = min(self._missing, default=None)
-            for worker in self._with_news(again):
+            for worker in self._wait_for_news(again):
                 if worker.news() == "ended":
                     self._lose(worker)
             now = time.monotonic()
@@ -195,14 +195,14 @@ class Workers:
     def _start(self) -> None:
         ours, theirs = _SPAWN.Pipe()
         first, self._first = self._first, False
-        given = self._work, self._listening, theirs, first, self._folder.name
-        process = _SPAWN.Process(target=_begin, args=given, daemon=True)
+        arguments = self._work, self._listening, theirs, first, self._folder.name
+        process = _SPAWN.Process(target=_begin, args=arguments, daemon=True)
         self._workers.append(_Worker(process, ours))
         with block_ctrl_c():  # it reaches every process of a terminal; this one ends the others
             process.start()
         theirs.close()
 
-    def _with_news(self, until: float | None) -> "list[_Worker]":
+    def _wait_for_news(self, until: float | None) -> "list[_Worker]":
         """Workers that reported something or ended, once there are any, or at a time."""
         seconds = None if until is None else max(0.0, until - time.monotonic())
         having = wait([worker.connection for worker in self._workers], seconds)
@@ -214,7 +214,7 @@ class Workers:
 
         self._workers.remove(worker)
         mark_process_dead(worker.process.pid, self._folder.name)  # type: ignore[no-untyped-call]
-        if not worker.ready and not any(each.ready for each in self._workers):
+        if not worker.ready and not any(other_worker.ready for other_worker in self._workers):
             raise InputError(worker.failure)
         pause = 0.0 if worker.ready else _PAUSE
         self._missing.append(time.monotonic() + pause)

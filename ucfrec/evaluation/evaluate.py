@@ -16,8 +16,8 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
-from ucfrec.evaluation.simulator import Environment
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow

@@ -24,12 +24,12 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.liked import LikedExpression
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.evaluation.ranking_table import ranking_rows, require_one_catalogue
-from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher

@@ -14,7 +14,7 @@ import pytest
 
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
-from ucfrec.evaluation.simulator import Environment
+from ucfrec.evaluation.environment import Environment
 from ucfrec.plugins import load_plugin
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results

@@ -14,7 +14,8 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Environment, Simulator
+from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare

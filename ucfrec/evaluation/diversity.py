@@ -157,8 +157,8 @@ def variety_columns(
     if counts is None or numbers is None:
         return row
     shown, liked = (
-        np.bincount(numbers[numbers >= 0], each.numpy()[numbers >= 0], n_items)
-        for each in (counts.shown, counts.liked)
+        np.bincount(numbers[numbers >= 0], counted.numpy()[numbers >= 0], n_items)
+        for counted in (counts.shown, counts.liked)
     )
     if shown.any():
         row["novelty"] = novelty(items, shown / counts.episodes)

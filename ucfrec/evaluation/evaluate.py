@@ -16,8 +16,8 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
-from ucfrec.evaluation.simulator import Environment
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
@@ -43,8 +43,8 @@ def evaluate_behavior(
     """
     simulator = environment.simulator()
     if behavior not in simulator.behaviors:
-        known = ", ".join(simulator.behaviors)
-        raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {known}")
+        names = ", ".join(simulator.behaviors)
+        raise InputError(f"{environment.name} has no behavior {behavior!r}; it has {names}")
     env = simulator.started(min(episodes, SIDE_BY_SIDE), environment.folder)
     actor = simulator.behaviors[behavior](env, seed)
     name = {"method": behavior, "policy": behavior}
@@ -138,13 +138,13 @@ def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) ->
         if sizes["items"] or space.shape != (sizes["action"],):
             raise _misfit(environment, f"vector actions of size {space.shape}")
         return None
-    known = environment_items(env)
+    names = environment_items(env)
     ids = trained.item_ids
     if ids is None or ids.dtype.kind not in "iu":
-        raise _misfit(environment, f"{len(known)} items with whole numbers as {schema.ITEM_ID}")
-    numbers = IdLookup(known).numbers(ids)
+        raise _misfit(environment, f"{len(names)} items with whole numbers as {schema.ITEM_ID}")
+    numbers = IdLookup(names).numbers(ids)
     if (numbers < 0).all():
-        raise _misfit(environment, f"items {known.min()} to {known.max()} as {schema.ITEM_ID}")
+        raise _misfit(environment, f"items {names.min()} to {names.max()} as {schema.ITEM_ID}")
     return numbers
 
 

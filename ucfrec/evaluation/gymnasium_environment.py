@@ -93,8 +93,8 @@ class GymnasiumEnvironment(SyncVectorEnv):
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Start all sessions; returns observations (N, O) and info."""
         if isinstance(seed, int):
-            drawn = [np.random.SeedSequence([seed, i]) for i in range(self.num_envs)]
-            seed = [int(each.generate_state(1)[0]) for each in drawn]
+            sequences = [np.random.SeedSequence([seed, i]) for i in range(self.num_envs)]
+            seed = [int(sequence.generate_state(1)[0]) for sequence in sequences]
         observations, info = super().reset(seed=seed, options=options)
         self._gives_users = USER_IDS in info
         self._require_all_users(info)
@@ -111,8 +111,8 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     def _require_all_users(self, info: dict[str, Any]) -> None:
         # Gymnasium fills the entries of sessions that give none with 0, which may be a user's.
-        given = info.get(f"_{USER_IDS}", np.zeros(self.num_envs, dtype=bool))
-        if (given != self._gives_users).any():
+        present = info.get(f"_{USER_IDS}", np.zeros(self.num_envs, dtype=bool))
+        if (present != self._gives_users).any():
             raise InputError(
                 f"only some sessions or steps have info[{USER_IDS!r}]; the environment's reset "
                 "must give it in every session, or in none"

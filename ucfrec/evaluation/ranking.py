@@ -135,8 +135,8 @@ def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
             scores = scores.expand(len(numbers), n_items).clone()
             scores[batch.left_out] = -torch.inf
         best, top = scores.topk(k, dim=1)
-        known = top.masked_fill(torch.isneginf(best), -1)
-        parts.append(known.expand(len(numbers), k).numpy())
+        listed_items = top.masked_fill(torch.isneginf(best), -1)
+        parts.append(listed_items.expand(len(numbers), k).numpy())
     return Ranked(_first_scores(ranker, later, at_once), np.concatenate(parts))
 
 
@@ -146,14 +146,14 @@ def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
     items = later.store.column(schema.ITEM).astype(np.int64)
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(len(first) + 1))
-    found = np.empty(len(owner))
+    result = np.empty(len(owner))
     for begin in range(0, len(first), at_once):
         at = first[begin : begin + at_once]
         scores = ranker.scores(later.steps(at, filter_seen=False))
         rows = order[bounds[begin] : bounds[begin + len(at)]]
         of_user = owner[rows] - begin if len(scores) > 1 else np.zeros(len(rows), dtype=np.int64)
-        found[rows] = scores.double().numpy()[of_user, items[rows]]
-    return found
+        result[rows] = scores.double().numpy()[of_user, items[rows]]
+    return result
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
 
     every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
     rates = np.append(period.item_rates, np.nan)[ranked.top]  # −1: no item
-    known = ~np.isnan(rates)
+    listed_items = ~np.isnan(rates)
     return {
         "hit_rate_shown": (by_user(hit), by_user(every)),
         "ndcg_shown": (by_user(gain), by_user(every)),
@@ -235,8 +235,8 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
         "ndcg_liked": (by_user(gain * liked), by_user(liked)),
         "recall_liked": _recall(period, ranked, owner, len(users)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
-        "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(known.sum(1))),
-        "known": (by_user(known.sum(1)), by_user((ranked.top >= 0).sum(1))),
+        "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(listed_items.sum(1))),
+        "known": (by_user(listed_items.sum(1)), by_user((ranked.top >= 0).sum(1))),
     }
 
 
@@ -281,27 +281,31 @@ def compare(
     Returns:
         One entry per ranker, in the order of `ranked`.
     """
-    measured = [measure(period, each) for each in ranked.values()]
+    measured = [measure(period, entry) for entry in ranked.values()]
     # (U, rankers, measures), so that one draw of users serves all rankers.
     above, below = (
-        np.stack([np.stack([each[m][part] for m in MEASURES], axis=1) for each in measured], axis=1)
+        np.stack(
+            [np.stack([entry[m][part] for m in MEASURES], axis=1) for entry in measured], axis=1
+        )
         for part in (0, 1)
     )
-    drawn = resampled_ratios(_flat(above), _flat(below), seed).reshape(-1, *above.shape[1:])
+    resampled = resampled_ratios(_flat(above), _flat(below), seed).reshape(-1, *above.shape[1:])
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
     column = list(ranked).index(reference)
-    ends = _ends(drawn)
-    differences = np.stack([values - values[column], *_ends(drawn - drawn[:, column : column + 1])])
+    ends = _ends(resampled)
+    differences = np.stack(
+        [values - values[column], *_ends(resampled - resampled[:, column : column + 1])]
+    )
     return [
         Compared(
             name,
             dict(zip(MEASURES, values[row].tolist(), strict=True)),
             dict(zip(MEASURES, ends[:, row].T.tolist(), strict=True)),
             dict(zip(MEASURES, differences[:, row].T.tolist(), strict=True)),
-            len(np.setdiff1d(each.top, [-1])) / period.n_items,
+            len(np.setdiff1d(entry.top, [-1])) / period.n_items,
         )
-        for row, (name, each) in enumerate(ranked.items())
+        for row, (name, entry) in enumerate(ranked.items())
     ]
 
 
@@ -309,19 +313,19 @@ def _flat(values: Float64Array) -> Float64Array:
     return values.reshape(len(values), -1)
 
 
-def _ends(drawn: Float64Array) -> Float64Array:
+def _ends(resampled: Float64Array) -> Float64Array:
     """Ends (2, rankers, measures) of the 95% intervals; NaN if all resampled ratios are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanquantile(drawn, [0.025, 0.975], axis=0))
+        return np.asarray(np.nanquantile(resampled, [0.025, 0.975], axis=0))
 
 
 def rankers_named(rankers: Sequence[Ranker]) -> dict[str, Ranker]:
     """The rankers by name; of equal names, the second and later ones get a suffix -2, -3, …"""
-    named: dict[str, Ranker] = {}
+    by_name: dict[str, Ranker] = {}
     for ranker in rankers:
         name, number = ranker.name, 2
-        while name in named:
+        while name in by_name:
             name, number = f"{ranker.name}-{number}", number + 1
-        named[name] = ranker
-    return named
+        by_name[name] = ranker
+    return by_name

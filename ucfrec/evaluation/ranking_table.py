@@ -75,13 +75,13 @@ def ranking_rows(
         liked: which steps were liked; None for the run's own definition. Without `train`, "most
             clicked" and "item click rate" keep the run's own.
     """
-    named, liked = _rankers(policies, trained, train, seed, liked)
+    rankers, liked = _rankers(policies, trained, train, seed, liked)
     assert trained.counts is not None
     k = min(k, len(trained.counts.shown))
     period = Period.of(later.store, np.asarray(users), liked)
-    ranked = {name: rank_steps(ranker, later, k) for name, ranker in named.items()}
-    reference = next(iter(named))
-    own = dict(zip(named, policies, strict=False))
+    ranked = {name: rank_steps(ranker, later, k) for name, ranker in rankers.items()}
+    reference = next(iter(rankers))
+    policy_rankers = dict(zip(rankers, policies, strict=False))
     shared: dict[str, Any] = {
         "suite": SUITE,
         "table": SUITE,
@@ -104,7 +104,8 @@ def ranking_rows(
         **provenance(),
     }
     return [
-        _row(one, own.get(one.name), shared) for one in compare(period, ranked, reference, seed)
+        _row(compared, policy_rankers.get(compared.name), shared)
+        for compared in compare(period, ranked, reference, seed)
     ]
 
 
@@ -132,9 +133,9 @@ def _rankers(
     return rankers_named([*policies, *model, *others]), liked
 
 
-def _row(one: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:
+def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:
     """The row of one ranker; `policy` is the ranker if it is a trained policy."""
-    row = ResultRow(method=one.name, policy=one.name, **shared)
+    row = ResultRow(method=compared.name, policy=compared.name, **shared)
     if policy is not None:
         rule, record = policy.rule, policy.trained.record
         row = row.extended(
@@ -144,13 +145,13 @@ def _row(one: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) 
             training_seed=record.seed,
             config_hash=config_hash(record.settings),
         )
-    metric = METRIC if math.isfinite(one.values[METRIC]) else _OTHERWISE
-    low, high = one.intervals[metric]
+    metric = METRIC if math.isfinite(compared.values[METRIC]) else _OTHERWISE
+    low, high = compared.intervals[metric]
     interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
     measured = {
-        **{name: one.values[name] for name in MEASURES},
-        "coverage": one.coverage,
-        "intervals": one.intervals,
-        "differences": one.differences,
+        **{name: compared.values[name] for name in MEASURES},
+        "coverage": compared.coverage,
+        "intervals": compared.intervals,
+        "differences": compared.differences,
     }
     return row.extended(measured, interval=interval, metric=metric)

@@ -211,13 +211,13 @@ class SequencePolicy(nn.Module, ABC):
 
         if exposed is not None and padded is not None:
             exposed = exposed.select(padded.flatten())
-        given = (steps(features), steps(windows.actions), exposed)
+        inputs = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
-            value = self.head.loss(*given)  # type: ignore[arg-type]
+            value = self.head.loss(*inputs)  # type: ignore[arg-type]
             return value, {"action_loss": value.detach()}
         values = steps(self.values(windows, self.head.embed(windows.actions)))
         returns = steps(windows.returns_to_go)
-        losses = self.head.losses(*given)  # type: ignore[arg-type]
+        losses = self.head.losses(*inputs)  # type: ignore[arg-type]
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)
         action_loss, value_loss = losses.mean(), self.values.loss(values, returns)

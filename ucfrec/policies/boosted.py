@@ -97,8 +97,8 @@ class BoostedPolicy(SequencePolicy):
         def solve() -> None:
             steps = np.arange(train.n_steps)
             if len(steps) > _MAX_ROWS:
-                drawn = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
-                steps = np.sort(drawn)
+                sample = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
+                steps = np.sort(sample)
             trees = BoostedTrees.fit(*self._rows(train, steps), seed)
             self.base.copy_(trees.base)
             count = len(trees.leaves)
@@ -111,11 +111,15 @@ class BoostedPolicy(SequencePolicy):
     def _rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
         """Inputs (M, F) of the trees at training steps (M,), and which were liked."""
         folds = np.arange(train.n_episodes) % _FOLDS
-        others = []
+        other_counts = []
         for fold in range(_FOLDS):
-            own = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
-            others.append(torch.stack([self.shown.cpu() - own.shown, self.liked.cpu() - own.liked]))
-        counts = torch.stack(others, dim=1)  # (2, folds, n_items)
+            fold_counts = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
+            other_counts.append(
+                torch.stack(
+                    [self.shown.cpu() - fold_counts.shown, self.liked.cpu() - fold_counts.liked]
+                )
+            )
+        counts = torch.stack(other_counts, dim=1)  # (2, folds, n_items)
         inputs, target = [], []
         for begin in range(0, len(numbers), _AT_ONCE):
             at = train.locate(numbers[begin : begin + _AT_ONCE])
@@ -123,8 +127,8 @@ class BoostedPolicy(SequencePolicy):
             items = windows.actions[:, -1:]
             of_items = counts[:, torch.from_numpy(folds[at[0]]).unsqueeze(1), items]
             device = self.shown.device
-            found = self._inputs(windows.to(device), items.to(device), of_items.to(device))
-            inputs.append(found[:, 0].cpu().numpy())
+            rows = self._inputs(windows.to(device), items.to(device), of_items.to(device))
+            inputs.append(rows[:, 0].cpu().numpy())
             target.append(liked_rewards(train, train.step_values(schema.REWARD, *at)))
         return np.concatenate(inputs), np.concatenate(target)
 
@@ -152,7 +156,7 @@ class BoostedPolicy(SequencePolicy):
         none = cosines.new_zeros(cosines.shape[:2])
         alike = self.tag[items].unsqueeze(-1) == self.tag[earlier].unsqueeze(1)
         tagged, liked_tagged = (
-            (alike.float() @ each.unsqueeze(-1)).squeeze(-1) for each in (before, liked)
+            (alike.float() @ weights.unsqueeze(-1)).squeeze(-1) for weights in (before, liked)
         )
         whole = (likes + 1) / (count + 2)
         columns = (
@@ -167,7 +171,7 @@ class BoostedPolicy(SequencePolicy):
             torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
             tagged,
         )
-        return torch.stack([each.expand_as(none) for each in columns], dim=-1)
+        return torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
 
     def _scored(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""

@@ -69,8 +69,8 @@ class BPRPolicy(SequencePolicy):
         features, shown = self.features(normalized)[liked], windows.actions[liked]
         exposed = self.exposed(normalized)
         exposed = None if exposed is None else exposed.select(liked.flatten())
-        other = torch.randint(len(head.bias), shown.shape, device=shown.device)
-        apart = head.logit(features, shown, exposed) - head.logit(features, other, exposed)
+        negative = torch.randint(len(head.bias), shown.shape, device=shown.device)
+        apart = head.logit(features, shown, exposed) - head.logit(features, negative, exposed)
         value = -F.logsigmoid(apart).sum() / max(1, len(shown))
         return value, {"bpr_loss": value.detach()}
 

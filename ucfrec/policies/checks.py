@@ -50,8 +50,8 @@ def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str
             than the head takes; the loss is no pair; or the class defines a reserved name.
     """
     classes = type(policy).__mro__
-    own = classes[: classes.index(SequencePolicy)]
-    if taken := sorted(RESERVED.intersection(name for kind in own for name in vars(kind))):
+    own_classes = classes[: classes.index(SequencePolicy)]
+    if taken := sorted(RESERVED.intersection(name for kind in own_classes for name in vars(kind))):
         _refuse(policy, f"defines {', '.join(taken)}, which SequencePolicy keeps for itself")
     was_training = policy.training
     policy.eval()
@@ -85,8 +85,8 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
     cuts = context - 1 - back
     first, acts = _outputs(policy, windows)
     second, other_acts = _outputs(policy, _changed(windows, cuts, policy))
-    known = windows.mask & (torch.arange(context) <= cuts[:, None])
-    if _alike(first[known], second[known]) and _alike(acts[::2], other_acts[::2]):
+    unchanged = windows.mask & (torch.arange(context) <= cuts[:, None])
+    if _alike(first[unchanged], second[unchanged]) and _alike(acts[::2], other_acts[::2]):
         return
     if not _alike(first, _outputs(policy, windows)[0]):
         _refuse(policy, "gives other features for the same windows; draw only if self.training")

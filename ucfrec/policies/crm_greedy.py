@@ -61,8 +61,8 @@ class CRMGreedyPolicy(SequencePolicy):
         rewards = train.step_values(schema.REWARD, episodes, steps)
         self.reward_mean.fill_(float(rewards.mean()))
         self.reward_std.fill_(max(float(rewards.std()), 1e-6))
-        drawn = np.random.default_rng(0).integers(len(episodes), size=_CANDIDATES)
-        actions = train.step_values(schema.ACTION, episodes[drawn], steps[drawn])
+        sample = np.random.default_rng(0).integers(len(episodes), size=_CANDIDATES)
+        actions = train.step_values(schema.ACTION, episodes[sample], steps[sample])
         self.candidates.copy_(torch.from_numpy(actions))
 
     def make_solver(
@@ -122,12 +122,12 @@ class CRMGreedyPolicy(SequencePolicy):
 
     def _values(self, model: nn.Sequential, states: Tensor) -> Tensor:
         """Predicted standardised rewards (B, n_candidates) in states (B, S)."""
-        first, *rest = model
+        first, *layers = model
         assert isinstance(first, nn.Linear)
         # The first layer is linear: its state part is computed once per state and its action part
         # once per candidate, instead of both once per pair.
         size = states.shape[1]
         of_actions = F.linear(self.candidates, first.weight[:, size:], first.bias)
-        of_states, remaining = F.linear(states, first.weight[:, :size]), nn.Sequential(*rest)
+        of_states, remaining = F.linear(states, first.weight[:, :size]), nn.Sequential(*layers)
         chunks = torch.split(of_states, max(1, _PAIRS // len(of_actions)))
         return torch.cat([remaining(rows.unsqueeze(1) + of_actions).squeeze(-1) for rows in chunks])

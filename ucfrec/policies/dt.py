@@ -126,8 +126,8 @@ def rows_through(
     blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice
 ) -> Tensor:
     """The `rows` (B, M, d) of what `Block`s make of (B, L, d), by `visible` (B, 1, L, L)."""
-    *others, last = blocks
+    *first_blocks, last = blocks
     assert isinstance(last, Block)
-    for block in others:
+    for block in first_blocks:
         hidden = block(hidden, visible)
     return last.rows(hidden, visible, rows)

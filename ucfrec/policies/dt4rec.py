@@ -90,9 +90,9 @@ class DT4RecPolicy(DTPolicy):
         actions = self.head.embed(windows.actions)[mask]
         scores = [F.cosine_similarity(features[mask], actions, dim=-1)]
         for _ in range(config.negatives):
-            other = torch.randperm(len(mask), device=mask.device)
-            both_valid = mask & mask[other]
-            returns = torch.where(both_valid, windows.returns_to_go[other], windows.returns_to_go)
+            order = torch.randperm(len(mask), device=mask.device)
+            both_valid = mask & mask[order]
+            returns = torch.where(both_valid, windows.returns_to_go[order], windows.returns_to_go)
             prompts = self.embed.returns(replace(windows, returns_to_go=returns))
             negative = self.attended((prompts, *encoded), mask)[:, 1::3]
             score = F.cosine_similarity(negative[mask], actions, dim=-1)

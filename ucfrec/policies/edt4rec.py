@@ -70,9 +70,9 @@ class ConservativeQ(nn.Module):
         self.config = config
         mean, std = store.state_statistics
         episodes, steps = store.all_steps()
-        kept = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
+        sample = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
         column = schema.ITEM if store.has_items else schema.ACTION
-        logged = torch.from_numpy(store.step_values(column, episodes[kept], steps[kept]))
+        logged = torch.from_numpy(store.step_values(column, episodes[sample], steps[sample]))
         vectors = store.action_vectors(logged.long() if store.has_items else logged)
         every = store.item_states.embeddings if store.has_items else None
         self.register_buffer("state_mean", mean)
@@ -98,11 +98,11 @@ class ConservativeQ(nn.Module):
         shape = (count, self.config.candidates // 2)
         logged = self.logged[torch.randint(len(self.logged), shape)]
         if self.every is not None:
-            drawn = self.every[torch.randint(len(self.every), shape)]
+            uniform = self.every[torch.randint(len(self.every), shape)]
         else:
             low, high = self.low, self.high
-            drawn = low + (high - low) * torch.rand(*shape, len(low))
-        return torch.cat([logged, drawn], dim=1)
+            uniform = low + (high - low) * torch.rand(*shape, len(low))
+        return torch.cat([logged, uniform], dim=1)
 
     def compared(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
         """Values (M, C) of candidate actions (M, C, A) in states (M, S)."""
@@ -126,8 +126,8 @@ class ConservativeQ(nn.Module):
             next_values = self.state_values(batch.next_states, self.target)
             target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
         value = self.q(batch.states, batch.actions)
-        others = self.compared(batch.states, self.candidates(len(value)))
-        soft_maximum = torch.cat([others, value.unsqueeze(1)], dim=1).logsumexp(-1)
+        values = self.compared(batch.states, self.candidates(len(value)))
+        soft_maximum = torch.cat([values, value.unsqueeze(1)], dim=1).logsumexp(-1)
         conservative = (soft_maximum - value).mean()
         error = 0.5 * F.mse_loss(value, target)
         return self.config.weight * conservative + error, {"td": error.detach()}
@@ -193,8 +193,8 @@ def optimistic_returns(
     ends = np.cumsum(lengths)
     owner = np.repeat(np.arange(len(lengths)), lengths)
     total = np.cumsum(rewards, dtype=np.float64)
-    before = total - rewards  # C_t plus the rewards of earlier episodes
-    first = before[ends - lengths][owner]
+    earlier = total - rewards  # C_t plus the rewards of earlier episodes
+    first = earlier[ends - lengths][owner]
     next_values = np.append(values[1:], 0.0)
     next_values[ends - 1] = 0.0
     attainable = next_values + (total - first)  # V_{t+1} + C_{t+1}
@@ -202,7 +202,7 @@ def optimistic_returns(
     offset = float(np.ptp(attainable)) + 1.0
     separated = attainable - owner * offset
     highest = np.maximum.accumulate(separated[::-1])[::-1] + owner * offset
-    return np.asarray(highest - (before - first), dtype=np.float32)
+    return np.asarray(highest - (earlier - first), dtype=np.float32)
 
 
 @settings_table("policy")

@@ -57,9 +57,9 @@ class Proposal:
         cumulative, device = self._cumulative, self.share.device
         parts = torch.arange(count, device=device)
         points = (parts + torch.rand(count, device=device, dtype=torch.float64)) / count
-        drawn = torch.searchsorted(cumulative, points * cumulative[-1], right=True)
-        drawn = drawn.clamp(max=len(cumulative) - 1)
-        items, copies = torch.unique_consecutive(drawn, return_counts=True)
+        draws = torch.searchsorted(cumulative, points * cumulative[-1], right=True)
+        draws = draws.clamp(max=len(cumulative) - 1)
+        items, copies = torch.unique_consecutive(draws, return_counts=True)
         return Candidates(items, torch.log(copies / (count * self.share[items])).float())
 
 
@@ -161,7 +161,7 @@ class ItemHead(nn.Module):
             self._kept = None
             return self.project(self.embeddings) + self.correction  # type: ignore[no-any-return]
         weights = (self.embeddings, self.correction, self.project.weight, self.project.bias)
-        state = tuple((id(each), each.data_ptr(), each._version) for each in weights)
+        state = tuple((id(weight), weight.data_ptr(), weight._version) for weight in weights)
         if self._kept is None or self._kept[0] != state:
             self._kept = state, self.project(self.embeddings) + self.correction
         return self._kept[1]
@@ -206,10 +206,10 @@ class ItemHead(nn.Module):
         logit = self.logit(features, actions, exposed)
         if not self.training:
             return self._log_normaliser(features, exposed) - logit
-        found = self._proposal_now().draw(self.samples)
-        logits = self._weighted(features, found, exposed)
+        candidates = self._proposal_now().draw(self.samples)
+        logits = self._weighted(features, candidates, exposed)
         # The logged item counts as itself, not as one that was drawn.
-        column = columns_of(actions, found.items)
+        column = columns_of(actions, candidates.items)
         rows = torch.nonzero(column >= 0)[:, 0]
         logits = logits.index_put_((rows, column[rows]), logits.new_tensor(-torch.inf))
         return torch.logaddexp(logits.logsumexp(-1), logit) - logit
@@ -220,9 +220,9 @@ class ItemHead(nn.Module):
             logs = self.predict(features, exposed).log_softmax(-1)
             of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
             return of_all
-        found = self._proposal_now().draw(self.samples)
-        logs = self._weighted(features, found, exposed).log_softmax(-1)
-        estimate: Tensor = -(logs.exp() * (logs - found.log_weights)).sum(-1).mean()
+        candidates = self._proposal_now().draw(self.samples)
+        logs = self._weighted(features, candidates, exposed).log_softmax(-1)
+        estimate: Tensor = -(logs.exp() * (logs - candidates.log_weights)).sum(-1).mean()
         return estimate
 
     def _logits(
@@ -238,10 +238,14 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def _weighted(self, features: Tensor, found: Candidates, exposed: Exposed | None) -> Tensor:
+    def _weighted(
+        self, features: Tensor, candidates: Candidates, exposed: Exposed | None
+    ) -> Tensor:
         """Logits (M, L) of the candidates plus their log weights."""
-        bias = self._bias_of(found.items) + found.log_weights
-        return self._logits(features, self.vectors(found.items), bias, found.items, exposed)
+        bias = self._bias_of(candidates.items) + candidates.log_weights
+        return self._logits(
+            features, self.vectors(candidates.items), bias, candidates.items, exposed
+        )
 
     def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
         """Logits (M,) of the logged items."""
@@ -332,8 +336,8 @@ class ValueHead(nn.Module):
         tokens = F.relu(self.embed(torch.cat([windows.states, time, before], dim=-1)))
         # Padding is moved from the left to the right, where it follows every step.
         padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)
-        found, _ = self.history(_taken(tokens, (steps + padding).clamp(max=mask.shape[1] - 1)))
-        return self.out(_taken(found, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
+        candidates, _ = self.history(_taken(tokens, (steps + padding).clamp(max=mask.shape[1] - 1)))
+        return self.out(_taken(candidates, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
 
     @staticmethod
     def loss(values: Tensor, returns: Tensor) -> Tensor:

@@ -75,8 +75,8 @@ def some_padding(mask: Tensor) -> Tensor | None:
 
     A graph that is exported holds for every padding.
     """
-    known = mask.device.type == "cpu" and not torch.compiler.is_compiling()
-    return None if known and bool(mask.all()) else mask
+    on_cpu = mask.device.type == "cpu" and not torch.compiler.is_compiling()
+    return None if on_cpu and bool(mask.all()) else mask
 
 
 def draw_normal(weight: Tensor, std: float = 1.0) -> Tensor:
@@ -174,7 +174,7 @@ class _ConvBlock(nn.Module):
 def convolved(streams: Iterable[nn.Module], tokens: Iterable[Tensor], mask: Tensor) -> list[Tensor]:
     """The tokens (B, K, d) of each modality through its stream; steps outside `mask` count as 0."""
     padded = some_padding(mask)
-    return [stream(each, padded) for stream, each in zip(streams, tokens, strict=True)]
+    return [stream(values, padded) for stream, values in zip(streams, tokens, strict=True)]
 
 
 def visible_tokens(valid: Tensor) -> Tensor:

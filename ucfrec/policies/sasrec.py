@@ -59,11 +59,11 @@ class SASRecPolicy(SequencePolicy):
         """The first block's tokens (B, K, d), and which of them see which, (B, 1, K, K)."""
         before = self.head.embed(windows.actions).roll(1, dims=1)
         # The first step of a window has no earlier action in the window.
-        known = windows.mask & windows.mask.roll(1, dims=1)
-        known[:, 0] = False
+        has_earlier = windows.mask & windows.mask.roll(1, dims=1)
+        has_earlier[:, 0] = False
         last = self.embed_timestep.num_embeddings - 1
         time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        tokens = before.masked_fill(~known.unsqueeze(-1), 0.0) + time
+        tokens = before.masked_fill(~has_earlier.unsqueeze(-1), 0.0) + time
         return self.dropout(tokens), visible_tokens(windows.mask)
 
 
@@ -111,8 +111,8 @@ class GSASRecPolicy(SASRecPolicy):
         offset = math.log(beta / rate)
         negative = head.logits_of(features, items, exposed) + offset
         positive = head.logit(features, shown, exposed) + offset
-        others = items != shown.unsqueeze(1)
-        against = (F.softplus(negative) * others).sum(1)
+        is_negative = items != shown.unsqueeze(1)
+        against = (F.softplus(negative) * is_negative).sum(1)
         losses = (against - beta * F.logsigmoid(positive)) / (len(items) + 1)
         value = losses.mean()
         return value, {"gbce_loss": value.detach()}
@@ -122,6 +122,6 @@ class GSASRecPolicy(SASRecPolicy):
         device = self.state_mean.device
         if n_items <= self.config.negatives:
             return torch.arange(n_items, device=device)
-        drawn = torch.randint(n_items, (self.config.negatives,), device=device)
-        found: Tensor = torch.unique(drawn)
-        return found
+        sample = torch.randint(n_items, (self.config.negatives,), device=device)
+        items: Tensor = torch.unique(sample)
+        return items

@@ -220,7 +220,7 @@ class SupervisedAttention(nn.Module):
         scores = (scores / width**0.5).masked_fill(~visible.unsqueeze(1), -torch.inf)
         attention = scores.softmax(-1)  # (B, H, Q, 3K)
         shares = self.dropout(attention).unbind(1)
-        mixed = torch.cat([each @ value for each, value in zip(shares, values, strict=True)], -1)
+        mixed = torch.cat([share @ value for share, value in zip(shares, values, strict=True)], -1)
         return self.out(mixed), attention
 
 
@@ -308,8 +308,8 @@ class StackedStreams:
         tokens = policy.embed.stacked(windows, embed(windows.actions))
         tokens = self._convolved(tokens, some_padding(windows.mask))
         rows = tokens.view(3, batch * length, -1)
-        known = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
-        fused = policy.fuse_norm(known.add_(rows)).view(tokens.shape)
+        sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
+        fused = policy.fuse_norm(sums.add_(rows)).view(tokens.shape)
         attended = self._attended(fused, windows.mask)
         hidden = fused[1, :, -1] + attended
         return policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))  # type: ignore[no-any-return]

@@ -79,7 +79,7 @@ class Beginning:
             return None
         effects = Effects()
         with damage_explained(file, REMEDY):
-            tried = [EffectTried(**each) for each in load_tensors(file)[1]["effects"]]
+            entries = [EffectTried(**effect) for effect in load_tensors(file)[1]["effects"]]
             for name, old in load_tensors(_beside(file))[0].items():
                 new = design.zeros(name)
                 if old.dtype != new.dtype or not old.isfinite().all():
@@ -92,8 +92,12 @@ class Beginning:
                     new[: len(known)] = known
                     effects[name] = new
         spreads = np.array(_SPREADS)
-        numbers = {each.effect: int(np.abs(spreads - each.spread).argmin()) for each in tried}
-        return cls({each.effect: numbers[each.effect] for each in tried if each.kept}, effects)
+        numbers = {
+            effect.effect: int(np.abs(spreads - effect.spread).argmin()) for effect in entries
+        }
+        return cls(
+            {effect.effect: numbers[effect.effect] for effect in entries if effect.kept}, effects
+        )
 
 
 def save_fit(
@@ -227,8 +231,8 @@ class EffectSearch:
         def tell(scale: float) -> None:
             model.tastes.root.copy_(scale * root)
             self.design, self.held_out = (
-                replace(design, tastes=added_by_tastes(model, before, design.items))
-                for design, before in zip((self.design, self.held_out), shown, strict=True)
+                replace(design, tastes=added_by_tastes(model, earlier, design.items))
+                for design, earlier in zip((self.design, self.held_out), shown, strict=True)
             )
 
         def loss(scale: float) -> float:
@@ -254,34 +258,36 @@ class EffectSearch:
     def report(self) -> tuple[EffectTried, ...]:
         """The effects tried, with the final spreads of those that were kept."""
         return tuple(
-            dataclasses.replace(tried, spread=_SPREADS[self.kept[tried.effect]])
-            if tried.kept
-            else tried
-            for tried in self.tried
+            dataclasses.replace(entries, spread=_SPREADS[self.kept[entries.effect]])
+            if entries.kept
+            else entries
+            for entries in self.tried
         )
 
     def _best(
         self, name: str, at: int, strides: tuple[int, ...]
     ) -> tuple[int, tuple[Effects, Tensor]]:
         """Index of the best spread of the effect `name` near `at`, the fit, and its losses."""
-        found: dict[int, tuple[Effects, Tensor]] = {}
+        fits: dict[int, tuple[Effects, Tensor]] = {}
 
         def loss(index: int) -> float:
             if not 0 <= index < len(_SPREADS):
                 return float("inf")
-            if index not in found:
-                spreads = {each: _SPREADS[number] for each, number in self.kept.items()}
+            if index not in fits:
+                spreads = {effect: _SPREADS[number] for effect, number in self.kept.items()}
                 if self.new_users:
-                    spreads = {each: spreads[each] for each in spreads if each not in LASTING}
+                    spreads = {
+                        effect: spreads[effect] for effect in spreads if effect not in LASTING
+                    }
                 spreads[name] = _SPREADS[index]
                 start = self.effects
                 if self._begin is not None:
                     start = self._begin.effects | start
-                    if found:
-                        start = found[min(found, key=lambda other: abs(other - index))][0]
+                    if fits:
+                        start = fits[min(fits, key=lambda i: abs(i - index))][0]
                 effects = fit_effects(self.design, start, spreads, self._fixed)
-                found[index] = effects, self._losses(effects)
-            return float(found[index][1].mean())
+                fits[index] = effects, self._losses(effects)
+            return float(fits[index][1].mean())
 
         for stride in strides:
             for step in (stride, -stride):
@@ -291,7 +297,7 @@ class EffectSearch:
                 if at != start:
                     break
         loss(at)
-        return at, found[at]
+        return at, fits[at]
 
     def _losses(self, effects: Effects) -> Tensor:
         return self.held_out.loss(self.held_out.predictor(effects)).double()

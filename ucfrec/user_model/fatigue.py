@@ -68,16 +68,16 @@ class MainTags:
         liked = self.liked(shown.rewards) & (shown.items >= 0)
         tags = torch.where(liked, self.tags[shown.items], -1)
         lengths = []
-        before, length = torch.full((len(tags),), -1), torch.zeros(len(tags), dtype=torch.int64)
+        previous, length = torch.full((len(tags),), -1), torch.zeros(len(tags), dtype=torch.int64)
         for tag in reversed(tags.unbind(1)):
-            length = (torch.where(tag == before, length, 0) + 1).masked_fill(tag < 0, 0)
-            before = tag
+            length = (torch.where(tag == previous, length, 0) + 1).masked_fill(tag < 0, 0)
+            previous = tag
             lengths.append(length)
         return torch.stack(lengths[::-1], 1) if lengths else torch.zeros_like(shown.items)
 
     def tired(self, shown: Shown, run: int) -> Tensor:
         """Main tag (B,) of the `run` items shown last, if all had it and were liked; else −1."""
-        items, rewards = (each[:, :run] for each in shown)
+        items, rewards = (values[:, :run] for values in shown)
         tags = self.tags[items.clamp(min=0)]
         alike = (tags == tags[:, :1]) & (items >= 0) & self.liked(rewards)
         return torch.where(alike.all(1) & (items.shape[1] >= run), tags[:, 0], -1)
@@ -127,7 +127,7 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
     the fatigue, and showed what no one likes, look as if the users would have liked nothing.
     Fatigue must at least halve the likes, in held-out rows too.
     """
-    found, clearest = None, 0.0
+    best, clearest = None, 0.0
     for length, steps in _candidates(training.runs.shape[1]):
         seen, expected = _likes(training, length, steps)
         if expected < _EXPECTED or seen > _MOST * expected:
@@ -135,20 +135,20 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
         # Twice the logarithm of the likelihood ratio of two Poisson rates.
         clearness = 2 * (seen * np.log(max(seen, 1e-9) / expected) + expected - seen)
         if clearness > clearest:
-            found, clearest = Fatigue(length, steps, seen / expected), clearness
-    if found is None:
+            best, clearest = Fatigue(length, steps, seen / expected), clearness
+    if best is None:
         return None
-    seen, expected = _likes(held_out, found.length, found.steps)
-    return found if expected >= _EXPECTED and seen <= _MOST * expected else None
+    seen, expected = _likes(held_out, best.length, best.steps)
+    return best if expected >= _EXPECTED and seen <= _MOST * expected else None
 
 
 def _likes(rows: LoggedRuns, length: int, steps: int) -> tuple[float, float]:
     """Likes of fatigued users, and as many as they gave elsewhere in the same sessions."""
     tired = Fatigue(length, steps, 0.0).tired(rows.runs).numpy()
     count = int(rows.sessions.max(initial=-1)) + 1
-    others = np.bincount(rows.sessions[~tired], minlength=count)
+    rested = np.bincount(rows.sessions[~tired], minlength=count)
     liked = np.bincount(rows.sessions[~tired & rows.liked], minlength=count)
-    share = liked / np.maximum(others, 1)
+    share = liked / np.maximum(rested, 1)
     return float(rows.liked[tired].sum()), float(share[rows.sessions[tired]].sum())
 
 

@@ -86,27 +86,29 @@ class UserModel:
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line, checked = users.report.calibration if users else (1.0, 0.0), None
+            line, calibration = users.report.calibration if users else (1.0, 0.0), None
             if users is None or not report.new_users:
                 model = users.model if users else reward
-                checked = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
-                line = checked.line
+                calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
+                line = calibration.line
             fitted = {
                 "fatigue": None if tired is None else dataclasses.asdict(tired),
                 "calibration": line,
-                "calibration_report": checked and dataclasses.asdict(checked),
+                "calibration_report": calibration and dataclasses.asdict(calibration),
                 "session_end": dataclasses.asdict(end_report),
             }
             save_tensors(path, dict(end.tensors), fitted)
-        tensors, about = load_tensors(path)
+        tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
-            slope, intercept = about["calibration"]
-            fatigue = None if about["fatigue"] is None else Fatigue(**about["fatigue"])
-            end_report = SessionEndReport(**about["session_end"])
-            checked = about["calibration_report"] and UserCalibration(**about["calibration_report"])
+            slope, intercept = metadata["calibration"]
+            fatigue = None if metadata["fatigue"] is None else Fatigue(**metadata["fatigue"])
+            end_report = SessionEndReport(**metadata["session_end"])
+            calibration = metadata["calibration_report"] and UserCalibration(
+                **metadata["calibration_report"]
+            )
             end = SessionEnd.of(reward.likeness, tensors)
         line = slope, intercept
-        return cls(reward, report, users, line, end, end_report, fatigue, tags, checked)
+        return cls(reward, report, users, line, end, end_report, fatigue, tags, calibration)
 
     @property
     def rewarding(self) -> ItemRewardModel:
@@ -134,11 +136,11 @@ class UserModel:
 
     def report(self) -> dict[str, Any]:
         """What simulated sessions are drawn from, as a JSON object."""
-        checked = self.calibration_report
+        calibration = self.calibration_report
         users = None if self.training_users is None else self.training_users.report
         return {
             "calibration": list(self.calibration),
-            "calibration_report": checked and dataclasses.asdict(checked),
+            "calibration_report": calibration and dataclasses.asdict(calibration),
             "users": None if users is None else dataclasses.asdict(users),
             "session_end": dataclasses.asdict(self.session_end_report),
             "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),

@@ -204,13 +204,13 @@ class ItemRewardModel(nn.Module):
 
     def fixed_part(self, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
-        before, repeated, alike = self.exposures(shown)
-        each, known = items.unsqueeze(1), self._known(users, items)
-        exposure = self.likeness.to_items(self.likeness.profile(before, alike), each)
-        exposure = exposure + ((before == each) * repeated).sum(1)
+        earlier, repeated, alike = self.exposures(shown)
+        each, user_rows = items.unsqueeze(1), self._known(users, items)
+        exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), each)
+        exposure = exposure + ((earlier == each) * repeated).sum(1)
         tastes = self.tastes_after(shown)
-        affinity = ((self.affinity[known] + tastes[:, 1:]) * self.vectors[items]).sum(1)
-        part: Tensor = self.item[items] + self.user[known] + tastes[:, 0] + affinity + exposure
+        affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
+        part: Tensor = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
         return part
 
     def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:

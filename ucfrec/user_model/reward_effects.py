@@ -69,10 +69,10 @@ class Design:
         likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
         x = model.standardised(rows.states)
-        known = (rows.users >= 0) & (rows.users < last)
+        is_known = (rows.users >= 0) & (rows.users < last)
         return cls(
             items=rows.items,
-            users=torch.where(known, rows.users, last),
+            users=torch.where(is_known, rows.users, last),
             x=x,
             observed=x[:, x.shape[1] - rows.observations :],
             exposure=_exposure(model, rows),
@@ -153,8 +153,8 @@ class Design:
 
     def squares(self, name: str) -> Tensor:
         """Weighted sum over rows of the squares of what each number of the effect multiplies."""
-        each = self.weights.unsqueeze(1)
-        vectors, sums = each * self.rows.square(), self.zeros(name)
+        weight = self.weights.unsqueeze(1)
+        vectors, sums = weight * self.rows.square(), self.zeros(name)
         match name:
             case "mean":
                 return sums + self.count
@@ -165,7 +165,7 @@ class Design:
             case "content":
                 tags = self.tags[self.items]
                 counts = torch.zeros(self.n_tags + 1)
-                counts.index_add_(0, tags.flatten(), each.expand(tags.shape).flatten())
+                counts.index_add_(0, tags.flatten(), weight.expand(tags.shape).flatten())
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
             case "affinity":
                 return sums.index_add(0, self.users, vectors)
@@ -174,9 +174,9 @@ class Design:
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
             case "exposure":
-                return (each * self.exposure.square()).sum(0)
+                return (weight * self.exposure.square()).sum(0)
             case "state":
-                return (each * self.x.square()).sum(0)
+                return (weight * self.x.square()).sum(0)
         return self.x.square().T @ vectors
 
     @property
@@ -231,7 +231,7 @@ def fit_effects(
         spreads: of every effect of the fit; see `Design.penalty`.
         fixed: effects that are part of the predictor, and of the result, as they are.
     """
-    given = fixed or {}
+    constant = fixed or {}
     names = ("mean", *spreads)
     curvature = 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
@@ -241,17 +241,20 @@ def fit_effects(
 
     def effects_of(numbers: Tensor) -> Effects:
         parts = zip(first.items(), torch.split(numbers, sizes), strict=True)
-        return {name: units[name].effect(part.view(like.shape)) for (name, like), part in parts}
+        return {
+            name: units[name].effect(part.view(first_numbers.shape))
+            for (name, first_numbers), part in parts
+        }
 
     def objective(numbers: Tensor) -> Tensor:
         effects = effects_of(numbers)
-        loss = design.loss(design.predictor(given | effects)).sum(dtype=torch.float64)
+        loss = design.loss(design.predictor(constant | effects)).sum(dtype=torch.float64)
         for name in spreads:
             loss = loss + 0.5 * penalty[name] * effects[name].square().sum(dtype=torch.float64)
         return loss
 
     start_numbers = torch.cat([part.flatten() for part in first.values()])
-    return given | effects_of(minimum(objective, start_numbers))
+    return constant | effects_of(minimum(objective, start_numbers))
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:

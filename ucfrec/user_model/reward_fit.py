@@ -94,10 +94,10 @@ def fit_item_reward_model(
     """
     model = ItemRewardModel(reward_model_sizes(train))
     if (folder / FITTED).exists():
-        tensors, about = load_tensors(folder / FITTED)
+        tensors, metadata = load_tensors(folder / FITTED)
         load_weights(folder / FITTED, model, tensors)
         with damage_explained(folder / FITTED, REMEDY):
-            return model.eval(), ItemRewardReport(**about)
+            return model.eval(), ItemRewardReport(**metadata)
     start = time.process_time()
     rows = RewardRows.of(train, model.lags, max_rows, seed)
     held_out = RewardRows.of(validation, model.lags, max_rows, seed)
@@ -132,8 +132,8 @@ def refit_item_reward_model(
         store: view of the episodes to fit to.
         seed: of the rows drawn from a view with too many.
     """
-    tensors, about = load_tensors(first / FITTED)
-    report = ItemRewardReport(**about)
+    tensors, metadata = load_tensors(first / FITTED)
+    report = ItemRewardReport(**metadata)
     model = ItemRewardModel(reward_model_sizes(store))
     lags = MEMORY if "tastes" in report.kept else model.lags
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
@@ -178,12 +178,12 @@ def set_statistics(
     model.binary.fill_(binary)
     model.reward_low.fill_(values[0] if binary else states.reward_low)
     model.reward_high.fill_(values[1] if binary else states.reward_high)
-    rewards, before = rows.rewards.double(), rows.states.double()
+    rewards, states_before = rows.rewards.double(), rows.states.double()
     model.reward_mean.copy_(rewards.mean())
     model.reward_std.copy_(rewards.std(correction=0))
-    model.state_mean.copy_(before.mean(0))
-    spread = before.std(0, correction=0)
-    constant = spread <= _CONSTANT * before.mean(0).abs().clamp(min=1.0)
+    model.state_mean.copy_(states_before.mean(0))
+    spread = states_before.std(0, correction=0)
+    constant = spread <= _CONSTANT * states_before.mean(0).abs().clamp(min=1.0)
     model.state_std.copy_(torch.where(constant, torch.inf, spread))
     shown = states.embeddings[rows.items].double()
     centred = states.embeddings.double() - shown.mean(0)

@@ -78,8 +78,8 @@ def drawn_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, In
     """Episodes and steps (M,) of all steps of a view; of more than `limit`, so many drawn."""
     numbers = np.arange(view.n_steps)
     if view.n_steps > limit:
-        drawn = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
-        numbers = np.sort(drawn)
+        sample = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
+        numbers = np.sort(sample)
     return view.locate(numbers)
 
 
@@ -173,7 +173,7 @@ class ItemRewardReport:
     @property
     def kept(self) -> Mapping[str, float]:
         """Spreads of the effects that are part of the model, by name."""
-        return {tried.effect: tried.spread for tried in self.effects if tried.kept}
+        return {entry.effect: entry.spread for entry in self.effects if entry.kept}
 
 
 def scores_of(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]:
@@ -236,9 +236,9 @@ def gauc_against(
     _, owner = np.unique(users.numpy(), return_inverse=True)
     n_users = int(owner.max(initial=-1)) + 1
     above, below = group_auc(scores.double().numpy(), liked.numpy(), owner, n_users)
-    other, _ = group_auc(reference.double().numpy(), liked.numpy(), owner, n_users)
+    baseline, _ = group_auc(reference.double().numpy(), liked.numpy(), owner, n_users)
     value, error = ratio_with_error(above, below)
-    gain, gain_error = ratio_with_error(above - other, below)
+    gain, gain_error = ratio_with_error(above - baseline, below)
     return {
         "gauc": value,
         "gauc_error": error,

@@ -63,14 +63,14 @@ class LoggedEnds:
         The last step of a session that is not terminated is excluded: the log may simply have ended
         there.
         """
-        known = store.lengths - ~store.terminated
-        ends = np.cumsum(known)
+        usable = store.lengths - ~store.terminated
+        ends = np.cumsum(usable)
         numbers = np.arange(int(ends[-1]))
         if len(numbers) > most:
-            drawn = np.random.default_rng(seed).choice(len(numbers), most, replace=False)
-            numbers = np.sort(drawn)
+            sample = np.random.default_rng(seed).choice(len(numbers), most, replace=False)
+            numbers = np.sort(sample)
         episodes = np.searchsorted(ends, numbers, side="right")
-        steps = numbers - (ends - known)[episodes]
+        steps = numbers - (ends - usable)[episodes]
         ended = steps == store.lengths[episodes] - 1
         shown = Shown.before(store, episodes, steps, lags)
         items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
@@ -81,8 +81,8 @@ class LoggedEnds:
     def select(self, rows: BoolArray) -> "LoggedEnds":
         """Some of the steps."""
         shown, items = self.shown.at(torch.from_numpy(rows)), self.items[torch.from_numpy(rows)]
-        others = self.steps[rows], self.ended[rows], self.followed[rows]
-        return LoggedEnds(shown, items, self.rewards[rows], *others)
+        columns = self.steps[rows], self.ended[rows], self.followed[rows]
+        return LoggedEnds(shown, items, self.rewards[rows], *columns)
 
 
 def last_sessions(store: EpisodeStore) -> BoolArray:
@@ -162,7 +162,9 @@ class SessionEnd:
         certain = held_out.select(held_out.followed)
         if logged.followed.all() or certain.ended.sum() < _FEWEST:
             return every
-        sure, held_out = (each.select(each.followed | ~each.ended) for each in (logged, held_out))
+        sure, held_out = (
+            entry.select(entry.followed | ~entry.ended) for entry in (logged, held_out)
+        )
         without, report = cls._best(likeness, sure, held_out, seed)
         gain, error = _gain(every[0]._losses(certain), without._losses(certain))
         if gain <= 3 * error:
@@ -181,14 +183,14 @@ class SessionEnd:
             kinds["boosted"] = BoostedTrees.fit(inputs.numpy(), ended, seed).tensors()
         models = {kind: cls(likeness, tensors) for kind, tensors in kinds.items()}
         losses = {kind: model._losses(held_out) for kind, model in models.items()}
-        gains, kept = dict[str, tuple[float, float]](), "constant"
+        gains, best = dict[str, tuple[float, float]](), "constant"
         for kind in kinds:
-            gain, error = gains[kind] = _gain(losses[kept], losses[kind])
+            gain, error = gains[kind] = _gain(losses[best], losses[kind])
             if gain > error:
-                kept = kind
-        means = {kind: float(each.mean()) if len(each) else 0.0 for kind, each in losses.items()}
-        report = SessionEndReport(len(ended), len(held_out.ended), means, gains, kept)
-        return models[kept], report
+                best = kind
+        means = {kind: float(entry.mean()) if len(entry) else 0.0 for kind, entry in losses.items()}
+        report = SessionEndReport(len(ended), len(held_out.ended), means, gains, best)
+        return models[best], report
 
     def _losses(self, logged: LoggedEnds) -> Tensor:
         """Log losses (N,) of logged steps."""
@@ -206,11 +208,14 @@ class SessionEnd:
         """
         if "thresholds" in tensors:
             return cls(likeness, BoostedTrees.of(tensors, _INPUTS).tensors())
-        found = {name: tensors[name] for name in _LOGISTIC}
-        for name, each in found.items():
-            if each.shape != (() if name == "bias" else (_INPUTS,)) or each.dtype != torch.float64:
+        parts = {name: tensors[name] for name in _LOGISTIC}
+        for name, entry in parts.items():
+            if (
+                entry.shape != (() if name == "bias" else (_INPUTS,))
+                or entry.dtype != torch.float64
+            ):
                 raise ValueError(f"{name} does not fit the inputs")
-        return cls(likeness, found)
+        return cls(likeness, parts)
 
     def __post_init__(self) -> None:
         trees = BoostedTrees(**self.tensors) if "thresholds" in self.tensors else None
@@ -246,13 +251,15 @@ class SessionEnd:
         repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
         number = steps.unsqueeze(1)
         if self._trees is None:
-            inputs = [torch.stack(_columns(alike, repeated, each, number), -1) for each in rewards]
+            inputs = [
+                torch.stack(_columns(alike, repeated, entry, number), -1) for entry in rewards
+            ]
             odds = self._log_odds(torch.cat(inputs).flatten(0, 1))
             return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
         columns = torch.stack(_columns(alike, repeated, rewards[0], number)).flatten(1)
-        given = [each.flatten() for each in rewards]
-        odds_of_each = self._trees.with_values(columns.T, _REWARD, given)
-        return [torch.sigmoid(each).view(batch, count) for each in odds_of_each]
+        values = [entry.flatten() for entry in rewards]
+        odds_of_each = self._trees.with_values(columns.T, _REWARD, values)
+        return [torch.sigmoid(entry).view(batch, count) for entry in odds_of_each]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""
@@ -293,9 +300,9 @@ def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:
     return likeness.profile(items, torch.ones(items.shape))
 
 
-def _gain(losses: Tensor, others: Tensor) -> tuple[float, float]:
+def _gain(losses: Tensor, columns: Tensor) -> tuple[float, float]:
     """By how much the mean of `others` is lower, and the standard error; 0 without rows."""
-    decrease = losses - others
+    decrease = losses - columns
     if not len(decrease):
         return 0.0, 0.0
     return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5

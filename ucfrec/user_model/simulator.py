@@ -39,12 +39,14 @@ class LoggedRewards:
     @classmethod
     def of(cls, store: EpisodeStore) -> "LoggedRewards":
         """Those of all steps of a store."""
-        found = [
+        parts = [
             np.unique(rewards, return_counts=True)
             for (rewards,) in store.column_batches(schema.REWARD)
         ]
-        rewards, place = np.unique(np.concatenate([each for each, _ in found]), return_inverse=True)
-        counts = np.bincount(place, np.concatenate([each for _, each in found]))
+        rewards, place = np.unique(
+            np.concatenate([distinct for distinct, _ in parts]), return_inverse=True
+        )
+        counts = np.bincount(place, np.concatenate([distinct for _, distinct in parts]))
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]
         if len(values) > _GROUPS:
             middle = (counts.cumsum() - counts / 2) / counts.sum()

@@ -101,10 +101,10 @@ def fit_training_users(
     """
     model, path = ItemRewardModel(reward_model_sizes(train)), folder / _FITTED
     if path.exists():
-        tensors, about = load_tensors(path)
+        tensors, metadata = load_tensors(path)
         load_weights(path, model, tensors)
         with damage_explained(path, REMEDY):
-            return TrainingUsers(model.eval(), TrainingUsersReport(**about))
+            return TrainingUsers(model.eval(), TrainingUsersReport(**metadata))
     sessions = draw_sessions(train, seed)
     episodes, steps = sessions.all_steps()
     rows = RewardRows.at(sessions, episodes, steps, model.lags)
@@ -117,22 +117,22 @@ def fit_training_users(
         weights = propensity_weights(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
     begin = None if first is None else Beginning.of(first / _FITTED, design)
-    few = design
+    search_design = design
     if begin is not None and not weighted:
-        few = design.select(torch.arange(len(rows)) < WARM_ROWS)
-    search = EffectSearch(few, few, begin).of_training()
+        search_design = design.select(torch.arange(len(rows)) < WARM_ROWS)
+    search = EffectSearch(search_design, search_design, begin).of_training()
     with progress(len(EFFECTS), "training users", "effects") as bar:
         for name in EFFECTS:
             search.add(name)
             bar.update()
-    tried, held_back = search.report(), search.held_out
-    spreads = {each.effect: each.spread for each in tried if each.kept}
+    entries, held_back = search.report(), search.held_out
+    spreads = {entry.effect: entry.spread for entry in entries if entry.kept}
     start = design.mean_effect() if begin is None else search.effects
     effects = fit_effects(design, start, spreads)
     model.set_effects(effects, design.of_content)
     scores = held_back.predictor(search.effects)
     line = fit_line(scores, held_back.target, held_back.binary, held_back.weights)
-    report = TrainingUsersReport(line, tried, len(rows), design.count, weights is not None)
+    report = TrainingUsersReport(line, entries, len(rows), design.count, weights is not None)
     save_fit(path, model, effects, dataclasses.asdict(report))
     return TrainingUsers(model.eval(), report)
 
@@ -161,7 +161,7 @@ def propensity_weights(
     shares = np.minimum(1 / (propensities * items), _LARGEST_WEIGHT)
     owners = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
     users = np.unique(owners, return_inverse=True)[1][episodes]
-    sums, squares = (np.bincount(users, weights=each) for each in (shares, np.square(shares)))
+    sums, squares = (np.bincount(users, weights=entry) for entry in (shares, np.square(shares)))
     return torch.from_numpy(shares * (sums / squares)[users]).float()
 
 
@@ -199,7 +199,7 @@ class UserCalibration:
         parts = [half == number for number in (0, 1)]
         halves = [line_of(part) if part.sum() >= _FEWEST else line for part in parts]
         slope, intercept = (
-            torch.tensor([other[n] for other in reversed(halves)])[torch.from_numpy(half)]
+            torch.tensor([half_line[n] for half_line in reversed(halves)])[torch.from_numpy(half)]
             for n in (0, 1)
         )
         expected = (counts * model.expected(slope * scores + intercept)).double().numpy()

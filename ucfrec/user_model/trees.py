@@ -58,7 +58,7 @@ class BoostedTrees:
         model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
         tables = [_table(trees[0].nodes) for trees in model._predictors]
         splits, thresholds, leaves = (
-            torch.from_numpy(np.stack(each)) for each in zip(*tables, strict=True)
+            torch.from_numpy(np.stack(entry)) for entry in zip(*tables, strict=True)
         )
         base = torch.tensor(float(model._baseline_prediction.item())).double()
         return cls(splits, thresholds, leaves, base)
@@ -82,7 +82,7 @@ class BoostedTrees:
             raise ValueError("inputs are not numbers of inputs")
         if bool(((inputs < 0) | (inputs >= count)).any()):
             raise ValueError("inputs are beyond the last input")
-        if any(each.dtype != torch.float64 for each in (thresholds, leaves, base)):
+        if any(entry.dtype != torch.float64 for entry in (thresholds, leaves, base)):
             raise ValueError("thresholds, leaves and base are not float64")
         shapes = thresholds.shape, leaves.shape, base.shape
         if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
@@ -96,7 +96,7 @@ class BoostedTrees:
         powers = (2.0 ** torch.arange(self.inputs.shape[1])).expand(self.inputs.shape)
         bits.scatter_add_(1, which.view(self.inputs.shape), powers)
         numbers = splits[:, 0].long()
-        present, counts = (each.tolist() for each in numbers.unique(return_counts=True))
+        present, counts = (entry.tolist() for entry in numbers.unique(return_counts=True))
         ends = np.cumsum(counts).tolist()
         places = {i: slice(end - n, end) for i, n, end in zip(present, counts, ends, strict=True)}
         object.__setattr__(self, "_places", places)
@@ -114,12 +114,16 @@ class BoostedTrees:
             inputs: (M, F); fastest as the transpose of columns (F, M).
             number: of the input that is replaced.
         """
-        own = self._places.get(number, slice(0, 0))
+        places = self._places.get(number, slice(0, 0))
         at_most = self._at_most(inputs)
-        at_most[own] = 0.0
-        others, bits, thresholds = self._bits @ at_most, self._bits[:, own], self._splits[1][own]
+        at_most[places] = 0.0
+        columns, bits, thresholds = (
+            self._bits @ at_most,
+            self._bits[:, places],
+            self._splits[1][places],
+        )
         return [
-            self._sums(others + bits @ (each.double() <= thresholds).float()) for each in values
+            self._sums(columns + bits @ (entry.double() <= thresholds).float()) for entry in values
         ]
 
     def _at_most(self, inputs: Tensor) -> Tensor:

@@ -175,11 +175,11 @@ class EpisodeStore(EpisodeView):
         sources = np.concatenate([overlay.copy_source, overlay.action_source])
         edited = overlay.copy_source[overlay.edit_copy]
         steps = np.concatenate([overlay.edit_step, overlay.action_step])
-        known = not len(sources) or 0 <= sources.min() <= sources.max() < self.record.n_episodes
-        if known:
+        fits = not len(sources) or 0 <= sources.min() <= sources.max() < self.record.n_episodes
+        if fits:
             ends = self._columns.lengths[np.concatenate([edited, overlay.action_source])]
-            known = bool(((steps >= 0) & (steps < ends)).all())
-        if not known or overlay.edit_state.shape[1] != self.state_size:
+            fits = bool(((steps >= 0) & (steps < ends)).all())
+        if not fits or overlay.edit_state.shape[1] != self.state_size:
             raise InputError(
                 f"{overlay} has other episodes, steps or states than {self.path}; use the store "
                 "that the copies were made from"

@@ -49,9 +49,9 @@ def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     plain: dict[str, Tensor] = {}
     taken = set()
     for name, tensor in tensors.items():
-        own = tensor.detach().contiguous().cpu()
-        place = own.untyped_storage().data_ptr()
-        plain[name] = own.clone() if place in taken else own
+        plain_tensor = tensor.detach().contiguous().cpu()
+        place = plain_tensor.untyped_storage().data_ptr()
+        plain[name] = plain_tensor.clone() if place in taken else plain_tensor
         taken.add(place)
     return plain
 

@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
     from ucfrec.provenance import shorten_paths
-    from ucfrec.reporting.cards import card_of_evaluation
+    from ucfrec.reporting.model_card import add_evaluation
     from ucfrec.reporting.tables import evaluation_table
     from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
         )
         conditions = {**row.conditions, "run": shorten_paths(str(run))}
         rows.append(replace(row, conditions=conditions, checkpoint=options.checkpoint))
-        card_of_evaluation(run, rows[-1])
+        add_evaluation(run, rows[-1])
     rows += [
         evaluate_behavior(environment, behavior, options.episodes, options.seed)
         for behavior in options.behavior

@@ -190,7 +190,7 @@ def _evaluated(
     """Print and return what the logs say of one candidate."""
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.scored import evaluate_scored
-    from ucfrec.reporting.cards import card_of_estimates
+    from ucfrec.reporting.model_card import add_estimates
 
     trained = candidate.trained
     arguments = {"rule": candidate.rule, "seed": options.seed, "options": given}
@@ -211,7 +211,7 @@ def _evaluated(
         print(f"warning: {warning}")
     print(f"verdict: {found.verdict.headline}")
     print(_next_step(found.verdict))
-    card_of_estimates(trained.folder, options.logs or ["the test split"], found)
+    add_estimates(trained.folder, options.logs or ["the test split"], found)
     return found
 
 

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
         share_seen,
     )
     from ucfrec.provenance import shorten_paths
-    from ucfrec.reporting.cards import card_of_ranking
+    from ucfrec.reporting.model_card import add_ranking
     from ucfrec.reporting.tables import format_rows
     from ucfrec.results.rows_file import write_results
     from ucfrec.results.table import Ranking
@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> None:
     for policy, row, said in zip(trained, rows, warnings, strict=False):
         for warning in said:
             print(f"warning: {policy.folder}: {warning}")
-        card_of_ranking(policy.folder, row, on, said)
+        add_ranking(policy.folder, row, on, said)
     if options.json is not None:
         write_results(options.json, rows)
     print(_conclusion(rows, trained))

@@ -62,8 +62,7 @@ from ucfrec.python_api.run_folders import Scratch, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
-from ucfrec.reporting.cards import card_of_estimates, card_of_evaluation, card_of_ranking
-from ucfrec.reporting.model_card import write_card
+from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking, write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
@@ -402,7 +401,7 @@ class Recommender:
             about = later, logged.users, k, seed
             rows = ranking_rows(rankers, trained, trained.training_store(), *about, by)
         rows = [replace(row, checkpoint="best") for row in rows]
-        card_of_ranking(trained.folder, rows[0], _named(logs), said)
+        add_ranking(trained.folder, rows[0], _named(logs), said)
         return Ranking(rows, said)
 
     @_checked
@@ -433,7 +432,7 @@ class Recommender:
         trained = self._evaluated(logs)
         with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
             report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
-        card_of_estimates(trained.folder, [_named(logs)], report)
+        add_estimates(trained.folder, [_named(logs)], report)
         return report
 
     @_checked
@@ -464,7 +463,7 @@ class Recommender:
         about = episodes, seed
         own = evaluate_policy(simulated, trained, trained.name, *about, rule)
         own = replace(own, checkpoint="best")
-        card_of_evaluation(trained.folder, own)
+        add_evaluation(trained.folder, own)
         others = [evaluate_behavior(simulated, name, *about) for name in beside]
         return Evaluation([own, *others])
 

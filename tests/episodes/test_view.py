@@ -162,22 +162,3 @@ def test_what_an_action_copy_says_of_the_steps_before(tmp_path: Path) -> None:
     assert repr(union).count("6 action copies") == repr(overlay).count("6 action copies") == 1
     with pytest.raises(InputError, match=r"has 3 steps, none numbered|steps are numbered from 0"):
         union.windows(copies[:1], overlay.action_step[:1] + 1, 2)
-
-
-def test_action_augmentation_of_another_store_are_refused(tmp_path: Path) -> None:
-    base = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
-    good = random_action_augmentation(base, 3, seed=5)
-    vectors = np.zeros((3, 3), dtype=np.float32)
-    for message, wrong in (
-        ("copies of episodes", {"action_source": good.action_source + len(LENGTHS)}),
-        ("ends copies at steps", {"action_step": good.action_step + 7}),
-        ("ends copies at steps", {"action_step": good.action_step - 7}),
-        ("does not know", {"action": good.action + 11}),
-        ("does not know", {"action": vectors}),
-    ):
-        with pytest.raises(InputError, match=message):
-            base.with_overlay(replace(good, **wrong))
-    moving = write_store(tmp_path / "vectors", random_episodes(LENGTHS, items=False))
-    copies = random_action_augmentation(moving, 3, seed=5)
-    with pytest.raises(InputError, match="does not know"):
-        moving.with_overlay(replace(copies, action=vectors[:, :2]))

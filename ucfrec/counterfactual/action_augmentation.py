@@ -83,15 +83,20 @@ class ActionGenerator:
         rewards = self.view.column(schema.REWARD)
         reward = proposed.reward.clip(rewards.min(), rewards.max()).astype(np.float32)
         change = reward - proposed.logged
-        kept = proposed.reproduced & (np.abs(change) > self.delta)
+        accepted = proposed.reproduced & (np.abs(change) > self.delta)
         report = ActionReport(
-            proposals=len(kept),
-            reproduced=float(proposed.reproduced.mean()) if len(kept) else 0.0,
-            copies=int(kept.sum()),
-            mean_change=float(change[kept].mean()) if kept.any() else 0.0,
-            earns_more=float((change[kept] > 0).mean()) if kept.any() else 0.0,
+            proposals=len(accepted),
+            reproduced=float(proposed.reproduced.mean()) if len(accepted) else 0.0,
+            copies=int(accepted.sum()),
+            mean_change=float(change[accepted].mean()) if accepted.any() else 0.0,
+            earns_more=float((change[accepted] > 0).mean()) if accepted.any() else 0.0,
         )
-        passed = (proposed.episode[kept], proposed.step[kept], proposed.action[kept], reward[kept])
+        passed = (
+            proposed.episode[accepted],
+            proposed.step[accepted],
+            proposed.action[accepted],
+            reward[accepted],
+        )
         return self._copies(*passed), report
 
     @torch.no_grad()
@@ -108,26 +113,26 @@ class ActionGenerator:
         `exact` is the reward model in float64, so that a later check confirms what passes.
         """
         factual = self.read(self.view, episodes, steps).to(self.crm.device)
-        s, a, r = (each.double() for each in (factual.states, factual.actions, factual.rewards))
+        s, a, r = (values.double() for values in (factual.states, factual.actions, factual.rewards))
         z = exact.abduct(s, a, r)
         reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
         rows = np.repeat(np.arange(len(steps)), count)
         states = self.crm.normalised_states(factual.states).cpu()
         labels = self.clusters.nearest(states).numpy()
-        actions, known = self.support.draw(labels[rows], rng)
+        actions, drawable = self.support.draw(labels[rows], rng)
         logged = logged_actions(self.view, episodes[rows], steps[rows])
-        other = known & np.atleast_2d((actions != logged).T).any(axis=0)
-        rows, actions = rows[other], actions[other]
+        differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
+        rows, actions = rows[differs], actions[differs]
         # Copies with these actions, whatever their rewards, show what the reward model reads of
         # them.
         nothing = np.zeros(len(rows), dtype=np.float32)
         copies = self.view.with_overlay(self._copies(episodes[rows], steps[rows], actions, nothing))
         places = self.view.n_episodes + np.arange(len(rows))
-        given = self.read(copies, places, steps[rows]).actions.to(s)
+        inputs = self.read(copies, places, steps[rows]).actions.to(s)
         at = torch.from_numpy(rows).to(s.device)
-        reward = exact.predict(s[at], given, z[at]).cpu().numpy()
-        own = (r.cpu().numpy()[rows], reproduced[rows])
-        return _Proposed(episodes[rows], steps[rows], actions, reward, *own)
+        reward = exact.predict(s[at], inputs, z[at]).cpu().numpy()
+        outcomes = (r.cpu().numpy()[rows], reproduced[rows])
+        return _Proposed(episodes[rows], steps[rows], actions, reward, *outcomes)
 
     def _copies(
         self, episodes: IntArray, steps: IntArray, actions: Array, rewards: Float32Array

@@ -41,10 +41,10 @@ def require_rewards_vary(train: EpisodeStore) -> None:
         InputError: all training rewards are equal.
     """
     rewards = train.column_batches(schema.REWARD)
-    found = np.unique([extreme for (part,) in rewards for extreme in (part.min(), part.max())])
-    if len(found) == 1:
+    values = np.unique([extreme for (part,) in rewards for extreme in (part.min(), part.max())])
+    if len(values) == 1:
         raise InputError(
-            f"all {train.n_steps:,} training rewards of {train.path} equal {found[0]:g}: there is "
+            f"all {train.n_steps:,} training rewards of {train.path} equal {values[0]:g}: there is "
             "nothing for a reward model to learn; check the reward expression, or set "
             "augment.copies=0"
         )
@@ -95,10 +95,10 @@ def counterfactual_augmentation(
     states = crm.normalised_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
     support = ActionSupport(labels, logged_actions(train, *sampled))
-    others = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta, read)
+    actions = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta, read)
     places = candidates(train, config, np.random.default_rng(seed))
-    copies, found = others.propose(*places, config.actions, seed)
-    return overlay.joined(copies), replace(report, actions=found)
+    copies, actions_report = actions.propose(*places, config.actions, seed)
+    return overlay.joined(copies), replace(report, actions=actions_report)
 
 
 def interventions(
@@ -118,9 +118,9 @@ def interventions(
     edited = []
     for copy in range(copies):
         by_episode = rng.integers(len(steps), size=view.n_episodes)[episodes]
-        drawn = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
+        sources = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
         changed = states.copy()
-        changed[:, list(dimensions)] = states[drawn][:, list(dimensions)]
+        changed[:, list(dimensions)] = states[sources][:, list(dimensions)]
         edited.append(changed)
     numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
     return Overlay(

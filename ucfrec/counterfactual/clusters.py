@@ -79,9 +79,9 @@ class ActionSupport:
             Actions, (B,) or (B, A), and (B,) whether the cluster has a logged step at all; where it
             has none, the action means nothing.
         """
-        known = labels < len(self._counts)
-        clusters = np.where(known, labels, 0)
-        counts = np.where(known, self._counts[clusters], 0)
-        drawn = (generator.random(len(labels)) * counts).astype(np.int64)
-        places = np.minimum(self._starts[clusters] + drawn, len(self._actions) - 1)
+        drawable = labels < len(self._counts)
+        clusters = np.where(drawable, labels, 0)
+        counts = np.where(drawable, self._counts[clusters], 0)
+        numbers = (generator.random(len(labels)) * counts).astype(np.int64)
+        places = np.minimum(self._starts[clusters] + numbers, len(self._actions) - 1)
         return self._actions[places], counts > 0

@@ -126,8 +126,8 @@ class TangentGenerator:
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
         order = near.argsort(stable=True)
         rows = torch.bincount(near, minlength=len(self._clusters.centres)).tolist()
-        given = (each[order] for each in (states, actions, z, noise, length))
-        moves = self._moves(rows, *given)
+        ordered = (values[order] for values in (states, actions, z, noise, length))
+        moves = self._moves(rows, *ordered)
         return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
 
     def _moves(
@@ -172,8 +172,8 @@ class CounterfactualStateGenerator(nn.Module):
         # In a tuple, so that torch does not register the reward model as a submodule.
         self._crm = (crm,)
         self.band = config.band
-        given = crm.state_mean.numel() + crm.action_mean.numel() + crm.config.latent_dim
-        self.network = mlp(given, config.hidden, 3, crm.state_mean.numel())
+        input_size = crm.state_mean.numel() + crm.action_mean.numel() + crm.config.latent_dim
+        self.network = mlp(input_size, config.hidden, 3, crm.state_mean.numel())
 
     def move(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """Moves Δ (M, S), in standard deviations of the states; 0 in dimensions that never vary."""
@@ -242,7 +242,7 @@ def make_generator(
         return TangentGenerator(crm, clusters, config)
     chosen = _high_rewards(train, config, seed)
     fields = (train.states, train.actions, train.rewards)
-    s, a, r = (each[chosen].to(crm.device) for each in fields)
+    s, a, r = (values[chosen].to(crm.device) for values in fields)
     return _faithful(s, a, r, crm, config, folder, seed)
 
 

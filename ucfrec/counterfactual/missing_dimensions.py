@@ -46,14 +46,14 @@ class StandardSteps:
     @classmethod
     def of(cls, view: EpisodeStore, most: int, seed: int) -> "StandardSteps":
         episodes, steps = steps_with_successor(view, most, seed)
-        found = view.transitions(episodes, steps)
+        transitions = view.transitions(episodes, steps)
         mean, std = view.state_statistics
-        states = (found.states - mean) / torch.where(std > 1e-6, std, 1.0)
-        next_states = (found.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
+        states = (transitions.states - mean) / torch.where(std > 1e-6, std, 1.0)
+        next_states = (transitions.next_states - mean) / torch.where(std > 1e-6, std, 1.0)
         return cls(
             states=states.clamp(-CLIP, CLIP),
-            actions=standardised(found.actions),
-            rewards=standardised(found.rewards.unsqueeze(1)),
+            actions=standardised(transitions.actions),
+            rewards=standardised(transitions.rewards.unsqueeze(1)),
             changes=standardised(next_states - states),
             episodes=episodes,
             held_out=held_out_of(view, episodes),
@@ -131,8 +131,8 @@ def shared_pair(
 
     def some_missing() -> Tensor:
         # A third of the rows miss nothing, so that the complete predictor is not the worst trained.
-        drawn = torch.randint(3 * size // 2 + 1, (batch_size,)).clamp(max=size)
-        return absences[drawn].unsqueeze(0)
+        rows = torch.randint(3 * size // 2 + 1, (batch_size,)).clamp(max=size)
+        return absences[rows].unsqueeze(0)
 
     _optimise(pair, data, some_missing, steps, batch_size, learning_rate, "screening, common")
     return pair

@@ -163,10 +163,10 @@ class CausalRewardModel(nn.Module):
         """
         super().__init__()
         self.config = config
-        given = state_size + action_size
-        self.expected = mean or mlp(given, config.hidden, 2, 1)
-        self.encoder = mlp(given + 1, config.hidden, 2, 2 * config.latent_dim)
-        self.decoder = mlp(given + config.latent_dim, config.hidden, 2, 1)
+        input_size = state_size + action_size
+        self.expected = mean or mlp(input_size, config.hidden, 2, 1)
+        self.encoder = mlp(input_size + 1, config.hidden, 2, 2 * config.latent_dim)
+        self.decoder = mlp(input_size + config.latent_dim, config.hidden, 2, 1)
         for name, shape in (("state", (state_size,)), ("action", (action_size,)), ("reward", ())):
             self.register_buffer(f"{name}_mean", torch.zeros(shape))
             self.register_buffer(f"{name}_std", torch.ones(shape))
@@ -181,9 +181,9 @@ class CausalRewardModel(nn.Module):
         """The posterior q_ϕ(z | s, a, r), both fields (..., latent_dim)."""
         return self._encode(self.given(states, actions), self.residual(states, actions, rewards))
 
-    def _encode(self, given: Tensor, residual: Tensor) -> Posterior:
+    def _encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
         surprise = (residual / self.surprise_std).unsqueeze(-1)
-        mean, log_variance = self.encoder(torch.cat([given, surprise], dim=-1)).chunk(2, dim=-1)
+        mean, log_variance = self.encoder(torch.cat([inputs, surprise], dim=-1)).chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
     def abduct(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
@@ -192,19 +192,19 @@ class CausalRewardModel(nn.Module):
 
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
-        given = self.given(states, actions)
-        decoded = self.expected_reward(states, actions) + self._disturbance(given, z)
+        inputs = self.given(states, actions)
+        decoded = self.expected_reward(states, actions) + self._disturbance(inputs, z)
         return self.reward_mean + self.reward_std * decoded
 
-    def elbo(self, given: Tensor, residual: Tensor, noise: Tensor) -> ELBO:
+    def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> ELBO:
         """Both terms of Eq. 2 at z = μ + σ·noise, noise (..., latent_dim) standard normal.
 
         `given` (..., S + A) and `residual` (...) are those of the methods; they stay while encoder
         and decoder are trained.
         """
-        q = self._encode(given, residual)
+        q = self._encode(inputs, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
-        error = self._disturbance(given, z) - residual
+        error = self._disturbance(inputs, z) - residual
         scale = self.config.decoder_std
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
         return ELBO(log_likelihood, kl_to_prior(q).sum(-1))
@@ -213,12 +213,12 @@ class CausalRewardModel(nn.Module):
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
         return self.normalised_rewards(rewards) - self.expected_reward(states, actions)
 
-    def _disturbance(self, given: Tensor, z: Tensor) -> Tensor:
+    def _disturbance(self, inputs: Tensor, z: Tensor) -> Tensor:
         """What z adds to the expected reward, in standard deviations of the reward, (...)."""
-        disturbance: Tensor = self.decoder(torch.cat([given, z], dim=-1)).squeeze(-1)
+        disturbance: Tensor = self.decoder(torch.cat([inputs, z], dim=-1)).squeeze(-1)
         if isinstance(self.expected, EffectsMean):
             # With z at its prior mean, the model predicts exactly E[r | s, a].
-            without = torch.cat([given, torch.zeros_like(z)], dim=-1)
+            without = torch.cat([inputs, torch.zeros_like(z)], dim=-1)
             disturbance = disturbance - self.decoder(without).squeeze(-1)
         return disturbance
 

@@ -125,7 +125,7 @@ def fit_crm(
 def _fit_mean(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    given, rewards = (
+    inputs, rewards = (
         model.given(train.states, train.actions),
         model.normalised_rewards(train.rewards),
     )
@@ -134,7 +134,7 @@ def _fit_mean(
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
         rows = _rows(generator, len(rewards), model.config.batch_size, model.device)
-        return given[rows], rewards[rows]
+        return inputs[rows], rewards[rows]
 
     def loss(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
         return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
@@ -143,7 +143,7 @@ def _fit_mean(
         return _mean_over_chunks(loss, (held_out_given, held_out_rewards))
 
     first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rewards))
-    best, kept = math.inf, first
+    best, weights = math.inf, first
     for share in _REGRESSION_SHARES:
         steps = max(1, whole.steps // share)
         loop = replace(
@@ -154,27 +154,27 @@ def _fit_mean(
             validate_every=max(1, steps // 3),
         )
         model.expected.load_state_dict(first)
-        found = fit(
+        outcome = fit(
             model.expected, draw, loss, loop, folder / str(steps), seed=seed, validate=validate,
             describe="expected reward",
         )  # fmt: skip
-        if found.best_validation >= best:
+        if outcome.best_validation >= best:
             break
-        best, kept = found.best_validation, copy.deepcopy(model.expected.state_dict())
-    model.expected.load_state_dict(kept)
+        best, weights = outcome.best_validation, copy.deepcopy(model.expected.state_dict())
+    model.expected.load_state_dict(weights)
 
 
 @torch.no_grad()
 def _inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Tensor, Tensor]:
     """What the CVAE sees of the steps: normalised inputs (M, S + A) and residuals (M,)."""
     fields = (transitions.states, transitions.actions, transitions.rewards)
-    chunks = (torch.split(each, _CHUNK) for each in fields)
+    chunks = (torch.split(values, _CHUNK) for values in fields)
     parts = [
         (model.given(states, actions), model.residual(states, actions, rewards))
         for states, actions, rewards in zip(*chunks, strict=True)
     ]
-    given, residuals = zip(*parts, strict=True)
-    return torch.cat(given), torch.cat(residuals)
+    inputs, residuals = zip(*parts, strict=True)
+    return torch.cat(inputs), torch.cat(residuals)
 
 
 @torch.no_grad()
@@ -191,12 +191,12 @@ def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
 def _fit_elbo(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    config, (given, residuals) = model.config, _inputs(model, train)
+    config, (inputs, residuals) = model.config, _inputs(model, train)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
         rows = _rows(generator, len(residuals), config.batch_size, model.device)
         noise = _noise(generator, config.batch_size, config.latent_dim).to(model.device)
-        return given[rows], residuals[rows], noise
+        return inputs[rows], residuals[rows], noise
 
     def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
         log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
@@ -218,7 +218,7 @@ def _mean_over_chunks(
     loss: Callable[[Any], tuple[Tensor, Mapping[str, Tensor]]], rows: tuple[Tensor, ...]
 ) -> float:
     """The loss of M rows, of few at once: what a layer returns then stays in the cache."""
-    chunks = zip(*(torch.split(each, _AT_ONCE) for each in rows), strict=True)
+    chunks = zip(*(torch.split(values, _AT_ONCE) for values in rows), strict=True)
     total = sum(float(loss(chunk)[0]) * len(chunk[0]) for chunk in chunks)
     return total / len(rows[0])
 

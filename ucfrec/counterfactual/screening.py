@@ -143,8 +143,10 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
     def measured(dimensions: Sequence[int]) -> dict[int, bool]:
         if not dimensions:
             return {}
-        found = measured_reward(train, config.measurement, config.max_transitions, seed, dimensions)
-        return dict(zip(dimensions, found, strict=True))
+        verdicts = measured_reward(
+            train, config.measurement, config.max_transitions, seed, dimensions
+        )
+        return dict(zip(dimensions, verdicts, strict=True))
 
     if train.has_items:
         verdicts = measured(range(train.observation_size))
@@ -168,20 +170,30 @@ def screen(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Screening
         measures |= measured([dimension for dimension in tested if dimension not in measures])
         tested = [dimension for dimension in tested if measures[dimension]]
     effects, r2 = _effects(shared, data, tested, config, seed, r2)
-    undecided = [each.dimension for each in effects if each.undecided]
+    undecided = [effect.dimension for effect in effects if effect.undecided]
     measures |= measured([dimension for dimension in undecided if dimension not in measures])
-    found = {each.dimension: each.report(measures.get(each.dimension)) for each in effects}
-    flagged = [dimension for dimension, report in found.items() if not report.causes]
+    reports_by_dimension = {
+        effect.dimension: effect.report(measures.get(effect.dimension)) for effect in effects
+    }
+    flagged = [dimension for dimension, report in reports_by_dimension.items() if not report.causes]
     if len(flagged) > 1:
         measures |= measured([dimension for dimension in flagged if dimension not in measures])
         leaks = [dimension for dimension in flagged if measures[dimension]]
         constant = (data.states == data.states[0]).all(0)
-        others = [d for d in flagged if not measures[d] and not constant[d]]
-        together = _help_together(others, leaks, shared, data, config, seed)
-        found |= {d: replace(found[d], measures_reward=True) for d in leaks}
-        found |= {d: replace(found[d], measures_reward=False, causes=together) for d in others}
+        untied = [d for d in flagged if not measures[d] and not constant[d]]
+        together = _help_together(untied, leaks, shared, data, config, seed)
+        reports_by_dimension |= {
+            d: replace(reports_by_dimension[d], measures_reward=True) for d in leaks
+        }
+        reports_by_dimension |= {
+            d: replace(reports_by_dimension[d], measures_reward=False, causes=together)
+            for d in untied
+        }
     size = data.states.shape[1]
-    reports = [found.get(dimension) or _untested(dimension, False) for dimension in range(size)]
+    reports = [
+        reports_by_dimension.get(dimension) or _untested(dimension, False)
+        for dimension in range(size)
+    ]
     return ScreeningReport(tuple(reports), r2, len(data.episodes))
 
 
@@ -339,13 +351,13 @@ def _effects(
     """
     missing = [*((dimension,) for dimension in dimensions), ()]
     errors, hard = _Errors.of(shared, data, missing, config, seed), r2 < config.min_reward_r2
-    found, none = [], len(dimensions)
+    effects, none = [], len(dimensions)
     for row, dimension in enumerate(dimensions):
         of_next, of_reward = errors.effect(row, none, config), errors.effect_on_reward(row, none)
         helps_next = of_next.counts(config.min_effect, config.level)
         helps_reward = hard or of_reward.counts(config.min_reward_effect, config.level)
-        found.append(_Effect(dimension, of_next, of_reward, helps_next, helps_reward))
-    return found, errors.r2(none)
+        effects.append(_Effect(dimension, of_next, of_reward, helps_next, helps_reward))
+    return effects, errors.r2(none)
 
 
 def _effect_on_next(

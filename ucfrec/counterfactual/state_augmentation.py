@@ -252,13 +252,15 @@ class _Editor:
 
     def edit(self, episodes: IntArray, steps: IntArray, copy: int = 0) -> _Edits:
         """Propose one edit at each of the given steps; returns the accepted ones, in order."""
-        kept, states = np.zeros(len(steps), dtype=bool), []
+        accepted, states = np.zeros(len(steps), dtype=bool), []
         for start in range(0, len(steps), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            kept[rows], edited = self._chunk(episodes[rows], steps[rows])
+            accepted[rows], edited = self._chunk(episodes[rows], steps[rows])
             states.append(edited)
         state = np.concatenate([np.zeros((0, self._view.state_size), np.float32), *states])
-        return _Edits(episodes[kept], np.full(int(kept.sum()), copy), steps[kept], state)
+        return _Edits(
+            episodes[accepted], np.full(int(accepted.sum()), copy), steps[accepted], state
+        )
 
     @torch.no_grad()
     def _chunk(self, episodes: IntArray, steps: IntArray) -> tuple[BoolArray, Float32Array]:

@@ -221,7 +221,11 @@ class Columns:
             self._item_states_in_memory,
             return_to_go or self.return_to_go,
         )
-        copy._steps = {other: column for other, column in self._steps.items() if other != name}
+        copy._steps = {
+            column_name: column
+            for column_name, column in self._steps.items()
+            if column_name != name
+        }
         return copy
 
     @cached_property
@@ -236,19 +240,19 @@ class Columns:
 
     @cached_property
     def _starts_and_lengths(self) -> tuple[IntArray, IntArray]:
-        starts, lengths, before = [], [], 0
+        starts, lengths, first_step = [], [], 0
         for offsets in self._parts(schema.OFFSETS):
             if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
                 raise self._damaged(schema.OFFSETS, "do not ascend from 0")
-            starts.append(offsets[:-1] + before)
+            starts.append(offsets[:-1] + first_step)
             lengths.append(np.diff(offsets))
-            before += int(offsets[-1])
-        found = (sum(map(len, starts)), before)
+            first_step += int(offsets[-1])
+        counted = (sum(map(len, starts)), first_step)
         expected = (self.record.n_episodes, self.record.n_steps)
-        if found != expected:
+        if counted != expected:
             raise self._damaged(
                 schema.OFFSETS,
-                "have {} episodes of {} steps, not {} of {}".format(*found, *expected),
+                "have {} episodes of {} steps, not {} of {}".format(*counted, *expected),
             )
         return np.concatenate(starts), np.concatenate(lengths)
 

@@ -81,9 +81,9 @@ def with_observations(
             np.save(shard / f"{schema.OBSERVATION}.npy", values[begin:end])
             begin = end
         changed = f"{schema.OBSERVATION}.npy"
-        kept = store.record.files.items()
+        files = store.record.files.items()
         store.record.copy_with(
-            files={name: each for name, each in kept if not name.endswith(f"/{changed}")},
+            files={name: entry for name, entry in files if not name.endswith(f"/{changed}")},
             columns={**store.record.columns, schema.OBSERVATION: [values.shape[1]]},
             fingerprint=digest,
             source=Source.model_validate({**store.record.source.model_dump(), **source}),

@@ -29,11 +29,11 @@ class Distribution(Entry):
     """By share, e.g. `{"0.5": 3}`."""
 
 
-def _consistent(found: Distribution) -> Distribution:
-    ends = (found.values or ()) if found.edges is None else found.edges[1:]
-    if len(ends) != len(found.counts):
+def _consistent(distribution: Distribution) -> Distribution:
+    ends = (distribution.values or ()) if distribution.edges is None else distribution.edges[1:]
+    if len(ends) != len(distribution.counts):
         raise ValueError("it has other numbers of counts and of values or bins")
-    return found
+    return distribution
 
 
 class Source(Entry):

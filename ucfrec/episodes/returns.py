@@ -36,8 +36,8 @@ class ReturnToGo:
 
     def __post_init__(self) -> None:
         if self.definition not in get_args(Definition):
-            known = ", ".join(get_args(Definition))
-            raise InputError(f"no return-to-go is called {self.definition!r}; choose from {known}")
+            names = ", ".join(get_args(Definition))
+            raise InputError(f"no return-to-go is called {self.definition!r}; choose from {names}")
         if not 0 < self.discount <= 1 or self.horizon < 1:
             raise InputError(
                 f"the return-to-go has discount {self.discount} and horizon {self.horizon}; give a "
@@ -152,11 +152,11 @@ def returns_in_parts(
         begin, before = end, float(sums[-1])
 
 
-def _rest(before: Float64Array, offsets: IntArray) -> Float32Array:
+def _rest(sums: Float64Array, offsets: IntArray) -> Float32Array:
     """Rest of each episode, from the sums (N + 1,) of all rewards before each step."""
     lengths = np.diff(offsets)
     starts, ends = np.repeat(offsets[:-1], lengths), np.repeat(offsets[1:], lengths)
-    totals, collected = before[ends] - before[starts], before[:-1] - before[starts]
+    totals, collected = sums[ends] - sums[starts], sums[:-1] - sums[starts]
     return np.asarray(totals - collected, dtype=np.float32)
 
 

@@ -167,10 +167,20 @@ class EpisodeStore(EpisodeView):
         """A view with the copies of `overlay` appended after the episodes of this view.
 
         Raises:
-            InputError: the overlay was made from another store: it copies episodes or steps that
-                this store does not have, or its states or actions have another size.
+            InputError: the overlay was made from another store.
         """
-        _require_own_overlay(self, overlay)
+        sources = np.concatenate([overlay.copy_source, overlay.action_source])
+        edited = overlay.copy_source[overlay.edit_copy]
+        steps = np.concatenate([overlay.edit_step, overlay.action_step])
+        fits = not len(sources) or 0 <= sources.min() <= sources.max() < self.record.n_episodes
+        if fits:
+            ends = self._columns.lengths[np.concatenate([edited, overlay.action_source])]
+            fits = bool(((steps >= 0) & (steps < ends)).all())
+        if not fits or overlay.edit_state.shape[1] != self.state_size:
+            raise InputError(
+                f"{overlay} has other episodes, steps or states than {self.path}; use the store "
+                "that the copies were made from"
+            )
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
         return EpisodeStore(self._columns, self._selected, joined)
 
@@ -245,40 +255,6 @@ def _require_no_copies(store: EpisodeStore, operation: str) -> None:
             f"{store} has augmented episodes; {operation} its without_augmentation(), then add "
             "them with with_overlay"
         )
-
-
-def _require_own_overlay(store: EpisodeStore, overlay: Overlay) -> None:
-    size = overlay.edit_state.shape[1]
-    for source in (overlay.copy_source, overlay.action_source):
-        if len(source) and not 0 <= source.min() <= source.max() < store.record.n_episodes:
-            raise _of_another_store(
-                overlay, f"has copies of episodes that {store.path} does not have"
-            )
-    if size != store.state_size:
-        raise _of_another_store(
-            overlay, f"edits states of {size}; the store's have {store.state_size}"
-        )
-    if len(overlay.action_source):
-        _require_own_actions(store, overlay)
-
-
-def _require_own_actions(store: EpisodeStore, overlay: Overlay) -> None:
-    ends = EpisodeStore(store._columns, overlay.action_source).lengths
-    if not ((overlay.action_step >= 0) & (overlay.action_step < ends)).all():
-        raise _of_another_store(overlay, f"ends copies at steps that {store.path} does not have")
-    if store.has_items:
-        n_items = len(store.item_states.embeddings)
-        fits = (
-            overlay.action.ndim == 1 and 0 <= overlay.action.min() <= overlay.action.max() < n_items
-        )
-    else:
-        fits = list(overlay.action.shape[1:]) == store.record.columns[schema.ACTION]
-    if not fits:
-        raise _of_another_store(overlay, f"has actions that {store.path} does not know")
-
-
-def _of_another_store(overlay: Overlay, fault: str) -> InputError:
-    return InputError(f"{overlay} {fault}; use the store that the copies were made from")
 
 
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:

@@ -159,11 +159,11 @@ class EpisodeView:
     @property
     def terminated(self) -> BoolArray:
         """(E + C + N,) whether each session is known to have ended with its last step."""
-        known = np.ones(self.n_episodes, dtype=bool)
+        ended = np.ones(self.n_episodes, dtype=bool)
         if self._columns.has_episode_column(schema.TERMINATED):
-            known = self.episode_values(schema.TERMINATED).astype(bool)
-        known[self._first_action_copy :] = False
-        return known
+            ended = self.episode_values(schema.TERMINATED).astype(bool)
+        ended[self._first_action_copy :] = False
+        return ended
 
     @cached_property
     def returns(self) -> Float32Array:
@@ -192,13 +192,13 @@ class EpisodeView:
     def _step_values(self, episodes: IntArray, steps: IntArray, *names: str) -> list[Array]:
         """`step_values` of several columns."""
         index = self._columns.starts[self._sources[episodes]] + steps
-        found = self._columns.step_values(index, *names)
+        columns = self._columns.step_values(index, *names)
         if self._first_action_copy < self.n_episodes:
             copies = np.broadcast_arrays(episodes - self._first_action_copy, steps)
-            for name, values in zip(names, found, strict=True):
+            for name, values in zip(names, columns, strict=True):
                 if name in _OF_ACTIONS:
                     self._change_actions(name, values, *copies)
-        return found
+        return columns
 
     def _change_actions(self, name: str, values: Array, copies: IntArray, steps: IntArray) -> None:
         """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
@@ -209,15 +209,17 @@ class EpisodeView:
             steps: steps of them, of the same shape.
         """
         assert self.overlay is not None
-        here = np.asarray(copies >= 0)
-        ahead = self.overlay.action_step[copies[here]] - steps[here]
+        in_copies = np.asarray(copies >= 0)
+        ahead = self.overlay.action_step[copies[in_copies]] - steps[in_copies]
         if name == schema.RETURN_TO_GO:
             counted = self._columns.return_to_go.weights(ahead)
-            values[here] += counted * self._reward_changes[copies[here]]
+            values[in_copies] += counted * self._reward_changes[copies[in_copies]]
             return
-        own = self.overlay.action_reward if name == schema.REWARD else self.overlay.action
-        here[here] = ahead == 0
-        values[here] = own[copies[here]]
+        values_of_copies = (
+            self.overlay.action_reward if name == schema.REWARD else self.overlay.action
+        )
+        in_copies[in_copies] = ahead == 0
+        values[in_copies] = values_of_copies[copies[in_copies]]
 
     @cached_property
     def _reward_changes(self) -> Float64Array:
@@ -234,8 +236,8 @@ class EpisodeView:
             episodes: (B,) positions in the view.
             steps: (B,) steps of those episodes, from 0.
         """
-        owner, before = self._earlier(steps)
-        rewards = self.step_values(schema.REWARD, episodes[owner], before)
+        owner, earlier_steps = self._earlier(steps)
+        rewards = self.step_values(schema.REWARD, episodes[owner], earlier_steps)
         return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
 
     def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
@@ -245,8 +247,8 @@ class EpisodeView:
             episodes: (B,) positions in the view.
             steps: (B,) steps of those episodes, from 0; `rows` are indices into the B.
         """
-        owner, before = self._earlier(steps)
-        return owner, self.step_values(schema.ITEM, episodes[owner], before).astype(np.int64)
+        owner, earlier_steps = self._earlier(steps)
+        return owner, self.step_values(schema.ITEM, episodes[owner], earlier_steps).astype(np.int64)
 
     @staticmethod
     def _earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
@@ -345,8 +347,8 @@ class EpisodeView:
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
         action = schema.ITEM if self.has_items else schema.ACTION
         names = action, schema.REWARD, schema.RETURN_TO_GO
-        found = self._step_values(episodes[:, None], np.maximum(steps, 0), *names)
-        actions, rewards, returns_to_go = map(torch.from_numpy, found)
+        columns = self._step_values(episodes[:, None], np.maximum(steps, 0), *names)
+        actions, rewards, returns_to_go = map(torch.from_numpy, columns)
         return Windows.of(
             torch.from_numpy(steps),
             self._edited_states(episodes, steps),

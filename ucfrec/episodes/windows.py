@@ -10,17 +10,13 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
 
 @dataclass(frozen=True)
 class Windows:
-    """B windows of K steps, padded on the left; at padding all values are 0 and `mask` is false.
-
-    Raises:
-        InputError: the shapes do not match.
-    """
+    """B windows of K steps, padded on the left; at padding all values are 0 and `mask` is false."""
 
     states: Tensor
     """(B, K, S) float32."""
@@ -34,16 +30,6 @@ class Windows:
     """(B, K) int64 number of the step in its episode, from 0."""
     mask: Tensor
     """(B, K) bool, true at steps of the episode, false at padding."""
-
-    def __post_init__(self) -> None:
-        shape = self.mask.shape
-        if not (
-            len(shape) == 2
-            and shape == self.rewards.shape == self.returns_to_go.shape == self.timesteps.shape
-            and (self.states.ndim, self.states.shape[:2]) == (3, shape)
-            and (self.actions.ndim in (2, 3) and self.actions.shape[:2] == shape)
-        ):
-            raise _shapes_differ(self, "(B, K), states (B, K, S), actions (B, K) or (B, K, A)")
 
     def __repr__(self) -> str:
         (windows, steps, size), items = self.states.shape, self.actions.ndim == 2
@@ -105,11 +91,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Transitions:
-    """M single steps.
-
-    Raises:
-        InputError: the shapes do not match.
-    """
+    """M single steps."""
 
     states: Tensor
     """(M, S)."""
@@ -121,16 +103,6 @@ class Transitions:
     """(M, S) next states as logged, never edited; zeros at the last step of an episode."""
     last: Tensor
     """(M,) bool, true at the last step of an episode."""
-
-    def __post_init__(self) -> None:
-        shape = self.rewards.shape
-        if not (
-            len(shape) == 1
-            and shape == self.last.shape == self.states.shape[:1] == self.actions.shape[:1]
-            and self.states.ndim == self.actions.ndim == 2
-            and self.states.shape == self.next_states.shape
-        ):
-            raise _shapes_differ(self, "(M,), states and next_states (M, S), actions (M, A)")
 
     def to(self, device: torch.device) -> "Transitions":
         """The steps on `device`."""
@@ -156,9 +128,6 @@ class Overlay:
     C copies have other states at some steps: rewards, actions, returns-to-go and next states are
     those of the source (paper appendix H). N action copies end with another action: the source up
     to some step, at which another action had another reward.
-
-    Raises:
-        InputError: the shapes do not match.
     """
 
     copy_source: IntArray
@@ -177,19 +146,6 @@ class Overlay:
     """(N,) int64 items or (N, A) float32 vectors: the other actions."""
     action_reward: Float32Array = field(default_factory=_no_floats)
     """(N,) their rewards, in reward units."""
-
-    def __post_init__(self) -> None:
-        shape = self.edit_copy.shape
-        if not (
-            len(shape) == self.copy_source.ndim == 1
-            and shape == self.edit_step.shape == self.edit_state.shape[:1]
-            and self.edit_state.ndim == 2
-            and self.action_source.shape == self.action_step.shape == self.action_reward.shape
-            and (self.action_source.ndim, self.action_source.shape) == (1, self.action.shape[:1])
-            and self.action.ndim in (1, 2)
-        ):
-            given = "copy_source (C,), edits (M,), edit_state (M, S), action copies (N,)"
-            raise _shapes_differ(self, given)
 
     def __repr__(self) -> str:
         edits, size = self.edit_state.shape
@@ -265,8 +221,3 @@ def _end_to_end(first: Array, second: Array) -> Array:
         if len(first) and len(second)
         else max(first, second, key=len)
     )
-
-
-def _shapes_differ(value: Windows | Transitions | Overlay, expected: str) -> InputError:
-    shapes = ", ".join(f"{f.name} {tuple(getattr(value, f.name).shape)}" for f in fields(value))
-    return InputError(f"{type(value).__name__}: shapes do not match ({shapes}); give {expected}")

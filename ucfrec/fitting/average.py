@@ -94,8 +94,8 @@ class WeightAverage:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Named tensors and counters, for `restore`."""
-        when = {f"{name}{_WHEN}": each for name, each in self._when.items()}
-        tensors = {f"{PREFIX}{name}": each for name, each in {**self._means, **when}.items()}
+        when = {f"{name}{_WHEN}": table for name, table in self._when.items()}
+        tensors = {f"{PREFIX}{name}": table for name, table in {**self._means, **when}.items()}
         return tensors, {"averaged_steps": self._step, "average_log": self._log}
 
     def restore(self, tensors: Mapping[str, Tensor], counters: Mapping[str, float]) -> None:
@@ -125,15 +125,15 @@ def averages(
         counters: of `WeightAverage.state`.
     """
     means = {}
-    for name, each in weights.items():
+    for name, table in weights.items():
         if (mean := tensors.get(f"{PREFIX}{name}")) is not None:
             when = tensors.get(f"{PREFIX}{name}{_WHEN}")
             rest = None if when is None else counters["average_log"] - when
-            means[name] = mean if rest is None else _rested(mean, each, rest)
+            means[name] = mean if rest is None else _rested(mean, table, rest)
     return means
 
 
-def _rested(means: Tensor, weights: Tensor, rest: Tensor) -> Tensor:
+def _rested(means: Tensor, weights: Tensor, unnamed: Tensor) -> Tensor:
     """Averages of rows (M, …) that rested for steps with Σ log d = `rest` (M,)."""
-    share = rest.exp().to(means.dtype).view(-1, *[1] * (means.dim() - 1))
+    share = unnamed.exp().to(means.dtype).view(-1, *[1] * (means.dim() - 1))
     return torch.where(share < 1, torch.lerp(weights, means, share), means)

@@ -49,9 +49,9 @@ def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     plain: dict[str, Tensor] = {}
     taken = set()
     for name, tensor in tensors.items():
-        own = tensor.detach().contiguous().cpu()
-        place = own.untyped_storage().data_ptr()
-        plain[name] = own.clone() if place in taken else own
+        plain_tensor = tensor.detach().contiguous().cpu()
+        place = plain_tensor.untyped_storage().data_ptr()
+        plain[name] = plain_tensor.clone() if place in taken else plain_tensor
         taken.add(place)
     return plain
 
@@ -131,7 +131,6 @@ def load_training(
     means = {name: tensors.pop(name) for name in [*tensors] if name.startswith(PREFIX)}
     load_weights(path, module, tensors)
     with damage_explained(path, REMEDY):
-        _require_shapes(state, optimizer)
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": state, "param_groups": groups})
         if average is not None:
@@ -147,32 +146,9 @@ def load_trained(path: Path) -> dict[str, Tensor]:
         InputError: the file is missing or damaged.
     """
     tensors, counters = load_tensors(path)
-    weights = _raw(tensors)
+    weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
     with damage_explained(path, REMEDY):
         return weights | averages(tensors, weights, counters)
-
-
-def load_raw(path: Path) -> dict[str, Tensor]:
-    """The weights in a file of `save_training` as they were at its step, without averaging.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
-    return _raw(load_tensors(path)[0])
-
-
-def _raw(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
-
-
-def _require_shapes(
-    state: Mapping[int, Mapping[str, Tensor]], optimizer: torch.optim.Optimizer
-) -> None:
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for index, moments in state.items():
-        for key, value in moments.items():
-            if value.dim() and value.shape != parameters[index].shape:
-                raise ValueError(f"the optimizer's {key} of parameter {index} has another shape")
 
 
 def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Tensor]) -> _Module:

@@ -150,8 +150,10 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     counts = [int(size) for size in sizes]
     # Messages have to be of one size, that of the largest.
     all_rows, all_values = (
-        torch.cat([part[:n] for part, n in zip(_gathered(each, max(counts)), counts, strict=True)])
-        for each in (rows, values)
+        torch.cat(
+            [part[:n] for part, n in zip(_gathered(gradient, max(counts)), counts, strict=True)]
+        )
+        for gradient in (rows, values)
     )
     shape = gradient.shape
     return torch.sparse_coo_tensor(all_rows.unsqueeze(0), all_values, shape, check_invariants=False)

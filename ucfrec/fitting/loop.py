@@ -262,9 +262,9 @@ class _Training:
         """
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
-        found = self._keep_best(validate, step)
+        validation = self._keep_best(validate, step)
         self.counters |= {"step": step, "seconds": clock.total()}
-        return found
+        return validation
 
     def _keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
         """Save the weights if their validation loss is the lowest so far, or without validation."""
@@ -402,8 +402,8 @@ class RowAdamW(torch.optim.AdamW):
         state["exp_avg"][rows] = mean
         state["exp_avg_sq"][rows] = square
         scale = square.div_(1 - second**count).sqrt_().add_(group["eps"])
-        kept = table[rows].mul_(1 - group["lr"] * group["weight_decay"])
-        table[rows] = kept.addcdiv_(mean, scale, value=-group["lr"] / (1 - first**count))
+        decayed = table[rows].mul_(1 - group["lr"] * group["weight_decay"])
+        table[rows] = decayed.addcdiv_(mean, scale, value=-group["lr"] / (1 - first**count))
 
 
 def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor:

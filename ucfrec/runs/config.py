@@ -78,7 +78,7 @@ def resolve_config(
 
 def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
     """Settings, in any form that `resolve_config` takes, as `{"table.field": value}`."""
-    return {f"{each.table}.{each.key}": each.value for each in _from_overrides(overrides)}
+    return {f"{entry.table}.{entry.key}": entry.value for entry in _from_overrides(overrides)}
 
 
 def config_from_dict(values: object) -> Config:
@@ -156,7 +156,7 @@ def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
         if dot:
             yield _Setting(table, key, value, source)
         elif isinstance(value, Mapping):
-            yield from (_Setting(table, str(key), each, source) for key, each in value.items())
+            yield from (_Setting(table, str(key), entry, source) for key, entry in value.items())
         else:
             raise InputError(
                 f"{source}: {table} is a table of settings; give a value for one of its fields"

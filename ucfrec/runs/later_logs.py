@@ -27,14 +27,14 @@ def later_logs(
     """
     source = trained.record.data
     # A record may also name a dataset that is not read by an adapter.
-    known = source.dataset in plugin_names("datasets")
-    dataset: Dataset = load_plugin("datasets", str(source.dataset) if known else "generic")
+    has_adapter = source.dataset in plugin_names("datasets")
+    dataset: Dataset = load_plugin("datasets", str(source.dataset) if has_adapter else "generic")
     remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
     try:
-        files, found = dataset.resolve(paths, given)
+        files, mapping = dataset.resolve(paths, given)
     except InputError:
-        files, found = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in found.columns.items() if name not in given.columns}
+        files, mapping = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
+    columns = {name: text for name, text in mapping.columns.items() if name not in given.columns}
     return files, replace(given, remembered=LogMapping(columns))
 
 

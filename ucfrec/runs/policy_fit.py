@@ -53,14 +53,14 @@ def fit_policy(
     solve = policy.make_solver(base, validation, out / "policy", config.seed)
     if start is not None:
         weights = load_tensors(start)[0]
-        kept = policy.state_dict().keys() if solve is None else policy.chosen
-        policy.load_state_dict({name: weights[name] for name in kept}, strict=solve is None)
+        names = policy.state_dict().keys() if solve is None else policy.chosen
+        policy.load_state_dict({name: weights[name] for name in names}, strict=solve is None)
     alone = solve is not None
     validate = None if validation is None else _validation(policy, validation, config.seed, alone)
     if solve is not None:
         with distributed.leader_first():
             return fit_once(policy, solve, out / "policy", validate, config.policy_name, callbacks)
-    size, own = config.train.batch_size, distributed.share(config.train.batch_size)
+    size, rows = config.train.batch_size, distributed.share(config.train.batch_size)
     newest = np.array([], dtype=np.int64) if newest is None else newest
     recent = base.select(newest)
 
@@ -69,7 +69,7 @@ def fit_policy(
         if len(newest):
             of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
             episodes[::2] = newest[of_recent]
-        return train.windows(episodes[own], steps[own], k).to(device)
+        return train.windows(episodes[rows], steps[rows], k).to(device)
 
     def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         lower = config.train.precision == "bfloat16"
@@ -99,16 +99,16 @@ def _validation(
     Unless `alone`, the processes of `torchrun` divide the sample.
     """
     generator = np.random.default_rng([seed, 0])
-    drawn = [
+    samples = [
         validation.draw_steps(generator, _VALIDATION_BATCH) for _ in range(_VALIDATION_BATCHES)
     ]
     k, device = policy.config.context, policy.state_mean.device
     if not alone:
-        drawn = drawn[distributed.rank() :: distributed.processes()]
-    windows = [validation.windows(*steps, k) for steps in drawn]
+        samples = samples[distributed.rank() :: distributed.processes()]
+    windows = [validation.windows(*steps, k) for steps in samples]
 
     def loss() -> float:
-        losses = [policy.action_loss(each.to(device)) for each in windows]
+        losses = [policy.action_loss(batch.to(device)) for batch in windows]
         mean = float(torch.stack(losses).mean()) if losses else 0.0
         return mean if alone else distributed.joint_means({"loss": mean}, len(losses))["loss"]
 
@@ -141,10 +141,10 @@ def fit_once(
     folder.mkdir(parents=True, exist_ok=True)
     last = folder / "last.safetensors"
     if last.exists():
-        tensors, found = load_tensors(last)
+        tensors, counters = load_tensors(last)
         load_weights(last, module, tensors)
         module.eval()
-        return Fit(1, 1, found["best_validation"], found["seconds"])
+        return Fit(1, 1, counters["best_validation"], counters["seconds"])
     start = time.perf_counter()
     solve()
     module.eval()

@@ -115,7 +115,7 @@ class Screening(Entry):
     @property
     def flagged(self) -> list[int]:
         """The observation columns without effect."""
-        return [each.dimension for each in self.dimensions if not each.causes]
+        return [dimension.dimension for dimension in self.dimensions if not dimension.causes]
 
 
 class Candidate(Entry):
@@ -298,7 +298,7 @@ class RunRecord(TrainingRecord):
 
     def is_of(self, store: StoreRecord) -> bool:
         """Whether the run was trained on a store: on the same steps and item states."""
-        states = [each.files.get(ITEM_STATES) for each in (self, store)]
+        states = [stored.files.get(ITEM_STATES) for stored in (self, store)]
         # A store whose states a caller made lists no file of them.
         same_states = None in states or states[0] == states[1]
         return self.fingerprint == store.fingerprint and same_states
@@ -329,10 +329,10 @@ class RunRecord(TrainingRecord):
         """What a finished run did, a few lines of text; `logged` as in `learned_nothing`."""
         lines = [] if self.augmentation is None else _describe_augmentation(self.augmentation)
         fit = self.finished
-        found = f"best validation loss {fit.best_validation:.4g} at step {fit.best_step}"
+        outcome = f"best validation loss {fit.best_validation:.4g} at step {fit.best_step}"
         if self.refit_of is not None:
-            found = f"trained on all rows, up to step {fit.best_step}"
-        lines.append(f"policy        {found} of {fit.steps}, {fit.seconds:.0f} s")
+            outcome = f"trained on all rows, up to step {fit.best_step}"
+        lines.append(f"policy        {outcome} of {fit.steps}, {fit.seconds:.0f} s")
         if warning := self.learned_nothing(logged):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
@@ -370,9 +370,9 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
     """
     if not (run / REFIT / RUN).is_file():
         return None
-    found = read_record(run / REFIT)
-    whole = found.policy is not None and (found.rule is None) == (record.rule is None)
-    return found if whole else None
+    refit = read_record(run / REFIT)
+    whole = refit.policy is not None and (refit.rule is None) == (record.rule is None)
+    return refit if whole else None
 
 
 def read_training(run: Path) -> TrainingRecord:
@@ -480,16 +480,17 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
 
 
 def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
-    estimate, tried = choice.estimate, choice.tried
+    estimate, candidates = choice.estimate, choice.tried
     if estimate is None:
         how = (
-            f"It ranked best of {tried} rules in the validation period.\n"
+            f"It ranked best of {candidates} rules in the validation period.\n"
             f"              Selected by the {choice.chosen_by}{choice.warning}"
         )
     else:
         how = (
-            f"Of {tried} ways to turn the policy into recommendations, tried on simulated users, "
-            "it has the best return\n              (or one level with it) that the log supports: "
+            f"Of {candidates} ways to turn the policy into recommendations, tried on simulated "
+            "users, it has the best return\n"
+            "              (or one level with it) that the log supports: "
             f"{estimate.value:.4g} ± {estimate.error:.2g} per session, estimated; logged sessions "
             f"have {logged:.4g}.\n"
             f"{_describe_estimate(estimate, choice.halves_agree)}"
@@ -505,13 +506,13 @@ def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -
 
 def _describe_estimate(estimate: ValueEstimate, agree: tuple[bool, bool] | None) -> str:
     """How far the estimated return can be trusted, lines of text."""
-    said = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
+    sentences = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
     if agree is not None:
         would = {2: "both choose this rule", 1: "one chooses this rule", 0: "both choose another"}
-        said.append(would[sum(agree)])
+        sentences.append(would[sum(agree)])
     if estimate.optimism is not None:
         off, error = estimate.optimism
-        said.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
-    lines = [f"{'; '.join(said)}."]
+        sentences.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
+    lines = [f"{'; '.join(sentences)}."]
     lines += [f"WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts]
     return "".join(f"              {line}\n" for line in lines)

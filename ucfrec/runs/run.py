@@ -124,7 +124,7 @@ def train_run(
         if distributed.leads():
             remove_leftovers(out.parent)
             remove_leftovers_within(out)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
         if initial is not None:
             start_warm(run.policy, out, initial)
@@ -139,7 +139,7 @@ def train_run(
         if run.logged.has_items and config.rule.choose and not chosen:
             record = record.copy_with(**_selected(run, initial))
         _write_samples(run)
-        seconds = record.wall_time_s + time.perf_counter() - begun
+        seconds = record.wall_time_s + time.perf_counter() - start
         return record.copy_with(wall_time_s=seconds).seal(out)
 
 
@@ -182,7 +182,7 @@ def _prepare_inputs(
         view = policy.training_view(train, config.policy, out / "view", config.seed)
     if not record.return_to_go.per_session:
         view, validation = (
-            each.with_return_to_go(record.return_to_go) for each in (view, validation)
+            episodes.with_return_to_go(record.return_to_go) for episodes in (view, validation)
         )
     if view is not train:
         policy = new_policy(view, config)
@@ -209,8 +209,8 @@ def _augment(
         return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
     # A policy's own view of the episodes has augmentation of its own.
-    own = run.train is not run.logged
-    shared = OWN if own or not run.record.return_to_go.per_session else run.shared
+    has_own_view = run.train is not run.logged
+    shared = OWN if has_own_view or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
         overlay, report = counterfactual_augmentation(
@@ -258,9 +258,9 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     views = of_people(run.logged), of_people(run.held_out)
     inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated = run.record.return_to_go.per_session
-    given = *views, run.out / REWARD_MODEL, run.config.seed
+    inputs_of_fit = *views, run.out / REWARD_MODEL, run.config.seed
     first = None if initial is None else initial / REWARD_MODEL
-    fit = partial(UserModel.fit, *given, simulated, first)
+    fit = partial(UserModel.fit, *inputs_of_fit, simulated, first)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
@@ -274,9 +274,9 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     views = of_people(run.logged), of_people(run.held_out)
     start = None if initial is None else rule_to_start_from(initial, trained)
-    given = targets, *views, config, run.config.seed, start
+    problem = targets, *views, config, run.config.seed, start
     choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking
-    choice = choose(Problem(scorer, users, *given))
+    choice = choose(Problem(scorer, users, *problem))
     write_json(run.out / RULE, choice.rule.as_dict())
     write_json(run.out / CANDIDATES, choice.list_candidates())
     return RuleRecord.model_validate(choice.as_dict())

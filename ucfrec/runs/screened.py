@@ -63,10 +63,11 @@ def train_screened(
         raise InputError(f"screen is {how!r}; use one of {', '.join(SCREENINGS)}")
     started = read_record(out) if (out / RUN).exists() else None
     screening = None if started is None else started.screening
-    before = None if screening is None else screening.how
-    if started is not None and before != how:
+    started_with = None if screening is None else screening.how
+    if started is not None and started_with != how:
         raise InputError(
-            f"{out} was started with{f' --screen {before}' if before else 'out --screen'}; name "
+            f"{out} was started with"
+            f"{f' --screen {started_with}' if started_with else 'out --screen'}; name "
             "another run folder, or give the same options to resume"
         )
     if how is None:
@@ -82,9 +83,9 @@ def train_screened(
         )
     entries: dict[str, Any] = {**(about or {}), SCREENING: screening}
     if how == "drop":
-        kept = without_columns(store, flagged)
+        selected = without_columns(store, flagged)
         entries["dropped_observations"] = flagged
-        return train_run(kept, out, config, entries, callbacks=callbacks)
+        return train_run(selected, out, config, entries, callbacks=callbacks)
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
     more = interventions(train, places, config.seed) if places else None

@@ -39,13 +39,13 @@ class SharedStages:
         if self.folder is None:
             make()
             return
-        kept = self.folder / config_hash({**inputs, "stage": stage, "version": __version__})
-        with claim(kept, wait=True):
-            if kept.exists():
-                _copy(kept, out, names)
+        stage_folder = self.folder / config_hash({**inputs, "stage": stage, "version": __version__})
+        with claim(stage_folder, wait=True):
+            if stage_folder.exists():
+                _copy(stage_folder, out, names)
                 return
             make()
-            with atomic_folder(kept) as scratch:
+            with atomic_folder(stage_folder) as scratch:
                 _copy(out, scratch, names)
 
 

@@ -91,13 +91,13 @@ def _require_same(record: RunRecord, store: EpisodeStore, out: Path, config: Con
             )
 
 
-def _difference(before: Any, now: Any) -> str:
+def _difference(started_settings: Any, now: Any) -> str:
     if not isinstance(now, Mapping):
-        return f"{before} in the run, {now} now"
+        return f"{started_settings} in the run, {now} now"
     return ", ".join(
-        f"{key} is {before.get(key)} in the run, {value} now"
+        f"{key} is {started_settings.get(key)} in the run, {value} now"
         for key, value in now.items()
-        if before.get(key) != value
+        if started_settings.get(key) != value
     )
 
 
@@ -172,8 +172,8 @@ def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array
     returns = train.returns
     if not definition.per_session:
         returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)
-    kept = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
-    return np.asarray(np.sort(returns)[kept], dtype=np.float32)
+    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    return np.asarray(np.sort(returns)[places], dtype=np.float32)
 
 
 def reference_losses(counts: TrainingCounts, validation: EpisodeStore) -> dict[str, float]:

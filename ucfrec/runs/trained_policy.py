@@ -139,21 +139,24 @@ class TrainedPolicy:
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
         state = self.record.observation_size + (0 if states is None else states.size)
-        found: dict[str, tuple[Any, Any]] = {}
+        sizes_found: dict[str, tuple[Any, Any]] = {}
         if states is not None:
             table = (sizes["items"], sizes["action"])
-            found[ITEM_STATES] = ((table, sizes["state"]), (tuple(states.embeddings.shape), state))
+            sizes_found[ITEM_STATES] = (
+                (table, sizes["state"]),
+                (tuple(states.embeddings.shape), state),
+            )
         else:
-            found[RUN] = (sizes["state"], state)
+            sizes_found[RUN] = (sizes["state"], state)
         # A store that was not made from logs has no tables of items and users.
         if self.item_ids is not None and (self.folder / ITEMS).exists():
-            found[ITEMS] = (sizes["items"], len(self.item_ids))
+            sizes_found[ITEMS] = (sizes["items"], len(self.item_ids))
         if states is not None and len(states.user_features) and (self.folder / USERS).exists():
-            found[USERS] = (len(states.user_features), len(self.user_ids))
+            sizes_found[USERS] = (len(states.user_features), len(self.user_ids))
         if self.counts is not None:
             shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
-            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
-        for name, (stated, actual) in found.items():
+            sizes_found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in sizes_found.items():
             if stated != actual:
                 raise InputError(
                     f"{self.folder / name} does not fit the run: it has {actual}, the run "
@@ -195,8 +198,8 @@ class TrainedPolicy:
     @property
     def logged_observation_size(self) -> int:
         """Columns that observations must have; 0 if the policy sees none."""
-        kept = self.record.observation_size
-        return kept + len(self.dropped) if kept else 0
+        size = self.record.observation_size
+        return size + len(self.dropped) if size else 0
 
     @property
     def returns(self) -> ReturnToGo:
@@ -247,10 +250,10 @@ class TrainedPolicy:
         """
         models = (self.policy, self.reward_model)
         weights = [
-            (id(each), each.data_ptr(), each._version)
+            (id(tensor), tensor.data_ptr(), tensor._version)
             for model in models
             if model is not None
-            for each in model.state_dict(keep_vars=True).values()
+            for tensor in model.state_dict(keep_vars=True).values()
         ]
         if self._kept.get("weights") != weights:
             # The one before goes first, for its memory.

@@ -38,9 +38,9 @@ def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
     acting = initial if refit_of_run(initial, read_record(initial)) is None else initial / REFIT
     path = acting / "policy" / "best.safetensors"
     trained, names = load_trained(path), {name for name, _ in policy.named_parameters()}
-    own = policy.state_dict()
-    for name in sorted(own.keys() & trained.keys()):
-        new, old = own[name], trained[name]
+    state = policy.state_dict()
+    for name in sorted(state.keys() & trained.keys()):
+        new, old = state[name], trained[name]
         if name not in names and name not in _SCALES:
             continue
         if new.shape == old.shape:
@@ -61,11 +61,11 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
     rule, quantiles = old.rule, new.record.config.rule.quantiles
     if rule.target is not None:
         target = rule.target
-        nearest = min(quantiles, key=lambda each: abs(old.target_return(each) - target))
+        nearest = min(quantiles, key=lambda quantile: abs(old.target_return(quantile) - target))
         moved = new.target_return(nearest)
         least = None if rule.minimum_target is None else moved
         rule = replace(rule, target=moved, minimum_target=least)
-    of_new, of_old = (_mean_reward(each.record) for each in (new, old))
+    of_new, of_old = (_mean_reward(trained.record) for trained in (new, old))
     return replace(rule, lookahead=rule.lookahead * of_new / of_old if of_old > 0 else 0.0)
 
 
@@ -79,12 +79,12 @@ def warm_settings(config: Config, share: float = SHARE) -> Config:
     Args:
         share: of the steps and epochs of a training from scratch.
     """
-    few = max(1, round(share * config.train.steps))
+    steps = max(1, round(share * config.train.steps))
     train = replace(
         config.train,
-        steps=few,
-        warmup_steps=min(config.train.warmup_steps, few // 10),
-        validate_every=min(config.train.validate_every, few),
+        steps=steps,
+        warmup_steps=min(config.train.warmup_steps, steps // 10),
+        validate_every=min(config.train.validate_every, steps),
     )
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

@@ -1,6 +1,6 @@
 """docs/tables.md: the tables of results, written from the rows in benchmarks/results.
 
-    python benchmarks/results_page.py          # writes the page, and its pictures with matplotlib
+    python benchmarks/results_page.py          # writes the page and its pictures
     python benchmarks/results_page.py --check  # fails where the page does not follow from the rows
 
 Numbers have at most three significant digits. The page names the commits that measured a table.
@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from textwrap import TextWrapper
 from typing import Final
@@ -682,7 +681,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in FILES}
-    if not options.check and find_spec("matplotlib") is not None:
+    if not options.check:
         from results_pictures import draw
 
         draw(files, METHODS, PICTURES)

@@ -14,30 +14,29 @@ a number or `number ± error`; other cells are not drawn. Pictures follow the re
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+from ucfrec.reporting.charts import SERIES, SOFT, page_style, render  # noqa: E402
+
 DOCS = ROOT / "docs"
 ASSETS = DOCS / "assets"
-WIDTH, LEFT, RIGHT, NAME, BAR = 480, 14, 60, 17, 14
+WIDTH, NAME, BAR = 480, 17, 14
 _CHART = re.compile(r"^<!-- chart: ([\w-]+); ([^;]+); ([^;]+) -->\n\n?((?:\|.*\n)+)", re.MULTILINE)
 _VALUE = re.compile(r"^\**([+−-]?\d+(?:\.\d+)?)(?: ± (\d+(?:\.\d+)?))?\**$")
 STYLE = """
-    .panel { fill: #ffffff; stroke: #d0d7de }
-    .b0 { fill: #8c959f } .b1 { fill: #d55e00 } .b2 { fill: #0072b2 } .b3 { fill: #009e73 }
-    .error, .axis { stroke: #57606a; stroke-width: 1 }
-    text { font-family: system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; fill: #1f2328;
-      font-size: 13px }
-    .title { font-weight: 600; font-size: 14px }
-    .number { font-size: 12px; fill: #57606a }
+    svg { --ink: #1f2328; --soft: #57606a; --paper: #ffffff; --rule: #d0d7de;
+      --c0: #8c959f; --c1: #d55e00; --c2: #0072b2; --c3: #009e73;
+      font-family: system-ui, -apple-system, "Segoe UI", Roboto, sans-serif }
+    .panel { fill: var(--paper); stroke: var(--rule) }
     @media (prefers-color-scheme: dark) {
-      .panel { fill: #161b22; stroke: #30363d }
-      .b0 { fill: #6e7681 } .b1 { fill: #f0883e } .b2 { fill: #58a6ff } .b3 { fill: #3fb950 }
-      .error, .axis { stroke: #9aa4ae }
-      text { fill: #e6edf3 }
-      .number { fill: #9aa4ae }
+      svg { --ink: #e6edf3; --soft: #9aa4ae; --paper: #161b22; --rule: #30363d;
+        --c0: #6e7681; --c1: #f0883e; --c2: #58a6ff; --c3: #3fb950 }
     }"""
 
 
@@ -66,67 +65,56 @@ def _number(cell: str) -> tuple[float, float, str] | None:
     return float(found[1].replace("−", "-")), float(found[2] or 0), found[1]
 
 
+@page_style()
 def _chart(title: str, columns: list[str], table: str) -> str:
     rows = [(next(iter(row.values())), [_number(row[c]) for c in columns]) for row in _rows(table)]
     rows = [(name.replace("`", ""), values) for name, values in rows if any(values)]
-    found = [value for _, values in rows for value in values if value]
-    low = min(0.0, *(mean - error for mean, error, _ in found))
-    scale = (WIDTH - LEFT - RIGHT) / (max(mean + error for mean, error, _ in found) - low)
-
-    def x(value: float) -> float:
-        return round(LEFT + (value - low) * scale, 1)
-
-    parts = [f'<text class="title" x="{LEFT}" y="26">{escape(title)}</text>']
-    if len(columns) > 1:
+    top, legend = 38, len(columns) > 1
+    bars = sum(value is not None for _, values in rows for value in values)
+    height = top + 20 * legend + len(rows) * (NAME + 5) + bars * BAR + 8
+    figure = Figure(figsize=(WIDTH / 72, height / 72))
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((14 / WIDTH, 0, 1 - 74 / WIDTH, 1))
+    axes.set_axis_off()
+    axes.set_ylim(height, 0)
+    left = axes.get_yaxis_transform()
+    axes.text(0, 26, title, transform=left, size=14, weight="bold")
+    if legend:
         for k, column in enumerate(columns):
-            at = LEFT + k * 170
-            parts.append(f'<rect class="b{k}" x="{at}" y="38" width="10" height="10"/>')
-            parts.append(f'<text class="number" x="{at + 15}" y="47">{escape(column)}</text>')
-    y = 58 if len(columns) > 1 else 38
+            at = 170 * k / (WIDTH - 74)
+            axes.text(at, 48, "■", transform=left, size=12, color=SERIES[k])
+            axes.text(at + 0.035, 47, column, transform=left, size=12, color=SOFT)
+    y = top + 20 * legend
     for name, values in rows:
-        parts.append(f'<text x="{LEFT}" y="{y + 13}">{escape(name)}</text>')
+        axes.text(0, y + 13, name, transform=left, size=13)
         y += NAME
+        start = y
         for k, value in enumerate(values):
-            if value is not None:
-                color = k if len(columns) > 1 else int("UCF" in name)
-                parts += _bar(y, x, value, color)
-                y += BAR
-        drawn = BAR * sum(value is not None for value in values)
-        parts.append(f'<line class="axis" x1="{x(0)}" x2="{x(0)}" y1="{y - drawn}" y2="{y}"/>')
+            if value is None:
+                continue
+            mean, error, text = value
+            color = SERIES[k if legend else int("UCF" in name)]
+            middle = y + BAR / 2
+            axes.barh(middle, mean, height=BAR - 2, color=color)
+            axes.hlines(middle, mean - error, mean + error, color=SOFT, linewidth=1)
+            axes.annotate(
+                text, (max(mean, 0) + error, middle), (5, 0), textcoords="offset points",
+                va="center", size=12, color=SOFT, annotation_clip=False,
+            )  # fmt: skip
+            y += BAR
+        axes.vlines(0, start, y, color=SOFT, linewidth=1)
         y += 5
-    said = "; ".join(
+    ends = [end for _, values in rows for v in values if v for end in (v[0] - v[1], v[0] + v[1])]
+    axes.set_xlim(min(0.0, *ends), max(ends))
+    numbers = "; ".join(
         f"{name}: " + ", ".join("–" if v is None else v[2] for v in values) for name, values in rows
     )
-    return _svg(WIDTH, y + 8, title, said, parts)
-
-
-def _bar(
-    y: int, x: Callable[[float], float], value: tuple[float, float, str], color: int
-) -> list[str]:
-    mean, error, text = value
-    start, end = sorted((x(0), x(mean)))
-    middle = y + BAR / 2
-    drawn = [
-        f'<rect class="b{color}" x="{start}" y="{y + 1}" width="{max(end - start, 1):.1f}" '
-        f'height="{BAR - 2}"/>'
-    ]
-    if error:
-        ends = f'x1="{x(mean - error)}" x2="{x(mean + error)}" y1="{middle:g}" y2="{middle:g}"'
-        drawn.append(f'<line class="error" {ends}/>')
-    right = x(max(mean, 0) + error) + 5
-    drawn.append(f'<text class="number" x="{right:g}" y="{middle + 4:g}">{text}</text>')
-    return drawn
-
-
-def _svg(width: int, height: int, title: str, about: str, parts: list[str]) -> str:
-    body = "\n  ".join(parts)
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height:g}" width="{width}" '
-        f'role="img">\n  <title>{escape(title)}</title>\n  <desc>{escape(about)}</desc>\n'
-        f"  <style>{STYLE}\n  </style>\n"
-        f'  <rect class="panel" x="1" y="1" width="{width - 2}" height="{height - 2:g}" rx="8"/>'
-        f"\n  {body}\n</svg>\n"
-    )
+    svg = render(figure, title, numbers).svg
+    size = f'xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{height}"'
+    panel = f'<rect class="panel" x="1" y="1" width="{WIDTH - 2}" height="{height - 2}" rx="8"/>'
+    start, _, body = svg.partition(">")
+    start = start.replace("<svg", f"<svg {size}", 1)
+    return f"{start}>\n  <style>{STYLE}\n  </style>\n  {panel}{body}"
 
 
 def _badges() -> Iterator[tuple[str, str]]:

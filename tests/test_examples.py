@@ -141,9 +141,8 @@ def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) ->
     log = pd.read_parquet(tmp_path / "log-02.parquet")
     assert len(log) == len(shown) > 0
     assert log.click.sum() == round(days[1].reward * month.sessions)
-    if find_spec("matplotlib") is not None:
-        plot(days, tmp_path / "month.svg")
-        assert (tmp_path / "month.svg").stat().st_size > 1000
+    plot(days, tmp_path / "month.svg")
+    assert (tmp_path / "month.svg").stat().st_size > 1000
 
 
 @pytest.mark.slow

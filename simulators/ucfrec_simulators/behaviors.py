@@ -10,19 +10,6 @@ from ucfrec.acting.rollout import Actor
 from ucfrec.acting.uniform import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 
-Array = Array
-
-
-class Constant(Memoryless):
-    """The same action vector (A,) at every step."""
-
-    def __init__(self, action: Float32Array) -> None:
-        self._action = action
-
-    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
-        """Repeat the action, (N, A)."""
-        return np.tile(self._action, (len(observations), 1)), None
-
 
 def truncated_normal(
     mean: Float32Array, scale: float, generator: np.random.Generator
@@ -67,6 +54,11 @@ class Rule(Memoryless):
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, None]:
         """Apply the rule, (N, A)."""
         return self._rule(observations), None
+
+
+def repeat_action(action: Float32Array) -> Rule:
+    """The same action vector (A,) at every step."""
+    return Rule(lambda observations: np.tile(action, (len(observations), 1)))
 
 
 class Blend(Memoryless):

@@ -1,11 +1,7 @@
 """The benchmark grid: resumed without measuring twice, nothing lost to a failure."""
 
-import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,8 +33,6 @@ def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
         file.write(f"{number}\n")
     if number < 0:
         raise ValueError("negative")
-    if number >= 100:
-        time.sleep(0.2)
     metrics = {"square": float(number**2), "process": os.getpid(), "threads": _threads()}
     row = ResultRow(**vars(key), metric="square", metrics=metrics)
     return [replace(row, checkpoint=name) for name in ("last", "best")]
@@ -129,7 +123,7 @@ def test_an_interruption_that_a_library_renames_is_no_failed_cell(tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         run_grid(_cells(tmp_path, 1, 2), replace(HOW, measure=_interrupted), tmp_path / "rows", 1)
     assert not (tmp_path / "rows").exists()
-    assert run_grid(_cells(tmp_path, 1), HOW, tmp_path / "rows", 1), "no lock is left"
+    assert run_grid(_cells(tmp_path, 1), HOW, tmp_path / "rows", 1)
 
 
 def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:
@@ -138,43 +132,6 @@ def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Pa
     with pytest.raises(InputError, match="line 2 is not a result row"):
         run_grid(_cells(tmp_path, 1), HOW, results, 1)
     assert not (tmp_path / "marks").exists()
-
-
-_RUN = """
-import json, sys
-from pathlib import Path
-from tests.benchmark.test_grid import HOW
-from ucfrec.benchmark.grid import run_grid
-if __name__ == "__main__":
-    folder, workers, *numbers = sys.argv[1:]
-    cells = [(folder, int(number)) for number in numbers]
-    rows = run_grid(cells, HOW, Path(folder) / "rows.jsonl", int(workers))
-    print(json.dumps([row.task for row in rows]))
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_on_one_file_share_the_work(tmp_path: Path) -> None:
-    """Every cell is measured by one of them; both return the rows of all."""
-    script = tmp_path / "run.py"
-    script.write_text(_RUN)
-    numbers = [str(number) for number in range(100, 112)]
-    root = str(Path(__file__).parents[2])
-    running = [
-        subprocess.Popen(
-            [sys.executable, str(script), str(tmp_path), workers, *order],
-            stdout=subprocess.PIPE,
-            text=True,
-            env={"PYTHONPATH": root, "PATH": "", "OMP_NUM_THREADS": "1"},
-        )
-        for workers, order in (("2", numbers), ("1", numbers[::-1]))
-    ]
-    said = [json.loads(process.communicate()[0]) for process in running]
-    assert _marks(tmp_path) == numbers
-    assert said[0] == [n for n in numbers for _ in range(2)]
-    assert said[1] == said[0][::-1]
-    rows = read_rows(tmp_path / "rows.jsonl")
-    assert sorted(row.task for row in rows) == sorted(said[0])
 
 
 def test_what_is_chosen_keeps_its_order() -> None:

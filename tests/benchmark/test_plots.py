@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from tests.support.result_rows import distractor_rows, result_row
 from ucfrec.benchmark import plots
@@ -12,7 +13,6 @@ from ucfrec.benchmark.tables import DISTRACTOR_RATES
 
 
 def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     values = dict.fromkeys(DISTRACTOR_RATES, (1.0, 2.0))
     rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
     clean = [row for row in rows if row.conditions["distractor"] is None]
@@ -31,7 +31,7 @@ def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) ->
 
 
 def test_error_bars_are_those_of_the_tables() -> None:
-    figure = pytest.importorskip("matplotlib.figure").Figure()
+    figure = Figure()
     axes = figure.add_subplot()
     plots._bars(axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))])
     (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))

@@ -16,8 +16,8 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.reporting.model_card import user_model_table
-from ucfrec.reporting.page_results import frontier
+from ucfrec.reporting.model_card import tabulate_user_model
+from ucfrec.reporting.page_results import draw_frontier
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
@@ -105,7 +105,7 @@ def test_only_rules_that_the_log_can_evaluate_are_chosen(folder: Path) -> None:
 def test_the_report_draws_what_a_bolder_rule_would_gain(folder: Path) -> None:
     record = RunRecord.read(folder / "run")
     assert record.rule is not None
-    found, table = frontier(record), user_model_table(record)
+    found, table = draw_frontier(record), tabulate_user_model(record)
     assert found is not None
     assert table is not None
     values = [float(cells[0]) for _, cells in found[1].rows]

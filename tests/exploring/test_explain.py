@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from tests.recommending.test_recommend import random_log
 from ucfrec import DecisionRule, FeatureTable, LogMapping, Recommender
@@ -57,16 +56,6 @@ def test_the_parts_order_items_as_recommend_does(
     assert moved["reward weight"] == bool(rule.reward_weight)
     assert bool(rule.lookahead) >= moved["lookahead"]  # this log shows no end of sessions
     assert moved["policy"]
-
-
-def test_exposure_is_what_earlier_items_change(policy: Recommender) -> None:
-    head = policy.trained.policy.head
-    assert head is not None
-    found = explained(policy, DecisionRule(2.0))
-    shown = {item for item, _ in found.rows[:3]}
-    exposed = explained(policy, DecisionRule(2.0)).cards
-    assert any(card.parts["exposure"] for card in exposed) or not shown
-    assert torch.isfinite(torch.tensor([card.parts["exposure"] for card in exposed])).all()
 
 
 def test_excluded_items_have_their_reason(policy: Recommender) -> None:

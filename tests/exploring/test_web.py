@@ -95,7 +95,7 @@ def test_off_policy_values_are_shown_by_target(explorer: Explorer) -> None:
     assert page.count("<tr><th") == 3
     for _, _, row in explorer.values:
         assert f"{row.value:.4g} [" in page
-    assert '<svg class="chart"' in page
+    assert '<figure class="chart"><svg ' in page
     assert "Off-policy value" not in Explorer(explorer.runs).page({})
 
 

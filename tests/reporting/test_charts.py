@@ -1,82 +1,94 @@
-"""Charts: everything lies inside the drawing, and stands for its value."""
+"""Charts are SVG of a page: text stays text, colors are the page's, and names are never markup."""
 
-import dataclasses
+import re
+from html.parser import HTMLParser
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ucfrec.reporting import charts
+from tests.support.report_page import HOSTILE
+from ucfrec.reporting.charts import (
+    Chart,
+    Interval,
+    histogram,
+    interval_chart,
+    line_chart,
+    name_bins,
+)
 
 VALUES = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: round(x, 4))
 
 
-@given(st.dictionaries(st.integers(1, 10**7).map(float), VALUES, min_size=1, max_size=30))
-def test_every_point_is_drawn_inside_the_axes(curve: dict[float, float]) -> None:
-    chart = charts.line_chart("t", "x", [("run", 0, curve)])
-    points = [tuple(map(float, p.split(","))) for p in chart.lines[0].points.split()]
-    assert len(points) == len(curve) + 1
-    for x, y in points:
-        assert charts.LEFT <= x <= charts.WIDTH - charts.RIGHT
-        assert charts.TOP <= y <= charts.HEIGHT - charts.BOTTOM
-    for ticks in (chart.x_ticks, chart.y_ticks):
-        assert 2 <= len(ticks) <= 7
-        assert len({tick.label for tick in ticks}) == len(ticks)
+class Elements(HTMLParser):
+    """Tags, attributes and text of a chart."""
+
+    def __init__(self, chart: Chart) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.text = ""
+        self.feed(chart.svg)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
 
 
-@given(st.lists(st.tuples(VALUES, st.floats(0, 100), st.floats(0, 100)), min_size=1, max_size=8))
-def test_bars_start_at_zero_and_carry_their_interval(
-    rows: list[tuple[float, float, float]],
-) -> None:
-    chart = charts.bar_chart("t", [("p", v, v - below, v + above) for v, below, above in rows])
-    for bar, (value, _, _) in zip(chart.bars, rows, strict=True):
-        end = bar.end if value >= 0 else bar.start
-        assert chart.zero in (bar.start, bar.end)
-        assert bar.low <= end <= bar.high
-        assert dataclasses.astuple(bar)[2] < chart.height
+def charts_of(name: str) -> list[Chart]:
+    return [
+        line_chart("t", name[:20], [(name, 9, {1.0: 2.0, 20_000.0: 3.5})], {name: 2.5, "b": 2.5}),
+        interval_chart("t", [Interval(name, 1.0, 2.0, 3.0), Interval("b", -1.0, -2.0, 0.5)]),
+        interval_chart("t", [Interval(name, 1.0, 0.0, 3.0, False)], logged=0.5),
+        histogram("t", name[:20], [3, 0, 1], name_bins([0, 1, 2, 4], None)),
+    ]
 
 
-@given(
-    st.dictionaries(st.integers(1, 10**4).map(float), VALUES, min_size=1, max_size=9),
-    st.lists(VALUES, min_size=1, max_size=2, unique=True),
-)
-def test_levels_lie_on_the_axis_of_the_curves(
-    curve: dict[float, float], levels: list[float]
-) -> None:
-    named = {f"level {i}": value for i, value in enumerate(levels)}
-    chart = charts.line_chart("t", "x", [("run", 0, curve)], named)
-    assert len(chart.levels) == len(levels)
-    heights = [float(p.split(",")[1]) for p in chart.lines[0].points.split()][1:]
-    known = dict(zip([v for _, v in sorted(curve.items())], heights, strict=True))
-    for level, value in zip(chart.levels, sorted(levels, reverse=True), strict=True):
-        assert charts.TOP <= level.y <= charts.HEIGHT - charts.BOTTOM
-        assert f"{value:.4g}" in level.label
-        for other, y in known.items():
-            if other > value:
-                assert y <= level.y + 0.01
-    if len(chart.levels) == 2:  # labels never overlap
-        assert abs(chart.levels[0].label_y - chart.levels[1].label_y) >= 10
+@pytest.mark.parametrize("name", [HOSTILE, "$x$ \udc80 漢 \x00", "#0100fe", "long name " * 20, ""])
+def test_names_are_text_and_the_same_chart_gives_the_same_bytes(name: str) -> None:
+    for chart, again in zip(charts_of(name), charts_of(name), strict=True):
+        assert chart == again
+        page = Elements(chart)
+        assert set(page.tags) <= {
+            "svg",
+            "g",
+            "path",
+            "text",
+            "tspan",
+            "use",
+            "defs",
+            "clippath",
+            "rect",
+        }
+        assert not [key for key, _ in page.attributes if key.startswith("on")]
+        assert all(value and value[0] == "#" for key, value in page.attributes if key == "href")
+        used = re.findall(r"(?:fill|stroke): ([^;\"]+)", chart.svg)
+        assert {color for color in used if color != "none"} <= {
+            *(f"var(--{name})" for name in ("ink", "soft", "rule", "paper", "c0", "c1"))
+        }
+        assert "http" not in chart.svg
+        assert chart.svg.encode("utf-8")
 
 
-@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=25).filter(any), st.booleans())
-def test_columns_are_as_high_as_their_counts(counts: list[int], binned: bool) -> None:
-    edges = [float(2**i) for i in range(len(counts) + 1)]
-    values = None if binned else edges[:-1]
-    chart = charts.histogram("t", "x", counts, edges if binned else None, values)
-    floor, highest = charts.HEIGHT - charts.BOTTOM, max(c.height for c in chart.columns)
-    for column, count in zip(chart.columns, counts, strict=True):
-        assert column.y + column.height == pytest.approx(floor, abs=0.02)
-        assert column.y >= charts.TOP
-        assert column.height == pytest.approx(count / max(counts) * highest, abs=0.03)
-    right = chart.columns[-1].x + chart.columns[-1].width
-    assert abs(right - (charts.WIDTH - charts.RIGHT)) < 0.02 * len(counts)
-    assert len(chart.x_ticks) <= 6
-    assert f"{max(counts):,.6g}" in chart.summary
+def test_the_text_says_what_is_drawn() -> None:
+    line, bars, forest, columns = charts_of("ucf")
+    assert "ucf: 2 at 1, 3.5 at 20000, lowest 2 at 1. For comparison, ucf: 2.5" in line.summary
+    assert "20k" in Elements(line).text
+    assert "ucf: 1, 95% interval 2 to 3. b: -1, 95% interval -2 to 0.5" in bars.summary
+    assert forest.summary.endswith("do not rely on it. For comparison, logged sessions: 0.5")
+    assert "stroke-dasharray" in forest.svg
+    assert columns.summary == "3 columns from 0 to <1 to 2 to <4; the highest is 0 to <1: 3"
+    assert 'role="img" aria-label="t. ucf' in bars.svg
+    assert interval_chart("t", []).summary == ""
 
 
-def test_a_long_name_is_drawn_whole() -> None:
-    name = "a policy whose name is longer than any chart is wide, with its seed and its checkpoint"
-    chart = charts.bar_chart("t", [(name, 1.0, 0.5, 1.5), ("b", 1.0, 0.5, 1.5)])
-    assert " ".join(chart.bars[0].name) == name
-    assert chart.bars[0].top + charts.NAME * len(chart.bars[0].name) < chart.bars[0].y
-    assert chart.bars[0].y < chart.bars[1].top
+@settings(max_examples=6, deadline=None)
+@given(st.dictionaries(st.integers(1, 10**7).map(float), VALUES, min_size=1, max_size=9))
+def test_any_curve_and_any_counts_are_drawn(curve: dict[float, float]) -> None:
+    assert "<path" in line_chart("t", "x", [("run", 0, curve)]).svg
+    counts = [abs(value) for value in curve.values()]
+    values = name_bins(None, list(curve))
+    assert f"{max(counts):,.6g}" in histogram("t", "x", counts, values).summary

@@ -74,9 +74,8 @@ def test_losses_are_drawn_against_uniform_and_popularity(folder: Path, tmp_path:
     assert found["uniform"] == pytest.approx(math.log(N_ITEMS))
     assert found["popularity"] == pytest.approx(-np.log(share[items]).mean())
     page = page_of(tmp_path / "report.html", folder / "ucf")
-    labels = [d for t, d in page.elements if t == "line" and d["class"] == "level"]
-    assert len(labels) == 2 * 2  # validation and training loss
-    assert f"all items alike: {math.log(N_ITEMS):.4g}" in page.text
+    # In the charts of the validation and of the training loss.
+    assert page.text.count(f"all items alike: {math.log(N_ITEMS):.4g}") == 2
     assert number(page.tables["Runs"]["loss with items by popularity"]["ucf"]) == pytest.approx(
         found["popularity"], rel=1e-3
     )
@@ -84,7 +83,7 @@ def test_losses_are_drawn_against_uniform_and_popularity(folder: Path, tmp_path:
 
 def test_a_squared_error_is_not_compared_with_likelihoods(folder: Path, tmp_path: Path) -> None:
     page = page_of(tmp_path / "report.html", folder / "greedy")
-    assert not [d for t, d in page.elements if t == "line" and d["class"] == "level"]
+    assert "all items alike: " not in page.text
     assert "loss with items by popularity" not in page.tables["Runs"]
 
 
@@ -205,7 +204,7 @@ def test_estimates_from_logs_are_shown_with_their_warnings(folder: Path, tmp_pat
     }  # fmt: skip
     assert table["logged sessions"]["mean return of a session"] == "2 [1.5, 3.5]"
     assert page.text.index("Do not rely on it") < page.text.index("Trained on")
-    assert len([d for t, d in page.elements if t == "rect" and d["class"] == "bar"][:4]) == 4
+    assert page.raw.count("DR: 3, 95% interval 2.5 to 4.5") == 2
     assert not {tag for tag, _ in page.elements} & {"script", "img"}
 
 
@@ -243,15 +242,3 @@ def test_models_have_no_interval_and_the_verdict_of_ope_is_quoted(
     assert "For ucf: Do not rely on it" in page.text
     write_results(tmp_path / "ope.json", rows[1:])
     page_of(tmp_path / "report.html", folder / "ucf", results=(tmp_path / "ope.json",))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"metrics": {"R_cum": "many"}}, {"details": 3}, {"metrics": {}}, {"policy": 3}]
-)
-def test_estimates_of_another_kind_are_refused(
-    folder: Path, tmp_path: Path, wrong: dict[str, object]
-) -> None:
-    good = estimate("DR", 1.0).to_json()
-    (tmp_path / "ope.json").write_text(json.dumps([good, good | wrong]))
-    with pytest.raises(InputError, match=f"row 2 is not a result row: .*{next(iter(wrong))}"):
-        write_report(tmp_path / "out.html", [folder / "ucf"], [tmp_path / "ope.json"])

@@ -3,8 +3,6 @@
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("matplotlib", reason="the extra plots is not installed")
 from matplotlib.figure import Figure
 
 from ucfrec.reporting.plot_style import save

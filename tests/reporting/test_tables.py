@@ -3,11 +3,11 @@
 import pytest
 
 from ucfrec.reporting.tables import (
+    format_number,
     format_rows,
+    format_value,
     markdown_table,
     mean_and_sd,
-    number,
-    shown,
     signed_difference,
     text_table,
 )
@@ -48,7 +48,7 @@ def test_differences_have_a_sign() -> None:
 
 
 def test_small_numbers_keep_three_digits() -> None:
-    assert [number(value) for value in (0.0, 0.01234, -2.0)] == ["0.000", "0.0123", "-2.000"]
-    assert [shown(v) for v in (None, float("nan"), 12345.6, 0.5, 1234, "x")] == [
+    assert [format_number(value) for value in (0.0, 0.01234, -2.0)] == ["0.000", "0.0123", "-2.000"]
+    assert [format_value(v) for v in (None, float("nan"), 12345.6, 0.5, 1234, "x")] == [
         *("–", "–", "12,346", "0.5", "1,234", "x")
     ]

@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.result_rows import result_row
@@ -86,6 +86,7 @@ _JSON = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(name=st.sampled_from([*WHOLE.to_json(), "other"]), value=_JSON)
 def test_whatever_stands_in_a_field_it_is_a_row_or_refused(name: str, value: Any) -> None:
     written = json.loads(json.dumps(WHOLE.to_json() | {name: value}))
@@ -96,6 +97,7 @@ def test_whatever_stands_in_a_field_it_is_a_row_or_refused(name: str, value: Any
     assert row_from_json(json.loads(json.dumps(row.to_json(), allow_nan=False)), "again") == row
 
 
+@settings(max_examples=40)
 @given(value=_JSON)
 def test_whatever_is_no_row_is_refused(value: Any) -> None:
     with pytest.raises(InputError, match="here is not a result row"):

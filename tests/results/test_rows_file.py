@@ -11,13 +11,11 @@ import pytest
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash
-from ucfrec.results.row import RowKey
 from ucfrec.results.rows_file import (
     CONFIGURATIONS,
     append_rows,
     benchmarking,
     latest,
-    measuring,
     read_rows,
 )
 
@@ -44,20 +42,18 @@ def test_configurations_lie_once_beside_the_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "torn", [b"[broken", b'{"suite": "x"', b"1" * 5000, b"[" * 100_000, b'"text"']
-)
-def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes) -> None:
+    ("torn", "says"),
+    [
+        *((torn, "line 2 is not a result row") for torn in
+          (b"[broken", b'{"suite": "x"', b"1" * 5000, b"[" * 100_000, b'"text"')),
+        (b"\xff\xfe\n", r"rows\.jsonl is not UTF-8 text"),
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes, says: str) -> None:
     path = tmp_path / "rows.jsonl"
     append_rows(path, [result_row()])
     path.write_bytes(path.read_bytes() + torn)
-    with pytest.raises(InputError, match="line 2 is not a result row"):
-        read_rows(path)
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
-    path.write_bytes(b"\xff\xfe\n")
-    with pytest.raises(InputError, match=r"rows\.jsonl is not UTF-8 text"):
+    with pytest.raises(InputError, match=says):
         read_rows(path)
 
 
@@ -123,37 +119,6 @@ def test_processes_that_append_at_once_lose_no_row(tmp_path: Path) -> None:
     for name in names:
         own = [(row.training_seed, row.table) for row in rows if row.method == name]
         assert own == [(n, table) for n in range(30) for table in "ab"]
-
-
-_HOLD = """
-import sys, time
-from pathlib import Path
-from tests.results.test_rows_file import KEY
-from ucfrec.results.rows_file import measuring
-with measuring(Path(sys.argv[1]), KEY, wait=True):
-    print("held", flush=True)
-    time.sleep(600)
-"""
-KEY = RowKey(suite="s", table="t", task="a", method="m", policy="p")
-
-
-def test_a_measurement_is_claimed_until_its_process_dies(tmp_path: Path) -> None:
-    path = tmp_path / "rows.jsonl"
-    other = RowKey(suite="s", table="t", task="b", method="m", policy="p")
-    holder = subprocess.Popen(
-        [sys.executable, "-c", _HOLD, str(path)], stdout=subprocess.PIPE, text=True
-    )
-    assert holder.stdout is not None
-    assert holder.stdout.readline() == "held\n"
-    with measuring(path, KEY, wait=False) as held:
-        assert not held
-    with measuring(path, other, wait=False) as held:
-        assert held
-    holder.kill()
-    holder.wait()
-    holder.stdout.close()
-    with measuring(path, KEY, wait=True) as held:
-        assert held
 
 
 def test_of_rows_that_measure_the_same_the_last_counts() -> None:

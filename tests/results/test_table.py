@@ -1,6 +1,5 @@
 """Result rows in a notebook: a frame, a chart, HTML that quotes names, and a file for `report`."""
 
-import sys
 from pathlib import Path
 
 import matplotlib as mpl
@@ -55,13 +54,6 @@ def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
     for name in ("T", "method", "k"):
         with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
             Measured(ROWS).plot(name)
-
-
-def test_a_chart_needs_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(InputError, match=r"install ucfrec\[plots\]"):
-        Measured(ROWS).plot()
 
 
 def test_saved_rows_are_read_again(tmp_path: Path) -> None:

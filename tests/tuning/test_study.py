@@ -19,7 +19,7 @@ from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.report import _value
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measured, tune
+from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measure_run, tune
 
 FIXED = {
     "train.validate_every": 2,
@@ -54,7 +54,7 @@ def values(study: optuna.Study) -> list[tuple[float | None, Mapping[str, object]
 @pytest.fixture(scope="module")
 def found(store: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, optuna.Study]:
     searched = plan(store, tmp_path_factory.mktemp("found") / "tuned", ("dt", "item-rate"), "ndcg")
-    return searched, tune(searched, 6)
+    return searched, tune(searched, 4)
 
 
 def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
@@ -68,12 +68,12 @@ def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
 
 def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]) -> None:
     searched, study = found
-    assert len(finished(study)) == 6
+    assert len(finished(study)) == 4
     best = searched.out / BEST
     assert {path.name for path in searched.out.iterdir()} == {BEST, STUDY, "stages"}
     trained = TrainedPolicy.load(best)
     store = EpisodeStore.open(searched.store)
-    assert measured(trained, store, "ndcg", 5) == study.best_value
+    assert measure_run(trained, store, "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
 
@@ -117,7 +117,7 @@ def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
     }
     fixed = {**FIXED, "train.steps": 12, "policy.dim": 8, "rule.choose": False}
     search = Search(("dt",), fixed, False, 0, rates)
-    study = tune(Plan(store, tmp_path / "tuned", search, "gauc", 5), 12)
+    study = tune(Plan(store, tmp_path / "tuned", search, "gauc", 5), 9)
     ended = [trial for trial in study.trials if trial.state.name == "PRUNED"]
     assert ended
     assert all(max(trial.intermediate_values) <= 12 for trial in ended)

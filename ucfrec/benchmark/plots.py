@@ -1,4 +1,4 @@
-"""Plots of result rows; needs matplotlib (extra `plots`)."""
+"""Plots of result rows."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ucfrec.benchmark.tables import DISTRACTOR_RATES, of_checkpoint
+from ucfrec.benchmark.tables import DISTRACTOR_RATES, select_checkpoint
 from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
 from ucfrec.results.row import ResultRow
 from ucfrec.results.statistics import grouped, summary
@@ -24,7 +24,7 @@ def plot_methods(rows: _Rows, folder: Path, kind: str = "methods") -> list[Path]
     Args:
         kind: what the files are called, before the environment.
     """
-    return _by_environment(kind, _bars, rows, folder)
+    return _plot_environments(kind, _bars, rows, folder)
 
 
 def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
@@ -34,7 +34,7 @@ def plot_distractor(rows: _Rows, folder: Path) -> list[Path]:
     """
     rows = [row for row in rows if row.conditions["quantiles"] == "1"]
     planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
-    return _by_environment(
+    return _plot_environments(
         "distractor", _triples, [r for r in rows if r.environment in planted], folder
     )
 
@@ -43,7 +43,7 @@ def _bars(axes: "Axes", rows: _Rows) -> None:
     by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
     returns = [summary(row.value for row in group) for _, group in by_method]
     colors = [OURS if name == "ucf" else PLAIN for name, _ in by_method]
-    means, spreads = [each.mean for each in returns], [each.sd for each in returns]
+    means, spreads = [r.mean for r in returns], [r.sd for r in returns]
     axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
     axes.set_xlabel("return per session (mean ± sd over training seeds)")
 
@@ -57,26 +57,26 @@ def _triples(axes: "Axes", rows: _Rows) -> None:
             for _, group in by_method
         ]
         positions = np.arange(len(by_method)) + 0.25 * (1 - index)
-        means = [each.mean for each in returns]
+        means = [r.mean for r in returns]
         axes.barh(positions, means, height=0.25, color=color, label=label)
     axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
     axes.set_xlabel("return per session (mean over training seeds)")
     axes.legend()
 
 
-def _by_environment(
+def _plot_environments(
     kind: str, draw: Callable[["Axes", _Rows], None], rows: _Rows, folder: Path
 ) -> list[Path]:
-    environments = grouped(of_checkpoint(rows, "best"), lambda row: row.environment)
+    environments = grouped(select_checkpoint(rows, "best"), lambda row: row.environment)
     return [
         path
         for environment, group in environments.items()
-        for path in _saved(folder, f"{kind}-{environment}", draw, group)
+        for path in _plot(folder, f"{kind}-{environment}", draw, group)
     ]
 
 
 @styled
-def _saved(
+def _plot(
     folder: Path, name: str, draw: Callable[["Axes", _Rows], None], rows: _Rows
 ) -> list[Path]:
     from matplotlib.figure import Figure

@@ -29,9 +29,9 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """
     columns = (*_SHOWN, "coverage", "target", "estimate")
     head = ("environment", "method", "logs × seeds", *columns, f"− {OURS}")
-    lines, shown = [], of_checkpoint(rows, checkpoint)
-    less = difference_to_ours(shown)
-    for (environment, method), group in grouped(shown, _line).items():
+    lines, rows = [], select_checkpoint(rows, checkpoint)
+    less = difference_to_ours(rows)
+    for (environment, method), group in grouped(rows, _line).items():
         spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
         chosen = (_targets(group), mean_and_sd(numbers(group, "estimated_value")))
         lines.append((environment, method, len(group), *spread, *chosen, less[environment, method]))
@@ -41,27 +41,27 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
 def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
     """By (environment, method): its return less that of UCF, as in `method_table`; a dash for
     UCF."""
-    found: dict[tuple[str, str], str] = {}
+    texts: dict[tuple[str, str], str] = {}
     for environment, group in grouped(rows, lambda row: str(row.environment)).items():
         values = {
-            name: {_seeds(row): row.value for row in own}
-            for name, own in grouped(group, lambda row: row.method).items()
+            name: {_seeds(row): row.value for row in rows_of_method}
+            for name, rows_of_method in grouped(group, lambda row: row.method).items()
         }
         ours = values.get(OURS, {})
-        found |= {
-            (environment, name): NONE if name == OURS else _difference(_less(own, ours))
-            for name, own in values.items()
+        texts |= {
+            (environment, name): NONE if name == OURS else _format_difference(_less(seeds, ours))
+            for name, seeds in values.items()
         }
-    return found
+    return texts
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
     head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
-    lines = []
-    for (environment, method), group in grouped(of_checkpoint(rows, checkpoint), _line).items():
-        shown = ("R_cum", "validation_loss", "acceptance")
-        spread = [mean_and_sd(numbers(group, name)) for name in shown]
+    lines, metrics = [], ("R_cum", "validation_loss", "acceptance")
+    groups = grouped(select_checkpoint(rows, checkpoint), _line)
+    for (environment, method), group in groups.items():
+        spread = [mean_and_sd(numbers(group, name)) for name in metrics]
         lines.append((environment, method, len(group), *spread))
     return markdown_table(head, lines)
 
@@ -77,7 +77,7 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
         # Environments together, the largest target first; methods stay in their order.
         return str(row.environment), -float(str(row.conditions["quantiles"])), row.method
 
-    groups = grouped(of_checkpoint(rows, checkpoint), key)
+    groups = grouped(select_checkpoint(rows, checkpoint), key)
     lines = []
     for (environment, quantile, method), group in sorted(
         groups.items(), key=lambda item: item[0][:2]
@@ -86,20 +86,19 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
             {_seeds(row): row.value for row in group if row.conditions["distractor"] == rate}
             for rate in DISTRACTOR_RATES
         ]
-        pairs = [pair for pair in by_pair[0] if all(pair in other for other in by_pair)]
+        pairs = [pair for pair in by_pair[0] if all(pair in values for values in by_pair)]
         if not pairs:  # an environment in which no distractor was planted
             continue
         clean, off, on = ([values[pair] for pair in pairs] for values in by_pair)
         drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
         lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
-    shown = ("no distractor", "distractor off", "distractor on", "drop, %")
-    return markdown_table(
-        ("environment", "target quantile", "method", "logs × seeds", *shown), lines
-    )
+    head = ("environment", "target quantile", "method", "logs × seeds")
+    columns = ("no distractor", "distractor off", "distractor on", "drop, %")
+    return markdown_table((*head, *columns), lines)
 
 
-def of_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
+def select_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
     """The rows of built-in policies, and those of one checkpoint of trained ones."""
     return [row for row in rows if row.checkpoint in (None, checkpoint)]
 
@@ -122,13 +121,14 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         rows: of several tasks, with the metric `score`.
         checkpoint: "last" or "best".
     """
-    kept = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
-    values, tasks = _by_seed(kept, "score"), list(dict.fromkeys(row.task for row in kept))
+    rows = [r for r in rows if r.checkpoint == checkpoint or "best_step" not in r.metrics]
+    values, tasks = _group_by_seed(rows, "score"), list(dict.fromkeys(row.task for row in rows))
     cells: dict[str, dict[str, Summary]] = {}
-    for method in dict.fromkeys(row.method for row in kept):
+    for method in dict.fromkeys(row.method for row in rows):
         of_tasks = [values.get((method, task), {}) for task in tasks]
-        own = [summary(seeds.values()) for seeds in of_tasks]
-        cells[method] = dict(zip((*tasks, MEAN), (*own, _over_tasks(of_tasks)), strict=True))
+        scores = [summary(seeds.values()) for seeds in of_tasks]
+        scores.append(_summarise_tasks(of_tasks))
+        cells[method] = dict(zip((*tasks, MEAN), scores, strict=True))
     best = {
         name: max((c[name].mean for c in cells.values() if c[name].count), default=0.0)
         for name in (*tasks, MEAN)
@@ -136,19 +136,19 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
     return [
         {
             "method": method,
-            "seeds": _count([own[task].count for task in tasks]),
-            **{name: _score(each, best[name]) for name, each in own.items()},
+            "seeds": _format_count([scores[task].count for task in tasks]),
+            **{name: _format_score(score, best[name]) for name, score in scores.items()},
         }
-        for method, own in cells.items()
+        for method, scores in cells.items()
     ]
 
 
-def _count(counts: Sequence[int]) -> str:
+def _format_count(counts: Sequence[int]) -> str:
     fewest, most = min(filter(None, counts)), max(counts)
     return str(most) if fewest == most else f"{fewest}–{most}"
 
 
-def _score(scores: Summary, best: float) -> str:
+def _format_score(scores: Summary, best: float) -> str:
     if not scores.count:
         return NONE
     error = f" ± {scores.standard_error:.2g}" if scores.count > 1 else ""
@@ -159,12 +159,11 @@ def _score(scores: Summary, best: float) -> str:
 def of_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Rows of the target return with the highest mean over seeds, for each dataset, method and
     checkpoint."""
-    kept: list[ResultRow] = []
+    best: list[ResultRow] = []
     for group in grouped(rows, lambda row: (row.task, row.method, row.checkpoint)).values():
         targets = grouped(group, lambda row: row.target_return)
-        means = {target: summary(row.value for row in own).mean for target, own in targets.items()}
-        kept += targets[max(means, key=lambda target: means[target])]
-    return kept
+        best += max(targets.values(), key=lambda same: summary(row.value for row in same).mean)
+    return best
 
 
 def over_seeds(
@@ -181,7 +180,7 @@ def over_seeds(
         {
             **dict(zip(by, key, strict=True)),
             **{
-                n: mean_and_sd(each[n] for each in group if each.get(n) is not None) for n in values
+                n: mean_and_sd(line[n] for line in group if line.get(n) is not None) for n in values
             },
         }
         for key, group in groups.items()
@@ -198,19 +197,19 @@ def difference_table(
     Args:
         metric: name of a metric; of methods without it there is no line.
     """
-    values, tasks = _by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))
+    values, tasks = _group_by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))
     lines = []
     for method in dict.fromkeys(row.method for row in rows if row.method != first):
         of_tasks = [
             _less(values.get((method, task), {}), values.get((first, task), {})) for task in tasks
         ]
         if any(of_tasks):
-            found = [*map(_difference, of_tasks), _signed(_over_tasks(of_tasks))]
-            lines.append({"method": method, **dict(zip((*tasks, MEAN), found, strict=True))})
+            texts = [*map(_format_difference, of_tasks), _format_signed(_summarise_tasks(of_tasks))]
+            lines.append({"method": method, **dict(zip((*tasks, MEAN), texts, strict=True))})
     return lines
 
 
-def _by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
+def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
     """The metric, where a row has it, by seeds, of each method and task."""
     return {
         pair: {_seeds(row): row.metrics[metric] for row in group if metric in row.metrics}
@@ -222,32 +221,34 @@ def _seeds(row: ResultRow) -> tuple[int | None, int | None]:
     return row.log_seed, row.training_seed
 
 
-def _over_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
+def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
     """Of the means over tasks of each seed; of one mean where tasks differ in their seeds."""
-    seeds = set(of_tasks[0])
-    if all(set(own) == seeds for own in of_tasks):
-        return summary(summary(own[seed] for own in of_tasks).mean for seed in of_tasks[0])
-    means = [summary(own.values()).mean for own in of_tasks]
-    return summary([summary(means).mean] if all(of_tasks) else [])
+    first = of_tasks[0]
+    if all(task.keys() == first.keys() for task in of_tasks):
+        return summary(summary(task[seed] for task in of_tasks).mean for seed in first)
+    means = [summary(task.values()) for task in of_tasks]
+    return summary([summary(task.mean for task in means).mean] if all(of_tasks) else [])
 
 
-def _less(values: _BySeed, others: _BySeed) -> _BySeed:
-    """By how much `values` exceed `others` of the same seeds; a value that no log or seed changes
-    is compared with each."""
+def _less(values: _BySeed, reference: _BySeed) -> _BySeed:
+    """By how much `values` exceed those of the same seeds in `reference`; a value that no log or
+    seed changes is compared with each."""
     if values.keys() == {(None, None)}:
-        values = dict.fromkeys(others, *values.values())
-    return {seeds: value - others[seeds] for seeds, value in values.items() if seeds in others}
+        values = dict.fromkeys(reference, *values.values())
+    return {
+        seeds: value - reference[seeds] for seeds, value in values.items() if seeds in reference
+    }
 
 
-def _difference(differences: _BySeed) -> str:
+def _format_difference(differences: _BySeed) -> str:
     """Mean ± standard error over all; with several logs, in brackets that over means of logs."""
-    text = _signed(summary(differences.values()))
+    text = _format_signed(summary(differences.values()))
     of_logs = grouped(differences.items(), lambda item: item[0][0]).values()
-    over_logs = summary(summary(value for _, value in own).mean for own in of_logs)
+    over_logs = summary(summary(value for _, value in log).mean for log in of_logs)
     return text if over_logs.count < 2 else f"{text} ({over_logs.standard_error:.2g})"
 
 
-def _signed(differences: Summary) -> str:
+def _format_signed(differences: Summary) -> str:
     if differences.count > 1:
         return signed_difference(differences)
     return f"{differences.mean:+.3g}" if differences.count else NONE

@@ -21,7 +21,6 @@ from ucfrec.episodes.windows import Overlay
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import read_ids
-from ucfrec.results.table import new_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,12 +113,10 @@ class EpisodeStore(EpisodeView):
         return store_frame(self)
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
-        """Histogram of the episodes' returns on matplotlib axes; needs ucfrec[plots].
+        """Histogram of the episodes' returns on matplotlib axes."""
+        from matplotlib import pyplot
 
-        Raises:
-            InputError: matplotlib is not installed.
-        """
-        axes = new_axes() if ax is None else ax
+        axes = pyplot.subplots()[1] if ax is None else ax
         axes.hist(self.returns, bins=30)
         axes.set_xlabel(f"return of an episode (sum of {self.record.reward})")
         axes.set_ylabel("episodes")

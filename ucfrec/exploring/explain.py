@@ -90,7 +90,7 @@ def explain(
         for number, row in zip(numbers, frame.to_dict("records"), strict=True)
     )
     rows = tuple(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
-    excluded = _excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
+    excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
     return Explained(rows, cards, tuple(excluded))
 
 
@@ -163,7 +163,7 @@ def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
     return {name: part - part.mean() for name, part in parts.items()}
 
 
-def _excluded(
+def _find_excluded(
     trained: TrainedPolicy,
     rule: DecisionRule,
     user: Histories,
@@ -182,8 +182,8 @@ def _excluded(
         seen = trained.items.numbers(user.seen_ids)
         exclude(seen[seen >= 0], "the user has seen it")
     if rule.exclude_seen:
-        shown = sessions.items[0]
-        exclude(shown[shown >= 0], "this session has shown it")
+        items = sessions.items[0]
+        exclude(items[items >= 0], "this session has shown it")
     for name, words in (
         ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),
         ("tag_run", f"the last {rule.tag_run} items had its main tag"),

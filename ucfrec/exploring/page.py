@@ -19,11 +19,9 @@ from ucfrec.files.record import CARD
 from ucfrec.python_api.given_data import histories_given
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import some_of
-from ucfrec.reporting import charts
-from ucfrec.reporting.charts import LineChart
-from ucfrec.reporting.forest import quoted
+from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
-from ucfrec.reporting.page_results import results_of
+from ucfrec.reporting.page_results import find_quoted, read_evidence
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -74,49 +72,46 @@ class Explorer:
         rows = [] if features is None else features.to_pylist()
         self._features = {str(row[schema.ITEM_ID]): row for row in rows}
 
-    def page(self, given: Mapping[str, str]) -> str:
+    def page(self, fields: Mapping[str, str]) -> str:
         """The whole page.
 
         Args:
-            given: fields of the form by name; unknown ones are ignored.
+            fields: of the form, by name; unknown ones are ignored.
         """
         return template(_PACKAGE, "explore.html").render(
-            **self._shown(given),
-            given=given,
+            **self._fill(fields),
+            given=fields,
             runs=[(run.folder.name, run, self._card(run)) for run in self.runs],
-            sliders=self._sliders(given),
+            sliders=self._sliders(fields),
             values=self.values,
             chart=self.values_chart,
-            layout=charts,
             users=self.runs[0].user_ids[:_USERS_LISTED].tolist(),
         )
 
-    def results(self, given: Mapping[str, str]) -> str:
+    def results(self, fields: Mapping[str, str]) -> str:
         """The part of the page that changes with the form."""
-        return template(_PACKAGE, "explore_results.html").render(**self._shown(given))
+        return template(_PACKAGE, "explore_results.html").render(**self._fill(fields))
 
     @cached_property
     def values(self) -> list[tuple[float, str, ResultRow]]:
         """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
-        found = []
-        for one in results_of(self._results).estimates:
-            row = quoted(one.rows)
+        values = []
+        for estimates in read_evidence(self._results).estimates:
+            row = find_quoted(estimates.rows)
             if row is not None and row.target_return is not None and row.interval is not None:
-                found.append((row.target_return, one.name, row))
-        return sorted(found, key=lambda each: each[:2])
+                values.append((row.target_return, estimates.name, row))
+        return sorted(values, key=lambda value: value[:2])
 
     @cached_property
-    def values_chart(self) -> LineChart | None:
+    def values_chart(self) -> Chart | None:
         """The values as one curve per policy; None with fewer than two targets."""
         curves: dict[str, dict[float, float]] = {}
         for target, _, row in self.values:
             curves.setdefault(row.policy, {})[target] = row.value
         if max(map(len, curves.values()), default=0) < 2:
             return None
-        named = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
-        return charts.line_chart(
-            "Off-policy value against the target return", "target return", named
-        )
+        styled = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
+        return line_chart("Off-policy value against the target return", "target return", styled)
 
     @cached_property
     def reports(self) -> list[str]:
@@ -129,20 +124,18 @@ class Explorer:
                 pages.append(file.read_text(encoding="utf-8"))
         return pages
 
-    def _shown(self, given: Mapping[str, str]) -> dict[str, Any]:
+    def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
         lists: list[tuple[str, str, Explained]] = []
         error = ""
         try:
-            if given.get("user", "").strip() or given.get("history", "").strip():
-                lists = [self._list(trained, given) for trained in self.runs]
+            if fields.get("user", "").strip() or fields.get("history", "").strip():
+                lists = [self._recommend(trained, fields) for trained in self.runs]
         except InputError as fault:
             lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in each.cards} for _, _, each in lists]
+        ids = [{str(card.item_id) for card in own.cards} for _, _, own in lists]
         common = set.intersection(*ids) if len(ids) == 2 else None
-        widths = [
-            abs(v) for _, _, each in lists for card in each.cards for v in card.parts.values()
-        ]
+        widths = [abs(v) for _, _, own in lists for card in own.cards for v in card.parts.values()]
         return {
             "lists": lists,
             "error": error,
@@ -152,16 +145,17 @@ class Explorer:
             "item": self._item,
         }
 
-    def _list(self, trained: TrainedPolicy, given: Mapping[str, str]) -> tuple[str, str, Explained]:
-        text, user = given.get("history", "").strip(), given.get("user", "").strip()
-        history = _pasted(trained, text) if text else _stored(trained, user)
-        rule = _rule_given(trained, given)
-        k = round(_number(given, "k", 10, 1, _MOST_ITEMS))
-        filter_seen = given.get("keep_seen") is None
-        found = explain(trained, rule, history, k, filter_seen)
-        return trained.folder.name, str(rule), found
+    def _recommend(
+        self, trained: TrainedPolicy, fields: Mapping[str, str]
+    ) -> tuple[str, str, Explained]:
+        text, user = fields.get("history", "").strip(), fields.get("user", "").strip()
+        history = _read_pasted(trained, text) if text else _read_stored(trained, user)
+        rule = _read_rule(trained, fields)
+        k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
+        filter_seen = fields.get("keep_seen") is None
+        return trained.folder.name, str(rule), explain(trained, rule, history, k, filter_seen)
 
-    def _sliders(self, given: Mapping[str, str]) -> list[Slider]:
+    def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
         trained = self.runs[0]
         rule, returns = trained.rule, trained.training_returns
         low, high = float(returns[0]), float(returns[-1])
@@ -178,14 +172,14 @@ class Explorer:
         states = trained.item_states
         if states is None or not bool((states.tags >= 0).any()):
             sliders.pop()
-        if given.get("custom") is None:
+        if fields.get("custom") is None:
             return sliders
         # Where a number is wrong, the list says so.
         return [
-            replace(each, value=float(given[each.name]))
-            if _NUMBER.fullmatch(given.get(each.name, ""))
-            else each
-            for each in sliders
+            replace(slider, value=float(fields[slider.name]))
+            if _NUMBER.fullmatch(fields.get(slider.name, ""))
+            else slider
+            for slider in sliders
         ]
 
     def _item(self, item_id: Any) -> dict[str, Any]:
@@ -194,11 +188,11 @@ class Explorer:
         row.pop(schema.ITEM_ID, None)
         title = next((row.pop(name) for name in _TITLES if name in row), None)
         image = next((str(row.pop(name)) for name in _IMAGES if name in row), "")
-        others = "; ".join(f"{name} {value}" for name, value in row.items() if value)
+        features = "; ".join(f"{name} {value}" for name, value in row.items() if value)
         return {
             "title": str(title or item_id),
             "image": image if image.startswith(("http://", "https://")) else "",
-            "features": others[:200],
+            "features": features[:200],
         }
 
     @staticmethod
@@ -207,19 +201,19 @@ class Explorer:
         return card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
 
 
-def _pasted(trained: TrainedPolicy, text: str) -> Histories:
+def _read_pasted(trained: TrainedPolicy, text: str) -> Histories:
     (history,) = histories_given(trained, pasted_history(text), None, ["pasted"])
-    known = trained.items.numbers(history.item_ids) >= 0
-    if not known.all():
-        unknown = some_of(list(dict.fromkeys(history.item_ids[~known].tolist())))
+    unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
+    if len(unknown):
         raise InputError(
-            f"the run {trained.folder.name} does not know the items {unknown:.200}; take their "
+            f"the run {trained.folder.name} does not know the items "
+            f"{some_of(list(dict.fromkeys(unknown.tolist()))):.200}; take their "
             "lines out of the history"
         )
     return history
 
 
-def _stored(trained: TrainedPolicy, user: str) -> Histories:
+def _read_stored(trained: TrainedPolicy, user: str) -> Histories:
     run = trained.folder.name
     if trained.users.numbers(np.asarray([user]))[0] < 0:
         raise InputError(
@@ -234,20 +228,22 @@ def _stored(trained: TrainedPolicy, user: str) -> Histories:
     return history
 
 
-def _rule_given(trained: TrainedPolicy, given: Mapping[str, str]) -> DecisionRule:
+def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:
     """The run's own rule, or that of the sliders."""
     rule = trained.rule
-    if given.get("custom") is None:
+    if fields.get("custom") is None:
         return rule
-    names = [name for name in ("target", "reward_weight", "temperature") if name in given]
-    changes: dict[str, Any] = {name: _number(given, name, 0.0, -1e12, 1e12) for name in names}
-    if "tag_window" in given:
-        changes["tag_window"] = round(_number(given, "tag_window", 0, 0, 10))
+    names = [name for name in ("target", "reward_weight", "temperature") if name in fields]
+    changes: dict[str, Any] = {name: _read_number(fields, name, 0.0, -1e12, 1e12) for name in names}
+    if "tag_window" in fields:
+        changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 0, 10))
     return replace(rule, **changes)
 
 
-def _number(given: Mapping[str, str], name: str, default: float, low: float, high: float) -> float:
-    text = given.get(name, "")
+def _read_number(
+    fields: Mapping[str, str], name: str, default: float, low: float, high: float
+) -> float:
+    text = fields.get(name, "")
     if not text.strip():
         return default
     try:

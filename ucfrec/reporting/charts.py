@@ -1,262 +1,251 @@
-"""Chart geometry that the report's template draws as SVG; lengths are in SVG user units."""
+"""Charts of the report and the explorer: matplotlib figures as SVG that is part of a page.
 
-import math
+Colors are variables of the page's style sheet (`--ink`, `--soft`, `--rule`, `--paper`, `--c0` to
+`--c7`), so that a chart is legible in light and dark; text stays text. Matplotlib is imported when
+a chart is drawn.
+"""
+
+import html
+import io
+import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ucfrec.errors import one_line
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 360, 220
-"""Size of line charts and histograms; bar charts have the same width. A phone is about as wide, so
-that text is not scaled there."""
-LEFT, RIGHT, TOP, BOTTOM = 52, 22, 16, 40
-"""Margins around the plot area."""
-BAR_BOTTOM = 26
-"""Bottom margin of bar charts, whose axis has no label."""
-LEFT_OF_BARS = 14
-"""Left and right margin of bar charts, whose names are above the bars."""
-NAME, _BAR, _GAP = 16, 18, 10
-"""Heights of one line of a bar's name, of the bar, and of the gap below it."""
-NAME_CHARACTERS = 48
-"""Most characters in a line of a bar's name."""
-_LABEL = 14
-"""Height of a label."""
-_X_LABELS = 6
-"""Most labels below a histogram."""
+"""Size of line charts and histograms in SVG units, which are points in matplotlib; charts of
+intervals have the same width. A phone is about as wide, so that text is not scaled there."""
+_VARIABLES: Final = ("ink", "soft", "rule", "paper", *(f"c{series}" for series in range(8)))
+# Colors that matplotlib writes into the SVG, where variables take their places.
+_COLORS: Final = {f"#01{number:02x}fe": name for number, name in enumerate(_VARIABLES)}
+INK, SOFT, RULE, PAPER, *SERIES = _COLORS
+_DASHES: Final = ("solid", "dashed", "dotted")
+_STYLE: Final[Any] = {
+    "font.size": 11,
+    "text.color": INK,
+    "text.parse_math": False,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": SOFT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "grid.color": RULE,
+    "figure.facecolor": "none",
+    "figure.constrained_layout.use": True,
+    "axes.facecolor": "none",
+    "lines.linewidth": 2,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "ucfrec",
+}
+_NAME, _BAR, _BOTTOM = 16, 28, 26
+"""Heights of a line of a name, of the bar below it with a gap, and of the axis below all."""
+_NAME_CHARACTERS: Final = 48
+_MOST_LABELS: Final = 6
 
 
 @dataclass(frozen=True)
-class Tick:
-    """A labelled position on an axis."""
-
-    at: float
-    label: str
-
-
-@dataclass(frozen=True)
-class Line:
-    """One curve."""
-
-    summary: str
-    """Text alternative: name, first, last and lowest value."""
-    style: int
-    """Number of the color and dashes; a run has the same in all charts."""
-    points: str
-    """Value of the SVG attribute `points`."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """A reference value, drawn as a horizontal line."""
-
-    y: float
-    label: str
-    label_y: float
-    """Baseline of the label: above the line, or below it if another label is there."""
-
-
-@dataclass(frozen=True)
-class LineChart:
-    """Curves that share axes."""
+class Chart:
+    """A picture with its text alternative."""
 
     title: str
-    x_label: str
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
-    lines: tuple[Line, ...]
-    levels: tuple[Level, ...]
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A horizontal bar with an interval, drawn below its name."""
-
-    name: tuple[str, ...]
-    """Lines of the name."""
     summary: str
-    top: float
-    y: float
-    """Middle of the bar."""
-    start: float
-    end: float
-    low: float
-    high: float
+    svg: str
+    """An element of a page, with the summary as its label; its texts are escaped."""
 
 
 @dataclass(frozen=True)
-class BarChart:
-    """Bars that share an axis, which includes 0."""
-
-    title: str
-    height: float
-    zero: float
-    ticks: tuple[Tick, ...]
-    bars: tuple[Bar, ...]
-
-
-@dataclass(frozen=True)
-class Column:
-    """One bin of a histogram."""
+class Interval:
+    """A value with its 95% interval."""
 
     name: str
-    summary: str
-    x: float
-    width: float
-    y: float
-    height: float
+    value: float
+    low: float
+    high: float
+    reliable: bool | None = None
+    """Whether a verdict lets the value stand; None where there is no verdict."""
+
+    @property
+    def summary(self) -> str:
+        """The numbers, and the verdict in words."""
+        verdicts = {True: ", the estimate stands", False: ", do not rely on it", None: ""}
+        ends = f"95% interval {self.low:.4g} to {self.high:.4g}"
+        return f"{self.name}: {self.value:.4g}, {ends}{verdicts[self.reliable]}"
 
 
-@dataclass(frozen=True)
-class Histogram:
-    """Counts of consecutive bins, all drawn with the same width."""
+@contextmanager
+def page_style() -> Iterator[None]:
+    """The style of a chart, for the block or function that draws it."""
+    from matplotlib import rc_context
 
-    title: str
-    summary: str
-    x_label: str
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
-    columns: tuple[Column, ...]
-
-
-class Scale:
-    """Linear map from values to positions, with ticks at round values."""
-
-    def __init__(self, values: Iterable[float], start: float, end: float) -> None:
-        listed = list(values)
-        low, high = min(listed), max(listed)
-        if low == high:  # a single value is drawn in the middle
-            low, high = low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2
-        self._step = _round_step((high - low) / 4)
-        self._low = math.floor(low / self._step) * self._step
-        self._high = math.ceil(high / self._step) * self._step
-        self._start, self._end = start, end
-
-    def at(self, value: float) -> float:
-        """Position of a value."""
-        share = (value - self._low) / (self._high - self._low)
-        return round(self._start + share * (self._end - self._start), 2)
-
-    def ticks(self) -> tuple[Tick, ...]:
-        """Labelled positions of round values, the ends of the scale among them."""
-        first, last = round(self._low / self._step), round(self._high / self._step)
-        values = [i * self._step for i in range(first, last + 1)]
-        return tuple(Tick(self.at(value), _label(value, self._step)) for value in values)
+    with rc_context(_STYLE), warnings.catch_warnings():
+        # Browsers have other fonts for the glyphs that matplotlib's font lacks.
+        warnings.filterwarnings("ignore", message="Glyph ", category=UserWarning)
+        yield
 
 
-def _label(value: float, step: float) -> str:
-    """Label of a tick; in thousands or millions if the distance `step` of the ticks is."""
-    for size, unit in ((1e6, "M"), (1e3, "k")):
-        if step >= size and value:
-            return f"{value / size:,.0f}{unit}"
-    return f"{value:,.{max(0, -math.floor(math.log10(step)))}f}"
-
-
-def _round_step(least: float) -> float:
-    """The smallest number ≥ `least` that is 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(least))
-    return next(m * power for m in (1, 2, 5, 10) if m * power >= least * (1 - 1e-9))
-
-
+@page_style()
 def line_chart(
     title: str,
     x_label: str,
     curves: Sequence[tuple[str, int, Mapping[float, float]]],
     levels: Mapping[str, float] | None = None,
-) -> LineChart:
+) -> Chart:
     """Draw curves in one chart.
 
     Args:
-        curves: (name, style, {x: y}) of each; at least one point, y finite.
-        levels: name to a finite reference value, drawn as a horizontal line.
+        curves: (name, style, {x: y}) of each; at least one point, y finite. A run has the same
+            style, which is its color and dashes, in all charts.
+        levels: name to a finite reference value, drawn as a horizontal line; at most two.
     """
-    levels = levels or {}
-    values = [value for _, _, curve in curves for value in curve.values()]
-    x = Scale((at for _, _, curve in curves for at in curve), LEFT, WIDTH - RIGHT)
-    y = Scale([*values, *levels.values()], HEIGHT - BOTTOM, TOP)
-    lines = tuple(_line(name, style, curve, x, y) for name, style, curve in curves)
-    return LineChart(title, x_label, x.ticks(), y.ticks(), lines, _levels(levels, y))
-
-
-def _levels(levels: Mapping[str, float], y: Scale) -> tuple[Level, ...]:
-    drawn: list[Level] = []
-    for name, value in sorted(levels.items(), key=lambda level: -level[1]):
-        at = y.at(value)
-        close = drawn and at - drawn[-1].y < _LABEL
-        drawn.append(Level(at, f"{name}: {value:.4g}", at + (_LABEL - 2 if close else -4)))
-    return tuple(drawn)
-
-
-def _line(name: str, style: int, curve: Mapping[float, float], x: Scale, y: Scale) -> Line:
-    ordered = sorted(curve.items())
-    lowest = min(ordered, key=lambda point: point[1])
-    summary = (
-        f"{name}: {ordered[0][1]:.4g} at {ordered[0][0]:g}, {ordered[-1][1]:.4g} at "
-        f"{ordered[-1][0]:g}, lowest {lowest[1]:.4g} at {lowest[0]:g}"
-    )
-    # The first point is repeated, so that a single point is a line of length 0, drawn as a dot.
-    positions = [f"{x.at(at)},{y.at(value)}" for at, value in (ordered[0], *ordered)]
-    return Line(summary, style, " ".join(positions))
-
-
-def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> BarChart:
-    """Draw horizontal bars one below the other.
-
-    Args:
-        bars: (name, value, low, high) of each, with the ends of its 95% interval.
-    """
-    values = [0.0, *(end for bar in bars for end in bar[1:])]
-    x = Scale(values, LEFT_OF_BARS, WIDTH - LEFT_OF_BARS)
-    drawn, top = [], float(TOP)
-    for name, value, low, high in bars:
-        start, end = sorted((x.at(0), x.at(value)))
-        summary = f"{name}: {value:.4g}, 95% interval {low:.4g} to {high:.4g}"
-        lines = tuple(textwrap.wrap(name, NAME_CHARACTERS)) or ("",)
-        y = top + NAME * len(lines) + _BAR / 2
-        drawn.append(Bar(lines, summary, top, y, start, end, x.at(low), x.at(high)))
-        top = y + _BAR / 2 + _GAP
-    return BarChart(title, top + BAR_BOTTOM, x.at(0), x.ticks(), tuple(drawn))
-
-
-def histogram(
-    title: str,
-    x_label: str,
-    counts: Sequence[float],
-    edges: Sequence[float] | None = None,
-    values: Sequence[float] | None = None,
-) -> Histogram:
-    """Draw counts as columns of equal width, whatever the width of their bins.
-
-    Args:
-        counts: (N,).
-        edges: (N + 1,) ascending bin edges; a bin includes its left edge but not its right one.
-        values: (N,) counted values, instead of `edges`.
-    """
-    y = Scale([0.0, *counts], HEIGHT - BOTTOM, TOP)
-    width = (WIDTH - LEFT - RIGHT) / len(counts)
-    names = [_short(value) for value in values or ()]
-    if edges is not None:
-        names = [f"{_short(low)} to <{_short(high)}" for low, high in pairwise(edges)]
-    columns = tuple(
-        Column(
-            name,
-            f"{name}: {count:,.6g}",
-            round(LEFT + i * width, 2),
-            round(width, 2),
-            y.at(count),
-            round(y.at(0) - y.at(count), 2),
+    figure, axes = _plot_axes(x_label)
+    summaries = []
+    for name, style, curve in curves:
+        x, y = zip(*sorted(curve.items()), strict=True)
+        color, dashes = SERIES[style % 8], _DASHES[style // 8 % 3]
+        marker = "o" if len(x) == 1 else ""
+        axes.plot(x, y, marker=marker, clip_on=False, color=color, linestyle=dashes)
+        summaries.append(
+            f"{name}: {y[0]:.4g} at {x[0]:g}, {y[-1]:.4g} at {x[-1]:g}, lowest {min(y):.4g} at "
+            f"{x[y.index(min(y))]:g}"
         )
-        for i, (name, count) in enumerate(zip(names, counts, strict=True))
+    ordered = sorted((levels or {}).items(), key=lambda level: -level[1])
+    for (name, value), side in zip(ordered, ("bottom", "top"), strict=False):
+        axes.axhline(value, color=INK, linestyle="dotted", linewidth=1)
+        place = axes.get_yaxis_transform()
+        text = _printable(f"{name}: {value:.4g}")
+        axes.text(1, value, text, transform=place, ha="right", va=side)
+        summaries.append(f"For comparison, {name}: {value:.4g}")
+    for axis in (axes.xaxis, axes.yaxis):
+        _format_labels(axis)
+    return render(figure, title, ". ".join(summaries))
+
+
+@page_style()
+def histogram(title: str, x_label: str, counts: Sequence[float], names: Sequence[str]) -> Chart:
+    """Draw counts (N,) of N named bins as columns of equal width, whatever the bins' widths."""
+    figure, axes = _plot_axes(x_label)
+    axes.bar(range(len(counts)), counts, width=0.95, color=SERIES[0], alpha=0.55)
+    labelled = range(0, len(counts), -(-len(counts) // _MOST_LABELS))
+    edges = [names[number].partition(" to ") for number in labelled]
+    # The label of a range is at its lower edge, that of a value below the middle of its column.
+    places = [n - 0.5 if end else n for n, (_, end, _) in zip(labelled, edges, strict=True)]
+    axes.set_xticks(places, [low for low, _, _ in edges])
+    _format_labels(axes.yaxis)
+    most = int(np.argmax(counts))
+    summary = (
+        f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is "
+        f"{names[most]}: {counts[most]:,.6g}"
     )
-    # Labels of edges are at the edges, those of values below the middle of their column.
-    labels, shift = (edges, 0.0) if edges is not None else (values or (), width / 2)
-    labelled = range(0, len(labels), -(-len(labels) // _X_LABELS))
-    ticks = tuple(Tick(round(LEFT + i * width + shift, 2), _short(labels[i])) for i in labelled)
-    most = max(columns, key=lambda column: column.height)
-    summary = f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is {most.summary}"
-    return Histogram(title, summary, x_label, ticks, y.ticks(), columns)
+    return render(figure, title, summary)
+
+
+def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> list[str]:
+    """Names of the bins of a histogram, by their edges (N + 1,) or by the counted values (N,)."""
+    if edges is not None:
+        return [f"{_short(low)} to <{_short(high)}" for low, high in pairwise(edges)]
+    return [_short(value) for value in values or ()]
+
+
+@page_style()
+def interval_chart(title: str, intervals: Sequence[Interval], logged: float | None = None) -> Chart:
+    """Draw values with their intervals one below the other.
+
+    Values without a verdict are bars from 0; others are dots, hollow and dashed where the verdict
+    forbids to rely on them.
+
+    Args:
+        logged: value of the logged sessions, drawn as a vertical line.
+    """
+    from matplotlib.figure import Figure
+
+    names = [textwrap.wrap(_printable(row.name), _NAME_CHARACTERS) or [""] for row in intervals]
+    tops = np.cumsum([0, *(_NAME * len(lines) + _BAR for lines in names)])
+    height = max(int(tops[-1]), 1) + _BOTTOM
+    figure = Figure(figsize=(WIDTH / 72, height / 72))
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.04, _BOTTOM / height, 0.92, 1 - _BOTTOM / height))
+    axes.set_ylim(height - _BOTTOM, 0)
+    axes.set_yticks([])
+    axes.spines[["left"]].set_visible(any(interval.reliable is None for interval in intervals))
+    axes.spines[["left"]].set_position(("data", 0))
+    axes.grid(axis="x")
+    for top, lines, interval in zip(tops, names, intervals, strict=False):
+        middle = top + _NAME * len(lines) + 9
+        dashes = "dashed" if interval.reliable is False else "solid"
+        place = axes.get_yaxis_transform()
+        axes.text(0.01, top + 2, "\n".join(lines), transform=place, va="top", size=12)
+        if interval.reliable is None:
+            axes.barh(middle, interval.value, height=16, color=SERIES[0], alpha=0.55)
+        else:
+            fill = SERIES[0] if interval.reliable else PAPER
+            axes.plot(interval.value, middle, "o", color=SERIES[0], markerfacecolor=fill, zorder=3)
+        axes.plot((interval.low, interval.high), (middle, middle), "|", color=INK, markersize=8)
+        axes.hlines(middle, interval.low, interval.high, color=INK, linewidth=1, linestyle=dashes)
+    summaries = [interval.summary for interval in intervals]
+    if logged is not None:
+        summaries.append(f"For comparison, logged sessions: {logged:.4g}")
+        axes.axvline(logged, color=INK, linestyle="dotted", linewidth=1)
+    _format_labels(axes.xaxis)
+    return render(figure, title, ". ".join(summaries))
+
+
+def _plot_axes(x_label: str) -> "tuple[Figure, Axes]":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
+    axes = figure.add_subplot()
+    axes.set_xlabel(_printable(x_label), loc="right")
+    axes.grid(axis="y")
+    return figure, axes
+
+
+def _format_labels(axis: "Axis") -> None:
+    """At most five labels, in thousands or millions where they are large."""
+    axis.get_major_locator().set_params(nbins=5)  # type: ignore[call-arg]
+    if max(map(abs, axis.get_view_interval())) >= 10_000:
+        axis.set_major_formatter(lambda value, _: _short(value))
 
 
 def _short(value: float) -> str:
     if abs(value) >= 10_000:
         return f"{value / 1e6:.4g}M" if abs(value) >= 1e6 else f"{value / 1e3:.4g}k"
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"
+
+
+def _printable(text: str) -> str:
+    return text if text.isprintable() else one_line(text)
+
+
+def render(figure: "Figure", title: str, summary: str) -> Chart:
+    """The figure as an `<svg>` of a page, with variables for its colors; matplotlib escapes texts.
+
+    Its style sheet, which would be one of the whole page, and names of groups are left out.
+    """
+    file = io.StringIO()
+    none = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(file, format="svg", metadata=none)
+    text = file.getvalue()
+    box = re.search(r'viewBox="[\d. ]+"', text)
+    assert box is not None
+    body = text[text.index("</defs>") + len("</defs>") :]
+    body = re.sub(r'<g id="[\w.]+"', "<g", body).replace("xlink:href", "href")
+    body = re.sub(r"(?<=: )#01\w\wfe(?=[;\"])", lambda color: f"var(--{_COLORS[color[0]]})", body)
+    body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
+    label = html.escape(_printable(f"{title}. {summary}"))
+    return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')

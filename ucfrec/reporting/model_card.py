@@ -4,19 +4,23 @@
 which every evaluation of the run adds its newest values; nothing in it is typed in manually.
 """
 
-import json
 import os
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
-from ucfrec.files.atomic import atomic_file, json_text, read_json, write_json
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.files.atomic import atomic_file, read_json, write_json
 from ucfrec.files.locks import claim
 from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.provenance import config_hash
-from ucfrec.reporting.tables import Table, markdown_table, shown
+from ucfrec.off_policy.estimators import LOGGED
+from ucfrec.off_policy.evaluate import OffPolicyReport
+from ucfrec.provenance import config_hash, shorten_paths
+from ucfrec.reporting.tables import Table, format_value, markdown_table
+from ucfrec.results.row import ResultRow
+from ucfrec.results.table import Ranking
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
 
@@ -32,16 +36,16 @@ def write_card(run: Path) -> Path:
     logged = read_metrics(run / "policy")
     parts = [
         f"# Model card: {record.name}",
-        _about(record),
+        _describe_run(record),
         "## Training data",
-        _data(record, refitted),
+        _describe_data(record, refitted),
         "## How it acts",
-        _rule(run),
-        _user_model(record),
+        _describe_rule(run),
+        _describe_user_model(record),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _limits(record, refitted, logged)),
+        "\n".join(f"- {limit}" for limit in _list_limits(record, refitted, logged)),
         "## Measured",
-        _measured(_read(run)),
+        _describe_measurements(_read_measured(run)),
     ]
     with atomic_file(card) as scratch:
         scratch.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -53,7 +57,7 @@ def add_measurement(
     how: str,
     of: str,
     values: Mapping[str, object],
-    said: Sequence[str] = (),
+    remarks: Sequence[str] = (),
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 
@@ -66,22 +70,74 @@ def add_measurement(
     if not os.access(run, os.W_OK):
         return
     with claim(run / MEASURED, wait=True):
-        found = [one for one in _read(run) if (one["how"], one["of"]) != (how, of)]
-        plain = {name: _plain(value) for name, value in values.items() if value is not None}
-        found.append({"how": how, "of": of, "values": plain, "said": list(said)})
-        write_json(run / MEASURED, found)
+        unchanged = [row for row in _read_measured(run) if (row["how"], row["of"]) != (how, of)]
+        present = {name: value for name, value in values.items() if value is not None}
+        measured = {"how": how, "of": of, "values": present, "said": list(remarks)}
+        write_json(run / MEASURED, [*unchanged, measured])
         write_card(run)
 
 
-def _read(run: Path) -> list[dict[str, Any]]:
+def add_evaluation(run: Path, row: ResultRow) -> None:
+    """Add a row of `ucfrec evaluate` to the card of its run."""
+    names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
+    of = f"{row.environment}, {_format_rule(row)}, checkpoint {row.checkpoint}"
+    values = {**_select_values(row, names), "seed": row.evaluation_seed}
+    add_measurement(run, "ucfrec evaluate", of, values)
+
+
+def add_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -> None:
+    """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
+    rows = {row.method: row for row in report.rows}
+    row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])
+    names = ("R_cum", "effective_sessions", "sessions", "lift", "probability_better", "overlap")
+    files = ", ".join(map(shorten_paths, logs))
+    of = f"{row.method} on {files}, {_format_rule(row)}"
+    of += ", pages" if row.conditions["pages"] else ""
+    discount = row.conditions["discount"]
+    of += f", discount {discount:g}" if discount != 1 else ""
+    values = _select_values(row, names) | {"logged": rows[LOGGED].value}
+    remarks = (
+        str(report.verdict),
+        *(w for w in report.warnings if w not in report.verdict.reasons),
+    )
+    add_measurement(run, "ucfrec ope", of, values, remarks)
+
+
+def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
+    """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
+    intervals = row.details["intervals"]
+    values: dict[str, object] = {}
+    for name in Ranking.shown:
+        values[name] = row.metrics.get(name)
+        if name in row.metrics and name in intervals:
+            values[name] = _format_interval(row.metrics[name], intervals[name])
+    of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
+    of += f", liked: {row.conditions['liked']}"
+    add_measurement(run, "ucfrec rank", of, values, remarks)
+
+
+def _format_rule(row: ResultRow) -> str:
+    return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
+
+
+def _select_values(row: ResultRow, names: Iterable[str]) -> dict[str, object]:
+    """The named values, `R_cum` with its interval."""
+    line = row.as_line()
+    values = {name: line[name] for name in names if line.get(name) is not None}
+    if row.interval is not None and "R_cum" in values:
+        values["R_cum"] = _format_interval(values["R_cum"], row.interval)
+    return values
+
+
+def _format_interval(value: float, ends: Sequence[float]) -> str:
+    return f"{value:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
+
+
+def _read_measured(run: Path) -> list[dict[str, Any]]:
     return list(read_json(run / MEASURED)) if (run / MEASURED).exists() else []
 
 
-def _plain(value: object) -> object:
-    return value if isinstance(value, (int, float, str, bool)) else json.loads(json_text(value))
-
-
-def _about(record: RunRecord) -> str:
+def _describe_run(record: RunRecord) -> str:
     fit = record.policy
     rows = {
         "policy": record.name,
@@ -91,16 +147,16 @@ def _about(record: RunRecord) -> str:
         "best validation loss": fit and fit.best_validation,
         "versions": ", ".join(f"{name} {number}" for name, number in record.versions.items()),
     }
-    return _listed(rows)
+    return _tabulate(rows)
 
 
-def _data(record: RunRecord, refitted: bool) -> str:
+def _describe_data(record: RunRecord, refitted: bool) -> str:
     source = record.data
-    window = _window(record, refitted)
+    window = _training_window(record, refitted)
     files = [PurePath(file).name for file in source.files]
     rows = {
         "files": ", ".join(files) or None,
-        "training window (UTC)": None if window is None else " to ".join(map(_day, window)),
+        "training window (UTC)": None if window is None else " to ".join(map(_format_day, window)),
         "reward": f"`{record.reward}`",
         "sessions by": record.session_by,
         "training sessions": record.train_episodes,
@@ -111,10 +167,10 @@ def _data(record: RunRecord, refitted: bool) -> str:
         "largest return of a session": record.return_quantiles.get("1.0"),
         "fingerprint": record.fingerprint[:12],
     }
-    return _listed(rows)
+    return _tabulate(rows)
 
 
-def _window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
+def _training_window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
     """Times (ms) of the first training row, and from which on rows are no longer trained on."""
     times, splits = record.data.time_range_ms, record.data.split_times_ms
     if times is None:
@@ -124,11 +180,11 @@ def _window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
     return times[0], min(splits[0], times[1])
 
 
-def _day(milliseconds: int) -> str:
+def _format_day(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def _rule(run: Path) -> str:
+def _describe_rule(run: Path) -> str:
     if not (run / RULE).exists():
         return "Its decision rule is not chosen yet."
     return (
@@ -137,15 +193,15 @@ def _rule(run: Path) -> str:
     )
 
 
-def _user_model(record: RunRecord) -> str:
-    numbers = user_model_table(record)
+def _describe_user_model(record: RunRecord) -> str:
+    numbers = tabulate_user_model(record)
     if numbers is None:
         return "It was chosen without a user model."
     rows = [[name, *values] for name, values in numbers.rows]
     return "The user model, which chose the rule:\n\n" + markdown_table(["part", "value"], rows)
 
 
-def _limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[str]:
+def _list_limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[str]:
     items = record.sizes["items"]
     limits = []
     if record.refit_of is not None:
@@ -157,10 +213,11 @@ def _limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[s
         )
     if items:
         limits.append(f"It knows {items:,} items and never shows another one.")
-    window = _window(record, refitted)
+    window = _training_window(record, refitted)
     if window is not None:
         limits.append(
-            f"It was not trained on anything after {_day(window[1])} UTC; tastes and items change."
+            f"It was not trained on anything after {_format_day(window[1])} UTC; tastes and items "
+            "change."
         )
     unknown = record.data.unknown_propensities
     if items and unknown is None:
@@ -181,26 +238,26 @@ def _limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[s
     return limits
 
 
-def _measured(measured: Sequence[Mapping[str, Any]]) -> str:
+def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
     if not measured:
         return (
             "Nothing yet: `ucfrec evaluate`, `ucfrec ope` and `ucfrec rank` write what they find "
             "here."
         )
     parts = []
-    for one in measured:
-        body = [[name, shown(value)] for name, value in one["values"].items()]
-        parts += [f"### {one['how']}: {one['of']}", markdown_table(["what", "value"], body)]
-        parts += ["\n".join(f"- {line}" for line in one["said"])] if one["said"] else []
+    for row in measured:
+        body = [[name, format_value(value)] for name, value in row["values"].items()]
+        parts += [f"### {row['how']}: {row['of']}", markdown_table(["what", "value"], body)]
+        parts += ["\n".join(f"- {line}" for line in row["said"])] if row["said"] else []
     return "\n\n".join(parts)
 
 
-def _listed(rows: Mapping[str, object]) -> str:
-    body = [[name, shown(value)] for name, value in rows.items() if value is not None]
+def _tabulate(rows: Mapping[str, object]) -> str:
+    body = [[name, format_value(value)] for name, value in rows.items() if value is not None]
     return markdown_table(["what", "value"], body)
 
 
-def user_model_table(record: RunRecord) -> Table | None:
+def tabulate_user_model(record: RunRecord) -> Table | None:
     """The held-out loss of every part of the user model beside simpler parts; None without one."""
     reward, rule = record.reward_model, record.rule
     if reward is None or rule is None:
@@ -210,9 +267,9 @@ def user_model_table(record: RunRecord) -> Table | None:
         "reward: loss of item effects": reward.item_loss,
         "reward: loss of the model": reward.loss,
     }
-    for tried in reward.effects:
-        kept = "" if tried.kept else ", excluded"
-        rows[f"gain by {tried.effect}"] = f"{tried.gain:.5f} ± {tried.gain_error:.5f}{kept}"
+    for effect in reward.effects:
+        excluded = "" if effect.kept else ", excluded"
+        rows[f"gain by {effect.effect}"] = f"{effect.gain:.5f} ± {effect.gain_error:.5f}{excluded}"
     if (end := rule.session_end) is not None:
         rows |= {f"session end: loss, {kind}": loss for kind, loss in end.loss.items()}
         rows["session end: kept"] = end.kept
@@ -225,5 +282,5 @@ def user_model_table(record: RunRecord) -> Table | None:
         rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
-    body = [(name, [each if isinstance(each, str) else shown(each)]) for name, each in rows.items()]
+    body = [(name, [format_value(value)]) for name, value in rows.items()]
     return Table("User model, on held-out rows", "", ["value"], body)

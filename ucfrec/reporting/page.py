@@ -15,15 +15,27 @@ from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.reporting import charts
-from ucfrec.reporting.augmentation import augmentation_table, moves_chart
-from ucfrec.reporting.curves import POINTS, REFERENCES, Curves, draw_curves, trained_on
-from ucfrec.reporting.data_quality import data_quality
-from ucfrec.reporting.forest import forest
-from ucfrec.reporting.model_card import user_model_table
-from ucfrec.reporting.page_results import environments, estimates, frontier, results_of
-from ucfrec.reporting.samples import read_features, sample_tables
-from ucfrec.reporting.tables import Table, shown
+from ucfrec.reporting.model_card import tabulate_user_model
+from ucfrec.reporting.page_results import (
+    draw_environments,
+    draw_estimates,
+    draw_forest,
+    draw_frontier,
+    read_evidence,
+)
+from ucfrec.reporting.samples import read_features, tabulate_samples
+from ucfrec.reporting.tables import Table, format_value
+from ucfrec.reporting.training import (
+    POINTS,
+    REFERENCES,
+    Curves,
+    draw_curves,
+    draw_distributions,
+    draw_moves,
+    select_curves,
+    tabulate_augmentation,
+    tabulate_rows,
+)
 from ucfrec.reporting.verdict import verdict
 from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
@@ -80,13 +92,13 @@ def write_report(
     by_data: dict[str, list[_Run]] = {}
     for run in _read_runs(runs):
         by_data.setdefault(run.record.fingerprint, []).append(run)
-    evidence = results_of(results)
+    evidence = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
             "verdict": verdict(evidence),
-            "environments": environments(evidence),
-            "estimates": estimates(evidence),
-            "forest": forest(evidence),
+            "environments": draw_environments(evidence),
+            "estimates": draw_estimates(evidence),
+            "forest": draw_forest(evidence),
         }
     features = None if items is None else read_features(items)
     warnings, sections = [], []
@@ -100,7 +112,6 @@ def write_report(
         version=__version__,
         warnings=warnings,
         sections=sections,
-        layout=charts,
         points=POINTS,
         **evaluated,
     )
@@ -130,9 +141,9 @@ def _read_runs(folders: Sequence[Path]) -> list[_Run]:
         augmentation = record.augmentation
         if augmentation is None and (path / AUGMENTATION).exists():
             augmentation = read_augmentation(path / AUGMENTATION)
-        common = os.path.commonpath([other.parent for other in paths])
+        common = os.path.commonpath([folder.parent for folder in paths])
         name = str(path.relative_to(common))
-        logged = trained_on(read_metrics(path / "policy"), record.settings)
+        logged = select_curves(read_metrics(path / "policy"), record.settings)
         runs.append(_Run(path, name, record, augmentation, logged))
     return runs
 
@@ -152,41 +163,43 @@ def _warnings(run: _Run) -> list[str]:
 
 def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
-    names = [run.name for run in runs]
+    names, record = [run.name for run in runs], runs[0].record
     item_runs = [run for run in runs if run.record.sizes["items"]]
     edited = [
         (run.name, style, run.augmentation)
         for style, run in enumerate(runs)
         if run.augmentation is not None
     ]
+    pictures, quantiles = draw_distributions(record.data)
     return {
         "names": names,
-        "store": runs[0].record.store,
-        "data": _data(runs[0].record),
-        "quality": data_quality(runs[0].record.data),
-        "summary": _summary(runs),
+        "store": record.store,
+        "data": [_tabulate_data(record), *tabulate_rows(record.data)],
+        "pictures": pictures,
+        "quantiles": quantiles,
+        "summary": _summarise(runs),
         "curves": draw_curves(names, [r.logged for r in runs], [r.references for r in runs]),
         "unlogged": [run.name for run in runs if not run.logged],
         "finished": any(run.record.policy is not None for run in runs),
         "references": any(run.references for run in runs),
         "verdicts": [(name, report.verdict) for name, _, report in edited],
-        "copies": augmentation_table(edited) if edited else None,
-        "moves": moves_chart(edited),
-        "user_models": _named(item_runs, user_model_table),
-        "frontiers": _named(item_runs, frontier),
-        "samples": [(run.name, sample_tables(run.folder, features)) for run in item_runs],
-        "differences": _differences(runs),
+        "augmentation": tabulate_augmentation(edited) if edited else None,
+        "moves": draw_moves(edited),
+        "user_models": _present(item_runs, tabulate_user_model),
+        "frontiers": _present(item_runs, draw_frontier),
+        "samples": [(run.name, tabulate_samples(run.folder, features)) for run in item_runs],
+        "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
 
 
-def _named(runs: Sequence[_Run], of: Callable[[RunRecord], Any]) -> list[tuple[str, Any]]:
-    """Name and what there is of each run."""
-    found = [(run.name, of(run.record)) for run in runs]
-    return [(name, each) for name, each in found if each is not None]
+def _present(runs: Sequence[_Run], make: Callable[[RunRecord], Any]) -> list[tuple[str, Any]]:
+    """Name of each run and what is made of its record, where that is not None."""
+    parts = [(run.name, make(run.record)) for run in runs]
+    return [(name, part) for name, part in parts if part is not None]
 
 
-def _data(record: RunRecord) -> Table:
+def _tabulate_data(record: RunRecord) -> Table:
     sizes = record.sizes
     rows = {
         "fingerprint": record.fingerprint[:12],
@@ -199,11 +212,11 @@ def _data(record: RunRecord) -> Table:
     }
     for level, value in record.return_quantiles.items():
         rows[f"{float(level):.0%} of returns are at most"] = value
-    body = [(name, [shown(value)]) for name, value in rows.items()]
+    body = [(name, [format_value(value)]) for name, value in rows.items()]
     return Table("Training data", "", ["value"], body)
 
 
-def _summary(runs: Sequence[_Run]) -> Table:
+def _summarise(runs: Sequence[_Run]) -> Table:
     fitted = [run.record.policy for run in runs]
     rows: list[tuple[str, list[Any]]] = [
         ("policy", [run.record.name for run in runs]),
@@ -217,24 +230,28 @@ def _summary(runs: Sequence[_Run]) -> Table:
     if any(run.references for run in runs):
         for key, name in REFERENCES.items():
             rows.append((f"loss with {name}", [run.references.get(key) for run in runs]))
-    return _of_runs("Runs", runs, rows)
+    return _tabulate_runs("Runs", runs, rows)
 
 
-def _of_runs(caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[Any]]]) -> Table:
-    body = [(name, [shown(value) for value in values]) for name, values in rows]
+def _tabulate_runs(
+    caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[Any]]]
+) -> Table:
+    body = [(name, [format_value(value) for value in values]) for name, values in rows]
     return Table(caption, "", [run.name for run in runs], body)
 
 
-def _differences(runs: Sequence[_Run]) -> Table | None:
+def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    flat = [_flat(run.record.settings) | _flat({"version": run.record.versions}) for run in runs]
-    names = dict.fromkeys(name for settings in flat for name in settings)
-    rows = [(name, [settings.get(name) for settings in flat]) for name in names]
+    settings = [
+        _flatten(run.record.settings) | _flatten({"version": run.record.versions}) for run in runs
+    ]
+    names = dict.fromkeys(name for run_settings in settings for name in run_settings)
+    rows = [(name, [run_settings.get(name) for run_settings in settings]) for name in names]
     rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]
-    return _of_runs("Settings that differ", runs, rows) if rows else None
+    return _tabulate_runs("Settings that differ", runs, rows) if rows else None
 
 
-def _flat(tables: Mapping[str, Any]) -> dict[str, Any]:
+def _flatten(tables: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in tables.items():
         inner = {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {}

@@ -9,15 +9,14 @@ from typing import Any
 from ucfrec.errors import InputError
 from ucfrec.evaluation.diversity import COLUMNS
 from ucfrec.off_policy.estimators import LOGGED, SUITE
-from ucfrec.reporting.charts import BarChart, LineChart, bar_chart, line_chart
-from ucfrec.reporting.tables import Table, evaluation_line, shown
+from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
+from ucfrec.reporting.tables import Table, evaluation_line, format_value
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
 from ucfrec.runs.record import RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
 _SEEDS = ("seed", "train_seed")
-_WEIGHTS = ("effective_sessions", "largest_weight", "sessions", "overlap")
 _STEP = "R_step"
 """Metric of rows per step, where only some steps of the logs have propensities."""
 
@@ -45,7 +44,7 @@ class Results:
     estimates: Sequence[Estimates]
 
 
-def results_of(paths: Sequence[Path]) -> Results:
+def read_evidence(paths: Sequence[Path]) -> Results:
     """Read result rows from JSON lines (files named `.jsonl`) or JSON.
 
     Raises:
@@ -54,32 +53,27 @@ def results_of(paths: Sequence[Path]) -> Results:
     environments: dict[str, list[ResultRow]] = {}
     estimates: list[Estimates] = []
     for path in paths:
-        rows = read_results(path)
-        for number, row in enumerate(rows, start=1):
-            of_steps = row.suite == SUITE and row.metric == _STEP
+        calls: list[list[ResultRow]] = []
+        for number, row in enumerate(read_results(path), start=1):
+            by_step = row.suite == SUITE and row.metric == _STEP
             session = row.metric == "R_cum" and (row.interval is not None or row.suite == SUITE)
-            if not (session or of_steps):
+            if not (session or by_step):
                 raise InputError(
                     f"{path}, row {number}, has no R_cum with an interval; give rows that `ucfrec "
                     "evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
                 )
             if row.suite != SUITE:
                 environments.setdefault(row.environment or row.task, []).append(row)
-        estimates += _estimates([row for row in rows if row.suite == SUITE])
+                continue
+            # The rows of one call of `ucfrec ope` begin with `logged`.
+            if (row.method == LOGGED and not by_step) or not calls:
+                calls.append([])
+            calls[-1].append(row)
+        estimates += map(_group_estimates, calls)
     return Results(environments, estimates)
 
 
-def _estimates(rows: Sequence[ResultRow]) -> list[Estimates]:
-    """Group the rows of one file by `ucfrec ope` call; the rows of a call begin with `logged`."""
-    groups: list[list[ResultRow]] = []
-    for row in rows:
-        if (row.method == LOGGED and row.metric != _STEP) or not groups:
-            groups.append([])
-        groups[-1].append(row)
-    return [_policy_estimates(group) for group in groups]
-
-
-def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
+def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
     steps = [row for row in group if row.metric == _STEP]
     sessions = [row for row in group if row.metric != _STEP]
     logged = next((row for row in sessions if row.method == LOGGED), None)
@@ -92,116 +86,164 @@ def _policy_estimates(group: Sequence[ResultRow]) -> Estimates:
     if first.details.get("selection") is not None:
         name = f"{first.policy} ({first.details.get('candidate')})"
     warnings = (row.details.get("warnings") for row in group)
-    said = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
-    return Estimates(name, logged, rows, tuple(dict.fromkeys(said)), steps)
+    texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
+    return Estimates(name, logged, rows, tuple(dict.fromkeys(texts)), steps)
 
 
-def environments(results: Results) -> list[tuple[BarChart, Table]]:
+def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
+    """The row that the verdict is of, if it has an interval."""
+    quoted = (row for row in rows if row.interval and row.method == row.details.get("verdict_of"))
+    return next(quoted, None)
+
+
+def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
-    return [_environment(environment, rows) for environment, rows in results.environments.items()]
-
-
-def _environment(environment: str, rows: Sequence[ResultRow]) -> tuple[BarChart, Table]:
-    names, lines = _row_names(rows), [evaluation_line(row) for row in rows]
-    columns = [c for c in (*_METRICS, *_SEEDS) if any(line.get(c) is not None for line in lines)]
-    body = [
-        (name, [interval(row), *(_cell(line, column) for column in columns)])
-        for name, row, line in zip(names, rows, lines, strict=True)
-    ]
-    table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
-    return _bars(f"R_cum in {environment}, with 95% intervals", names, rows), table
-
-
-def estimates(results: Results) -> list[tuple[Estimates, BarChart, Table]]:
-    """Bar chart and table of each policy with estimates from logs, and of those per step."""
-    drawn = []
-    for one in results.estimates:
-        rows = [*([one.logged] if one.logged else []), *one.rows]
-        names = ["logged sessions" if row.method == LOGGED else row.method for row in rows]
-        body = [
-            (name, [interval(row), *(shown(row.as_line().get(column)) for column in _WEIGHTS)])
-            for name, row in zip(names, rows, strict=True)
+    pictures = []
+    for environment, rows in results.environments.items():
+        names, lines = _name_rows(rows), [evaluation_line(row) for row in rows]
+        columns = [
+            c for c in (*_METRICS, *_SEEDS) if any(line.get(c) is not None for line in lines)
         ]
-        columns = ["mean return of a session", "effective sample", "share of the largest weight"]
-        table = Table(f"Estimates for {one.name}", "", [*columns, "sessions", "overlap"], body)
-        chart = _bars(f"Mean return of a session: {one.name}, with 95% intervals", names, rows)
-        if one.steps:
-            # The warnings come once, below both.
-            drawn += [(replace(one, warnings=()), chart, table), (one, *_per_step(one))]
-        else:
-            drawn.append((one, chart, table))
-    return drawn
+        body = [
+            (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
+            for name, row, line in zip(names, rows, lines, strict=True)
+        ]
+        table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
+        title = f"R_cum in {environment}, with 95% intervals"
+        pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
+    return pictures
 
 
-def _per_step(one: Estimates) -> tuple[BarChart, Table]:
-    names = ["logged steps" if row.method == LOGGED else row.method for row in one.steps]
-    weights = ("effective_steps", "largest_weight")
+def draw_estimates(results: Results) -> list[tuple[Chart, Table, Sequence[str]]]:
+    """Chart, table and warnings of each policy with estimates from logs, and of those per step."""
+    pictures: list[tuple[Chart, Table, Sequence[str]]] = []
+    for estimates in results.estimates:
+        logged = [] if estimates.logged is None else [estimates.logged]
+        parts = [
+            _draw_rows(
+                [*logged, *estimates.rows],
+                "sessions",
+                ("mean return of a session", f"Mean return of a session: {estimates.name}"),
+                f"Estimates for {estimates.name}",
+            )
+        ]
+        if estimates.steps:
+            title = f"Mean reward of a step with a propensity: {estimates.name}"
+            parts.append(
+                _draw_rows(
+                    estimates.steps,
+                    "steps",
+                    ("mean reward of a step", title),
+                    f"Estimates per step for {estimates.name}",
+                )
+            )
+        # The warnings come once, below both.
+        pictures += [(*part, ()) for part in parts[:-1]]
+        pictures.append((*parts[-1], estimates.warnings))
+    return pictures
+
+
+def _draw_rows(
+    rows: Sequence[ResultRow], unit: str, value: tuple[str, str], caption: str
+) -> tuple[Chart, Table]:
+    """Chart and table of estimates.
+
+    Args:
+        unit: "sessions" or "steps".
+        value: name of the value, as the head of its column and as the title of the chart.
+    """
+    columns = {
+        f"effective_{unit}": "effective sample",
+        "largest_weight": "share of the largest weight",
+        **({"sessions": "sessions", "overlap": "overlap"} if unit == "sessions" else {}),
+    }
+    names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
     body = [
-        (name, [interval(row), *(shown(row.as_line().get(column)) for column in weights)])
-        for name, row in zip(names, one.steps, strict=True)
+        (name, [format_interval(row), *(format_value(row.as_line().get(key)) for key in columns)])
+        for name, row in zip(names, rows, strict=True)
     ]
-    columns = ["mean reward of a step", "effective sample", "share of the largest weight"]
-    table = Table(f"Estimates per step for {one.name}", "", columns, body)
-    title = f"Mean reward of a step with a propensity: {one.name}, with 95% intervals"
-    return _bars(title, names, one.steps), table
+    head, title = value
+    chart = interval_chart(f"{title}, with 95% intervals", _list_intervals(names, rows))
+    return chart, Table(caption, "", [head, *columns.values()], body)
 
 
-def _bars(title: str, names: Sequence[str], rows: Sequence[ResultRow]) -> BarChart:
-    bars = [
-        (name, row.value, row.interval[0], row.interval[1])
+def draw_forest(results: Results) -> Chart | None:
+    """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
+    names, rows = [], []
+    for estimates in results.estimates:
+        if (row := find_quoted(estimates.rows)) is not None:
+            names.append(f"{estimates.name}: {row.method}")
+            rows.append(row)
+    if not rows:
+        return None
+    intervals = [
+        replace(interval, reliable=row.details.get("reliable") is True)
+        for interval, row in zip(_list_intervals(names, rows), rows, strict=True)
+    ]
+    # The line is of one set of logs; several have a line each in their own charts.
+    logged = {policy.logged.value for policy in results.estimates if policy.logged is not None}
+    title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
+    return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
+
+
+def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Interval]:
+    return [
+        Interval(name, row.value, *row.interval)
         for name, row in zip(names, rows, strict=True)
         if row.interval is not None
     ]
-    return bar_chart(title, bars)
 
 
-def interval(row: ResultRow) -> str:
+def format_interval(row: ResultRow) -> str:
     """The value with its 95% interval, if it has one."""
     if row.interval is None:
-        return f"{shown(row.value)} [–]"
+        return f"{format_value(row.value)} [–]"
     low, high = row.interval
-    return f"{shown(row.value)} [{shown(low)}, {shown(high)}]"
+    return f"{format_value(row.value)} [{format_value(low)}, {format_value(high)}]"
 
 
-def _row_names(rows: Sequence[ResultRow]) -> list[str]:
+def _name_rows(rows: Sequence[ResultRow]) -> list[str]:
     """Policy of each row, with the fields that differ if a policy has several rows."""
     names, lines = [], [evaluation_line(row) for row in rows]
     for line in lines:
-        same = [other for other in lines if other["policy"] == line["policy"]]
+        same = [row for row in lines if row["policy"] == line["policy"]]
         fields = ("run", "checkpoint", *_SEEDS)
         differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-        parts = [line["policy"], *(f"{key} {_cell(line, key)}" for key in differing)]
+        parts = [line["policy"], *(f"{key} {_format_cell(line, key)}" for key in differing)]
         names.append(", ".join(parts))
     return names
 
 
-def _cell(line: Mapping[str, Any], column: str) -> str:
+def _format_cell(line: Mapping[str, Any], column: str) -> str:
     value = line.get(column)
-    return str(value) if column in _SEEDS and value is not None else shown(value)
+    return str(value) if column in _SEEDS and value is not None else format_value(value)
 
 
-def frontier(record: RunRecord) -> tuple[LineChart, Table] | None:
+def draw_frontier(record: RunRecord) -> tuple[Chart, Table] | None:
     """The highest estimated value of the rules that leave so many effective users of the log.
 
     None where the log has no propensities.
     """
     if record.rule is None:
         return None
-    known = [
-        (each.evidence.effective_users, each.value, each.rule, each.evidence.interval)
-        for each in record.rule.candidates
-        if each.value is not None and each.evidence and each.evidence.effective_users is not None
-    ]
+    evidence = [
+        (candidate.evidence.effective_users, candidate.value, candidate.rule,
+         candidate.evidence.interval)
+        for candidate in record.rule.candidates
+        if candidate.value is not None
+        and candidate.evidence
+        and candidate.evidence.effective_users is not None
+    ]  # fmt: skip
     highest, curve, body = -math.inf, dict[float, float](), []
-    for users, value, rule, ends in sorted(known, key=lambda one: (-one[0], -one[1])):
+    for users, value, rule, ends in sorted(evidence, key=lambda rule: (-rule[0], -rule[1])):
         if value > highest:
             highest = curve[users] = value
             between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
-            body.append((str(rule), [shown(value), f"{users:.0f}", between]))
+            body.append((str(rule), [format_value(value), f"{users:.0f}", between]))
     if not curve:
         return None
     curves = [("best rule", 0, curve)]
-    chosen = [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]
+    chosen = [(users, value) for users, value, rule, _ in evidence if rule == record.rule.rule]
     if chosen:
         curves.append(("chosen rule", 1, dict(chosen[:1])))
     title = "Value in the search for a rule, against evidence"

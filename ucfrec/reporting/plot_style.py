@@ -1,12 +1,11 @@
-"""Style of all figures: a color-blind-safe palette and the column widths of a paper.
+"""Style of figures that are files: colors and the column widths of a paper.
 
-Matplotlib (extra `plots`) is imported only when a figure is drawn.
+Matplotlib is imported only when a figure is drawn.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import wraps
-from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
@@ -20,48 +19,9 @@ Drawn = TypeVar("Drawn")
 
 COLUMN, PAGE = 3.4, 7.0
 """Widths of one column and of the whole page, in inches."""
-FACTUAL, EDITED = "#0072B2", "#D55E00"
 PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
 """Colors of other methods, of UCF, and of a third bar."""
-MAP = "cividis"
 _NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
-# The color-blind-safe palette of Okabe and Ito (2008).
-_PALETTE = (
-    *("#0072B2", "#E69F00", "#009E73", "#D55E00"),
-    *("#CC79A7", "#56B4E9", "#000000", "#8C8C8C"),
-)
-# A method or condition has the same color in all figures.
-_FIXED = {
-    "bc": "#8C8C8C",
-    "dt": "#0072B2",
-    "dc": "#56B4E9",
-    "lsdt": "#009E73",
-    "ucf": "#D55E00",
-    "ucf-screened": "#CC79A7",
-    "ucf-dropped": "#F0E442",
-    "ucf-wo-count": "#E69F00",
-    "ucf-no-augmentation": "#E69F00",
-    "ucf-wo-arch": "#000000",
-    "dt-augmented": "#000000",
-    "none": "#8C8C8C",
-    "deterministic": "#0072B2",
-    "stochastic": "#56B4E9",
-    "early": "#E69F00",
-}
-_LABELS = {
-    "bc": "BC",
-    "dt": "DT",
-    "dc": "DC",
-    "lsdt": "LSDT",
-    "ucf": "UCF",
-    "ucf-screened": "UCF, screened",
-    "ucf-dropped": "UCF, dropped",
-    "ucf-wo-count": "w/o Count",
-    "ucf-no-augmentation": "w/o Count",
-    "ucf-wo-arch": "w/o Arch",
-    "dt-augmented": "w/o Arch",
-    "none": "no distractor",
-}
 
 _RC: Final[Any] = {
     "figure.dpi": 200,
@@ -76,7 +36,7 @@ _RC: Final[Any] = {
     "grid.color": "#DDDDDD",
     "lines.linewidth": 1.3,
     "lines.markersize": 3.5,
-    "image.cmap": MAP,
+    "image.cmap": "cividis",
     # Text stays text in SVG, and equal figures give identical files.
     "svg.fonttype": "none",
     "svg.hashsalt": "ucfrec",
@@ -94,19 +54,6 @@ def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
             return draw(*args, **kwargs)
 
     return drawn
-
-
-def label(name: str) -> str:
-    """Display name of a method or condition in figures."""
-    return _LABELS.get(name, name)
-
-
-def colors(names: Iterable[str]) -> dict[str, str]:
-    """Name to color: the fixed color of the name, else an unused color of the palette."""
-    wanted = list(names)
-    taken = {_FIXED.get(name) for name in wanted}
-    free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
-    return {name: _FIXED.get(name) or next(free) for name in wanted}
 
 
 @styled

@@ -13,7 +13,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import require_regular
-from ucfrec.reporting.tables import Table, shown
+from ucfrec.reporting.tables import Table, format_value
 from ucfrec.runs.samples import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
@@ -21,7 +21,7 @@ _CHARACTERS = 120
 """Most characters of the shown features of an item."""
 
 
-def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
+def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
     """The decision rule of the samples and one table per session; None if a run has no samples.
 
     Args:
@@ -35,7 +35,7 @@ def sample_tables(run: Path, features: pa.Table | None) -> tuple[str, list[Table
         sessions = samples["sessions"]
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
         items = _item_cells(pq.read_table(run / ITEMS), sorted(numbers), features)
-        tables = [_session(number, one, items) for number, one in enumerate(sessions, start=1)]
+        tables = [_tabulate(number, session, items) for number, session in enumerate(sessions, 1)]
         return str(samples["rule"]), tables
 
 
@@ -66,7 +66,7 @@ def _item_cells(
 ) -> dict[int, dict[str, str]]:
     """Item number to the cells (column: text) of its row in `items` and of its features."""
     rows = items.take(pa.array(numbers, pa.int64())).to_pylist()
-    known = {
+    cells = {
         number: {name: str(value) for name, value in row.items()}
         for number, row in zip(numbers, rows, strict=True)
     }
@@ -76,28 +76,30 @@ def _item_cells(
             matches = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids)).to_pylist()
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError, TypeError):
             matches = []  # the ids are of another type, so none of them can match
-        described = {row.pop(schema.ITEM_ID): _described(row) for row in matches}
+        described = {row.pop(schema.ITEM_ID): _describe(row) for row in matches}
         for number, row in zip(numbers, rows, strict=True):
-            known[number]["features"] = described.get(row[schema.ITEM_ID], "–")
-    return known
+            cells[number]["features"] = described.get(row[schema.ITEM_ID], "–")
+    return cells
 
 
-def _described(features: Mapping[str, Any]) -> str:
+def _describe(features: Mapping[str, Any]) -> str:
     """Text of the features that are neither missing nor zero, cut to `_CHARACTERS`."""
     parts = []
     for name, value in features.items():
-        text = ", ".join(map(shown, value)) if isinstance(value, list) else shown(value)
+        text = (
+            ", ".join(map(format_value, value)) if isinstance(value, list) else format_value(value)
+        )
         if value:
             parts.append(f"{name} {text}")
     described = "; ".join(parts) or "–"
     return described if len(described) <= _CHARACTERS else f"{described[: _CHARACTERS - 1]}…"
 
 
-def _session(
+def _tabulate(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
-    lines = [("shown before", item, shown(reward)) for item, reward in history]
+    lines = [("shown before", item, format_value(reward)) for item, reward in history]
     lines.append(("shown next in the log", session["logged"], "–"))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""

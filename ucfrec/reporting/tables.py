@@ -31,7 +31,7 @@ class Table:
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """An aligned table for a terminal; the first two columns are left-aligned, others right."""
-    table = [[_text(cell) for cell in line] for line in (head, *lines)]
+    table = [[_format_text(cell) for cell in line] for line in (head, *lines)]
     widths = [max(len(line[i]) for line in table) for i in range(len(head))]
     written = []
     for line in table:
@@ -43,7 +43,7 @@ def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """A table in GitHub Markdown."""
-    body = [[_text(cell) for cell in line] for line in (head, ["---"] * len(head), *lines)]
+    body = [[_format_text(cell) for cell in line] for line in (head, ["---"] * len(head), *lines)]
     return "\n".join("| " + " | ".join(line) + " |" for line in body)
 
 
@@ -67,10 +67,10 @@ def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> st
 
     A value `x` of a row that also has `x_low` and `x_high`, such as R_cum, gets its interval.
     """
-    return text_table(columns, [[_cell(row, name) for name in columns] for row in rows])
+    return text_table(columns, [[_format_cell(row, name) for name in columns] for row in rows])
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """`value` with three decimals, or three significant digits if it is below 0.1."""
     return f"{value:.3f}" if value == 0 or abs(value) >= 0.1 else f"{value:#.3g}"
 
@@ -88,7 +88,7 @@ def signed_difference(differences: Summary) -> str:
     return f"{differences.mean:+.3g} ± {differences.standard_error:.2g}"
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Cell text of `value`: floats with four significant digits, a dash if missing or infinite."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return NONE
@@ -97,17 +97,18 @@ def shown(value: Any) -> str:
     return f"{value:,}" if type(value) is int else str(value)
 
 
-def _cell(row: Mapping[str, Any], name: str) -> str:
+def _format_cell(row: Mapping[str, Any], name: str) -> str:
     value = row[name]
     if isinstance(value, float) and {f"{name}_low", f"{name}_high"} <= row.keys():
-        return f"{number(value)} [{_text(row[f'{name}_low'])}, {_text(row[f'{name}_high'])}]"
-    return _text(value)
+        low, high = (_format_text(row[f"{name}_{end}"]) for end in ("low", "high"))
+        return f"{format_number(value)} [{low}, {high}]"
+    return _format_text(value)
 
 
-def _text(value: object) -> str:
+def _format_text(value: object) -> str:
     if value is None:
         return NONE
     if isinstance(value, float):
-        return number(value)
+        return format_number(value)
     text = str(value)
     return text if text.isprintable() else one_line(text)

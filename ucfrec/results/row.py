@@ -25,9 +25,9 @@ Whole = Annotated[int, Strict()]
 def plain(value: Any) -> Any:
     """`value` as JSON; numbers that are not finite are None."""
     if isinstance(value, Mapping):
-        return {str(name): plain(one) for name, one in value.items()}
+        return {str(name): plain(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(one) for one in value]
+        return [plain(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -140,8 +140,8 @@ class ResultRow(RowKey):
 
     def of(self, key: RowKey) -> "ResultRow":
         """The row as a measurement `key`, whose conditions are added to its own."""
-        own = {**self.conditions, **key.conditions}
-        return replace(self, **{**vars(key), "conditions": own})
+        conditions = {**self.conditions, **key.conditions}
+        return replace(self, **{**vars(key), "conditions": conditions})
 
     def as_line(self) -> dict[str, Any]:
         """Every field, condition and metric in one flat mapping, for tables and figures."""
@@ -153,12 +153,12 @@ class ResultRow(RowKey):
     def to_json(self) -> dict[str, Any]:
         """The row as JSON values, without fields at their default."""
         written = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            factory = each.default_factory
-            default = each.default if factory is MISSING else factory()
+        for f in fields(self):
+            value = getattr(self, f.name)
+            factory = f.default_factory
+            default = f.default if factory is MISSING else factory()
             if value != default:
-                written[each.name] = list(value) if isinstance(value, tuple) else value
+                written[f.name] = list(value) if isinstance(value, tuple) else value
         return written
 
 

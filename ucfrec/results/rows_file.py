@@ -1,12 +1,11 @@
 """Read and write files of result rows (JSON lines)."""
 
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, read_json, write_json
@@ -88,15 +87,16 @@ def append_rows(
     Raises:
         InputError: a row has a number that is not finite, or another `config_hash` than `config`.
     """
-    named = None if config is None else config_hash(config)
-    if any(row.config_hash != named for row in rows):
+    digest = None if config is None else config_hash(config)
+    if any(row.config_hash != digest for row in rows):
         raise InputError(f"rows for {path} have the hash of another configuration; pass their own")
     for row in rows:
         row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
     configurations = path.with_name(CONFIGURATIONS)
     with claim(configurations, wait=True):
-        if config is not None and named not in _hashes(configurations):
-            _append(configurations, [{"hash": named, "config": config}])
+        configured = [value for _, value in read_lines(configurations) if isinstance(value, dict)]
+        if config is not None and digest not in [value.get("hash") for value in configured]:
+            _append(configurations, [{"hash": digest, "config": config}])
     with claim(path, wait=True):
         _append(path, [row.to_json() for row in rows])
 
@@ -105,9 +105,9 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
     """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
     with claim(path, wait=True):
         rows = read_rows(path)
-        kept = [row for row in rows if not any(key.covers(row) for key in keys)]
-        if len(kept) < len(rows):
-            _write(path, b"", [row.to_json() for row in kept])
+        remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
+        if len(remaining) < len(rows):
+            _write(path, b"", [row.to_json() for row in remaining])
 
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
@@ -137,41 +137,18 @@ def benchmarking(path: Path) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def measuring(path: Path, key: RowKey, wait: bool) -> Iterator[bool]:
-    """Lock one measurement of the file `path`, so that no two processes run it at once.
-
-    Args:
-        wait: wait until the lock is free, instead of giving up at once.
-
-    Yields:
-        Whether the lock is held.
-    """
-    digest = hashlib.sha256(str(key).encode()).hexdigest()[:16]
-    with claim(path.with_name(f"{path.name}.{digest}"), wait) as held:
-        yield held
-
-
-def _hashes(path: Path) -> set[object]:
-    return {value.get("hash") for _, value in read_lines(path) if isinstance(value, dict)}
-
-
 def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
-    before = path.read_bytes() if path.exists() else b""
-    if before and not before.endswith(b"\n"):
-        before += b"\n"
-    _write(path, before, values)
+    head = path.read_bytes() if path.exists() else b""
+    if head and not head.endswith(b"\n"):
+        head += b"\n"
+    _write(path, head, values)
 
 
-def _write(path: Path, before: bytes, values: Sequence[Mapping[str, Any]]) -> None:
+def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
     with atomic_file(path) as scratch, scratch.open("wb") as file:
-        file.write(before)
+        file.write(head)
         for value in values:
             line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
             file.write(line.encode() + b"\n")
-        _flush(file)
-
-
-def _flush(file: IO[bytes]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
+        file.flush()
+        os.fsync(file.fileno())

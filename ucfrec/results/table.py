@@ -47,21 +47,23 @@ class ResultTable:
         return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Draw one metric of every method with its 95% interval; needs ucfrec[plots].
+        """Draw one metric of every method with its 95% interval.
 
         Args:
             metric: name of a metric; None for the one that the rows are about.
             ax: matplotlib axes to draw on; None for new ones.
 
         Raises:
-            InputError: matplotlib is not installed, or no row has the metric.
+            InputError: no row has the metric.
         """
+        from matplotlib import pyplot
+
         metric, frame = metric or self.rows[0].metric, self.to_frame()
-        known = dict.fromkeys(name for row in self.rows for name in row.metrics)
-        if metric not in known:
-            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(known)}")
+        names = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        if metric not in names:
+            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(names)}")
         frame = frame[frame[metric].notna()].iloc[::-1]
-        axes = new_axes() if ax is None else ax
+        axes = pyplot.subplots()[1] if ax is None else ax
         low, high = (
             frame.get(f"{metric}_{end}", frame[metric]).fillna(frame[metric])
             for end in ("low", "high")
@@ -96,8 +98,8 @@ def _line(row: ResultRow) -> dict[str, Any]:
         line[name] = value
         if name in ends:
             line[f"{name}_low"], line[f"{name}_high"] = ends[name]
-    others = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
-    return {**line, **{name: value for name, value in others.items() if name not in line}}
+    fields = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
+    return {**line, **{name: value for name, value in fields.items() if name not in line}}
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,16 +127,3 @@ class Ranking(Measured):
         *("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate"),
         "coverage",
     )
-
-
-def new_axes() -> "Axes":
-    """New matplotlib axes.
-
-    Raises:
-        InputError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib import pyplot
-    except ModuleNotFoundError:
-        raise InputError("a plot needs matplotlib; install ucfrec[plots]") from None
-    return pyplot.subplots()[1]

@@ -60,12 +60,12 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
     body = [
         (
             trial.number,
-            f"{trial.value:.6g}" if trial.state.name == "COMPLETE" else _ended(trial),
+            f"{trial.value:.6g}" if trial.state.name == "COMPLETE" else _describe_end(trial),
             *(_short(trial.params.get(name)) for name in names),
         )
         for trial in trials
     ]
-    found = importances(study)
+    shares = importances(study)
     parts = [
         f"# Search on {plan.store}",
         f"Metric: {plan.metric}, the {METRICS[plan.metric]}. The best trial, "
@@ -74,8 +74,8 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
         f"To train it again: `{command}`",
         "## Importance",
         "Share of the variance of the metric between trials that a setting explains (fANOVA).",
-        markdown_table(("setting", "importance"), [(n, f"{v:.2f}") for n, v in found.items()])
-        if found
+        markdown_table(("setting", "importance"), [(n, f"{v:.2f}") for n, v in shares.items()])
+        if shares
         else "Too few trials to compare.",
         "## Trials",
         markdown_table(("trial", plan.metric, *names), body),
@@ -83,7 +83,7 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _ended(trial: Any) -> str:
+def _describe_end(trial: Any) -> str:
     if trial.state.name == "PRUNED":
         return "ended early"
     return str(trial.user_attrs.get("error", "interrupted"))[:80]

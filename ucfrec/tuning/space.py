@@ -113,8 +113,9 @@ def read_space(path: Path) -> Space:
         for field, values in fields.items():
             name = f"{table}.{field}"
             try:
-                named = values if isinstance(values, dict) else {"choices": tuple(values)}
-                space[name] = Dimension(**{**named, "choices": tuple(named.get("choices", ()))})
+                if not isinstance(values, dict):
+                    values = {"choices": values}
+                space[name] = Dimension(**{**values, "choices": tuple(values.get("choices", ()))})
             except TypeError:
                 raise InputError(
                     f"{path}: {name}: write a list of choices, or {{low = …, high = …, log = true}}"
@@ -137,7 +138,7 @@ class Search:
     """Setting to value."""
     by_value: bool
     seed: int
-    given: Space | None = None
+    own_space: Space | None = None
     """The space of every policy; None for each policy's default one."""
 
     def __post_init__(self) -> None:
@@ -147,8 +148,8 @@ class Search:
 
     def space(self, policy: str) -> Space:
         """The settings that vary: those of the space that are not fixed."""
-        space = default_space(policy, self.by_value) if self.given is None else self.given
-        return {name: each for name, each in space.items() if name not in self.fixed}
+        space = default_space(policy, self.by_value) if self.own_space is None else self.own_space
+        return {name: values for name, values in space.items() if name not in self.fixed}
 
     def config(self, policy: str, values: Mapping[str, Value]) -> Config:
         """The configuration with some values; a single value of a list stands for the list."""
@@ -174,5 +175,5 @@ class Search:
         policy = self.policies[0]
         if len(self.policies) > 1:
             policy = trial.suggest_categorical(POLICY, self.policies)
-        values = {name: each.suggest(trial, name) for name, each in self.space(policy).items()}
+        values = {name: choice.suggest(trial, name) for name, choice in self.space(policy).items()}
         return policy, values

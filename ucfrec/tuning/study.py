@@ -53,7 +53,7 @@ _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
 
-def measured(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
+def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
     """The metric of a finished run; higher is better.
 
     Args:
@@ -152,10 +152,14 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
             storage=plan.storage, study_name=_NAME, direction="maximize", load_if_exists=True
         )
         _require_same(study, plan, store)
-        _ended_again(study)
+        _enqueue_again(study)
         left = trials - len(finished(study))
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers)]
-        _searched(plan, [(n, share) for n, share in enumerate(shares) if share], len(study.trials))
+        _search(
+            plan,
+            [(n, share) for n, share in enumerate(shares) if share],
+            plan.search.seed + len(study.trials),
+        )
         _keep_best(study, plan)
     return study
 
@@ -186,7 +190,7 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
     spaces = {policy: search.space(policy) for policy in search.policies}
-    about = {
+    identity = {
         "store": store.record.fingerprint,
         "metric": plan.metric,
         "k": plan.k,
@@ -195,18 +199,18 @@ def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
             | {name: {n: asdict(d) for n, d in space.items()} for name, space in spaces.items()}
         ),
     }
-    before = study.user_attrs.get("about")
-    if before is None:
-        study.set_user_attr("about", about)
-    elif before != about:
-        changed = ", ".join(name for name in about if before.get(name) != about[name])
+    earlier = study.user_attrs.get("about")
+    if earlier is None:
+        study.set_user_attr("about", identity)
+    elif earlier != identity:
+        changed = ", ".join(n for n, value in identity.items() if earlier.get(n) != value)
         raise InputError(
             f"{plan.out} is a search with another {changed}; name another folder, or give the same "
             "options to go on"
         )
 
 
-def _ended_again(study: "Study") -> None:
+def _enqueue_again(study: "Study") -> None:
     """Trials that a killed or interrupted process left are run once more, first of all."""
     import optuna
 
@@ -222,24 +226,24 @@ def _ended_again(study: "Study") -> None:
     study.set_user_attr("again", sorted(again))
 
 
-def _searched(plan: Plan, shares: Sequence[tuple[int, int]], begun: int) -> None:
+def _search(plan: Plan, shares: Sequence[tuple[int, int]], seed: int) -> None:
     if len(shares) <= 1:
         for worker, share in shares:
-            _run_trials(plan, worker, share, begun)
+            _run_trials(plan, worker, share, seed)
         return
     threads = partial(torch.set_num_threads, max(1, torch.get_num_threads() // len(shares)))
     with pool_of_processes(len(shares), threads) as pool:
         with block_ctrl_c():
-            ended = [pool.submit(_run_trials, plan, *share, begun) for share in shares]
-        for each in ended:
-            each.result()
+            processes = [pool.submit(_run_trials, plan, *share, seed) for share in shares]
+        for process in processes:
+            process.result()
 
 
-def _run_trials(plan: Plan, worker: int, count: int, begun: int) -> None:
+def _run_trials(plan: Plan, worker: int, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
     optuna = _optuna()
     # A search that goes on must not draw the first points once more.
-    sampler = optuna.samplers.TPESampler(seed=plan.search.seed + begun + 1000 * worker)
+    sampler = optuna.samplers.TPESampler(seed=seed + 1000 * worker)
     study = optuna.load_study(storage=plan.storage, study_name=_NAME, sampler=sampler)
     store = EpisodeStore.open(plan.store)
     objective = partial(_objective, plan, store)
@@ -252,7 +256,7 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
     def stop_hopeless(step: int, logged: Mapping[str, float]) -> None:
         if plan.prune and "validation_loss" in logged:
             trial.report(logged["validation_loss"], step)
-            if _hopeless(trial.study, trial.number, policy):
+            if _is_hopeless(trial.study, trial.number, policy):
                 raise optuna.TrialPruned
 
     policy, values = plan.search.suggest(trial)
@@ -264,7 +268,7 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
         shared, heard = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
         with label_progress(f"trial {trial.number}"):
             train_run(store, run, config, shared=shared, callbacks=heard)
-            found = measured(TrainedPolicy.load(run), store, plan.metric, plan.k)
+            value = measure_run(TrainedPolicy.load(run), store, plan.metric, plan.k)
     except InputError as error:
         trial.set_user_attr("error", str(error))
         _remove(run)
@@ -272,9 +276,11 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
     except optuna.TrialPruned:
         _remove(run)
         raise
-    if any(each.value is not None and each.value >= found for each in _complete(trial.study)):
+    if any(
+        earlier.value is not None and earlier.value >= value for earlier in _complete(trial.study)
+    ):
         _remove(run)
-    return found
+    return value
 
 
 def _remove(run: Path | None) -> None:
@@ -283,10 +289,10 @@ def _remove(run: Path | None) -> None:
 
 
 def _complete(study: "Study") -> "list[FrozenTrial]":
-    return [each for each in study.trials if each.state.name == "COMPLETE"]
+    return [trial for trial in study.trials if trial.state.name == "COMPLETE"]
 
 
-def _hopeless(study: "Study", number: int, policy: str) -> bool:
+def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
     """Whether the loss of a trial is above the median of earlier ones of its policy at that step.
 
     Losses of different policies are not of the same quantity.
@@ -294,14 +300,14 @@ def _hopeless(study: "Study", number: int, policy: str) -> bool:
     trials = study.get_trials(deepcopy=False)
     curve = trials[number].intermediate_values
     step = max(curve)
-    others = [
-        each.intermediate_values[step]
-        for each in trials
-        if each.number != number
-        and each.user_attrs.get(POLICY) == policy
-        and step in each.intermediate_values
+    losses = [
+        trial.intermediate_values[step]
+        for trial in trials
+        if trial.number != number
+        and trial.user_attrs.get(POLICY) == policy
+        and step in trial.intermediate_values
     ]
-    return len(others) >= _COMPARED and curve[step] > float(np.median(others))
+    return len(losses) >= _COMPARED and curve[step] > float(np.median(losses))
 
 
 def _keep_best(study: "Study", plan: Plan) -> None:

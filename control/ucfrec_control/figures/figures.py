@@ -13,7 +13,7 @@ from ucfrec.benchmark.tables import of_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.plot_style import label, save
+from ucfrec.reporting.plot_style import save
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_results
 from ucfrec.results.statistics import grouped
@@ -74,7 +74,7 @@ class _Run:
 
     @property
     def title(self) -> str:
-        return f"{label(self.method)} on {self.task}"
+        return f"{plots.label(self.method)} on {self.task}"
 
 
 def make_figures(

@@ -1,7 +1,8 @@
 """Rows and arrays to figures: every function returns one matplotlib Figure."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -12,22 +13,63 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ucfrec.arrays import Float64Array
-from ucfrec.reporting.plot_style import (
-    COLUMN,
-    EDITED,
-    FACTUAL,
-    OURS,
-    PAGE,
-    PLAIN,
-    colors,
-    label,
-    styled,
-)
+from ucfrec.reporting.plot_style import COLUMN, OURS, PAGE, PLAIN, styled
 from ucfrec.results.statistics import summary
 
 Row = Mapping[str, Any]
+FACTUAL, EDITED = "#0072B2", "#D55E00"
+# The color-blind-safe palette of Okabe and Ito (2008).
+_PALETTE = (
+    *("#0072B2", "#E69F00", "#009E73", "#D55E00"),
+    *("#CC79A7", "#56B4E9", "#000000", "#8C8C8C"),
+)
+# A method or condition has the same color in all figures.
+_FIXED = {
+    "bc": "#8C8C8C",
+    "dt": "#0072B2",
+    "dc": "#56B4E9",
+    "lsdt": "#009E73",
+    "ucf": "#D55E00",
+    "ucf-screened": "#CC79A7",
+    "ucf-dropped": "#F0E442",
+    "ucf-wo-count": "#E69F00",
+    "ucf-no-augmentation": "#E69F00",
+    "ucf-wo-arch": "#000000",
+    "dt-augmented": "#000000",
+    "none": "#8C8C8C",
+    "deterministic": "#0072B2",
+    "stochastic": "#56B4E9",
+    "early": "#E69F00",
+}
+_LABELS = {
+    "bc": "BC",
+    "dt": "DT",
+    "dc": "DC",
+    "lsdt": "LSDT",
+    "ucf": "UCF",
+    "ucf-screened": "UCF, screened",
+    "ucf-dropped": "UCF, dropped",
+    "ucf-wo-count": "w/o Count",
+    "ucf-no-augmentation": "w/o Count",
+    "ucf-wo-arch": "w/o Arch",
+    "dt-augmented": "w/o Arch",
+    "none": "no distractor",
+}
 _PANELS = 3
 """Most datasets side by side."""
+
+
+def label(name: str) -> str:
+    """Display name of a method or condition in figures."""
+    return _LABELS.get(name, name)
+
+
+def colors(names: Iterable[str]) -> dict[str, str]:
+    """Name to color: the fixed color of the name, else an unused color of the palette."""
+    listed = list(names)
+    taken = {_FIXED.get(name) for name in listed}
+    free = cycle([color for color in _PALETTE if color not in taken] or _PALETTE)
+    return {name: _FIXED.get(name) or next(free) for name in listed}
 
 
 @styled

@@ -6,7 +6,7 @@ from typing import Final
 from ucfrec.benchmark.plots import plot_distractor, plot_methods
 from ucfrec.benchmark.suite import Benchmark, Shown
 from ucfrec.benchmark.tables import distractor_table, method_table, sweep_table
-from ucfrec_simulators.benchmark.budgets import BUDGETS, COSTS
+from ucfrec_simulators.benchmark.budgets import BUDGETS
 from ucfrec_simulators.benchmark.measure import MEASUREMENT
 from ucfrec_simulators.benchmark.methods import COMPONENTS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
@@ -28,5 +28,4 @@ BENCHMARK: Final = Benchmark(
     methods={**METHODS, **COMPONENTS, **SCREENED},
     plan=RecommendationCells,
     how=MEASUREMENT,
-    costs=COSTS,
 )

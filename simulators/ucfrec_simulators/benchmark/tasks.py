@@ -1,6 +1,6 @@
 """The benchmark tasks: a store to train on, and the environments to evaluate in."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,12 @@ exit, and exit rules that look back four items and one instead of ten."""
 KUAIRAND: Final = tuple(f"kuairand{preset}" for preset in EXIT_PRESETS)
 KUAIREC: Final = tuple(f"kuairec{preset}" for preset in EXIT_PRESETS)
 REFERENCES: Final = tuple(BEHAVIORS)
+_REFERENCES: Final = {
+    "virtual-taobao": ("random", "mixture", "best-constant"),
+    "synthetic-taobao": ("random", "mixture", "best-constant", "optimal"),
+    "synthetic-catalog": ("random", "mixture", "optimal"),
+}
+"""Built-in policies that are evaluated beside those trained on the mixture of an environment."""
 # Midnight in China (ms). The column `date` changes up to an hour too early, so it is not used.
 _APRIL_22, _APRIL_28 = 1_650_556_800_000, 1_651_075_200_000
 
@@ -48,27 +54,15 @@ class Log:
     """Number of parts of a given log; 1 for all of it."""
 
 
-def virtual_taobao(folder: Path, log: Log) -> Task:
-    """VirtualTaobao's published networks, with logs of the mixture of behaviors."""
-    environment = Environment("virtual-taobao")
+def built_in(name: str, behaviors: Sequence[str], folder: Path, log: Log) -> Task:
+    """An environment of this package that needs no logs, with logs of its mixture of behaviors.
+
+    Args:
+        behaviors: built-in policies that are evaluated as references.
+    """
+    environment = Environment(name)
     store = simulated_store(environment, folder, log.sessions, log.seed)
-    return Task(environment.title, store, (environment,), ("random", "mixture", "best-constant"))
-
-
-def synthetic_taobao(folder: Path, log: Log) -> Task:
-    """SyntheticTaobao, with logs of the mixture of behaviors; the optimal policy is known."""
-    environment = Environment("synthetic-taobao")
-    store = simulated_store(environment, folder, log.sessions, log.seed)
-    return Task(
-        environment.title, store, (environment,), ("random", "mixture", "best-constant", "optimal")
-    )
-
-
-def synthetic_catalog(folder: Path, log: Log) -> Task:
-    """SyntheticCatalog, with logs of the mixture of behaviors; the optimal policy is known."""
-    environment = Environment("synthetic-catalog")
-    store = simulated_store(environment, folder, log.sessions, log.seed)
-    return Task(environment.title, store, (environment,), ("random", "mixture", "optimal"))
+    return Task(environment.title, store, (environment,), tuple(behaviors))
 
 
 def sardine(name: str, folder: Path, log: Log) -> Task:
@@ -167,9 +161,7 @@ def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], stor
 TASKS: Final[Mapping[str, Callable[[Path, Log], Task]]] = {
     "kuairand": kuairand,
     "kuairec": kuairec,
-    "virtual-taobao": virtual_taobao,
-    "synthetic-taobao": synthetic_taobao,
-    "synthetic-catalog": synthetic_catalog,
+    **{name: partial(built_in, name, own) for name, own in _REFERENCES.items()},
     "sardine-static": partial(sardine, "sardine-static"),
     "sardine-boredinf": partial(sardine, "sardine-boredinf"),
 }

@@ -18,15 +18,28 @@ MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
 """Whose tags `random-mask` excludes: those of the last ten items, in every environment."""
 
 
-class RandomMask(Memoryless):
+class _Insider(Memoryless):
+    """A policy that reads the environment itself, not what `info` says of it.
+
+    Raises:
+        InputError: `env` is not a Kuaishou environment.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+        if not isinstance(env.unwrapped, KuaiEnv):
+            raise InputError(f"this behavior policy serves KuaiEnv, not {type(env).__name__}")
+        self._environment, self._generator = env.unwrapped, np.random.default_rng([seed, 1])
+
+    def inform(self, info: Mapping[str, Any]) -> None:
+        """Do nothing."""
+
+
+class RandomMask(_Insider):
     """A uniformly random item without a tag of the last ten, and that is not masked.
 
     If there is none, any item that is not masked. It uses no rewards: a baseline for what not
     repeating itself is worth.
     """
-
-    def __init__(self, environment: KuaiEnv, seed: int) -> None:
-        self._environment, self._generator = environment, np.random.default_rng([seed, 1])
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         """An item of each session, (N,)."""
@@ -35,20 +48,14 @@ class RandomMask(Memoryless):
         self._environment.leave_out_masked(drawn)
         return drawn.argmax(axis=1), None
 
-    def inform(self, info: Mapping[str, Any]) -> None:
-        """Do nothing: the environment itself is read instead of `info`."""
 
-
-class Oracle(Memoryless):
+class Oracle(_Insider):
     """The item of highest true reward that is not masked and does not end the session.
 
     It reads the environment's rewards, which no recommender can. It is greedy and so not optimal:
     it does not plan beyond the current step. If every item left ends the session, it shows the one
     of highest reward.
     """
-
-    def __init__(self, environment: KuaiEnv) -> None:
-        self._environment = environment
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, None]:
         """The best item of each session, (N,)."""
@@ -63,38 +70,11 @@ class Oracle(Memoryless):
         environment.leave_out_masked(rewards)
         return rewards.argmax(axis=1), None
 
-    def inform(self, info: Mapping[str, Any]) -> None:
-        """Do nothing: the environment itself is read instead of `info`."""
-
-
-def oracle(env: VectorEnv[Any, Any, Any], seed: int) -> Oracle:
-    """The greedy policy that knows every reward; `seed` is unused.
-
-    Raises:
-        InputError: `env` is not a Kuaishou environment.
-    """
-    return Oracle(_environment(env))
-
-
-def random_mask(env: VectorEnv[Any, Any, Any], seed: int) -> RandomMask:
-    """Random items whose tags were not shown lately.
-
-    Raises:
-        InputError: `env` is not a Kuaishou environment.
-    """
-    return RandomMask(_environment(env), seed)
-
-
-def _environment(env: VectorEnv[Any, Any, Any]) -> KuaiEnv:
-    if not isinstance(env.unwrapped, KuaiEnv):
-        raise InputError(f"this behavior policy serves KuaiEnv, not {type(env).__name__}")
-    return env.unwrapped
-
 
 BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
     "random": Uniform,
-    "random-mask": random_mask,
-    "oracle": oracle,
+    "random-mask": RandomMask,
+    "oracle": Oracle,
 }
 """Built-in policies of the Kuaishou environments."""
 
@@ -119,7 +99,7 @@ def simulators(
     variants += [("FB", four), ("NX_0", four), ("FB", one), ("NX_0", one)]
     return tuple(
         Simulator(
-            summary=f"{summary}; {_described(regime, exit_rule)}",
+            summary=f"{summary}; {_describe(regime, exit_rule)}",
             make=partial(make, exit_rule=exit_rule, regime=REGIMES[regime]),
             behaviors=BEHAVIORS,
             feedback=feedback,
@@ -128,7 +108,7 @@ def simulators(
     )
 
 
-def _described(regime: str, exit_rule: ExitRule) -> str:
+def _describe(regime: str, exit_rule: ExitRule) -> str:
     """A regime, by its name, and an exit rule, in words."""
     if REGIMES[regime].steps is not None:
         return f"regime {regime}"

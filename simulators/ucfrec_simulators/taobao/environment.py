@@ -2,15 +2,18 @@
 interface."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from ucfrec.acting.rollout import Actor
+from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec_simulators.behaviors import Constant
+from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, repeat_action
 from ucfrec_simulators.session_env import SessionsEnv
 
 ATTRIBUTES: Final = (8, 8, 11, 11, 11, 11, 2, 2, 3, 18, 3)
@@ -108,11 +111,6 @@ def taobao(env: VectorEnv[Any, Any, Any]) -> TaobaoEnv:
     return env.unwrapped
 
 
-def default_action() -> Float32Array:
-    """An untuned weight vector (27,): one fixed uniform draw from [−1, 1]^27."""
-    return np.random.default_rng([0, 11]).uniform(-1, 1, ACTION_DIM).astype(np.float32)
-
-
 def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
     """The constant action vector (27,) with the highest expected clicks over all users' pages.
 
@@ -149,15 +147,34 @@ def best_constant(env: TaobaoEnv, seed: int) -> Float32Array:
     return optima[int(np.argmax(mean_clicks(np.stack(optima), 10 * pages)))]
 
 
-def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
+def mix_blends(
+    env: VectorEnv[Any, Any, Any],
+    seed: int,
+    best: Actor,
+    uniform: float,
+    qualities: Sequence[tuple[float, float, float]],
+) -> SessionMixture:
+    """Uniform actions in a share of the sessions, in others noisy blends of an untuned constant
+    with the actions of `best`.
+
+    Args:
+        qualities: quality, noise and share of sessions of each blend.
+    """
+    default = np.random.default_rng([0, 11]).uniform(-1, 1, ACTION_DIM).astype(np.float32)
+    blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in qualities]
+    shares = [uniform, *(share for _, _, share in qualities)]
+    return SessionMixture([Uniform(env, seed), *blends], shares, seed)
+
+
+def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
     """A policy that always takes the zero action; `seed` is unused."""
-    return Constant(np.zeros(ACTION_DIM, dtype=np.float32))
+    return repeat_action(np.zeros(ACTION_DIM, dtype=np.float32))
 
 
-def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Constant:
+def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
     """A non-personalised baseline: always the action of `best_constant`.
 
     Raises:
         InputError: `env` is not a Taobao environment.
     """
-    return Constant(best_constant(taobao(env), seed))
+    return repeat_action(best_constant(taobao(env), seed))

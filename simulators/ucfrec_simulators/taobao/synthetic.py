@@ -1,15 +1,13 @@
 """A synthetic Taobao environment, without downloads and with a known optimal policy."""
 
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture
+from ucfrec_simulators.behaviors import Rule, SessionMixture
 from ucfrec_simulators.session_env import draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
@@ -20,7 +18,7 @@ from ucfrec_simulators.taobao.environment import (
     PAGE_INDICES,
     USER_BITS,
     TaobaoEnv,
-    default_action,
+    mix_blends,
     split_observations,
     taobao,
 )
@@ -120,20 +118,12 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant
     and the user's best action (`QUALITIES`).
     """
-    best, default = optimal(env, seed), default_action()
-    blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
-    return SessionMixture(
-        [Uniform(env, seed), *blends], [0.2, *(share for _, _, share in QUALITIES)], seed
-    )
-
-
-def _make(num_envs: int, folder: Path | None) -> SyntheticTaobao:
-    return SyntheticTaobao(num_envs)
+    return mix_blends(env, seed, optimal(env, seed), 0.2, QUALITIES)
 
 
 SIMULATOR: Final = Simulator(
     summary="built-in users with a known best action: 27 ranking weights per page, 0-10 clicks",
-    make=_make,
+    make=lambda num_envs, folder: SyntheticTaobao(num_envs),
     behaviors={**ddpg.COMMON, "mixture": mixture, "optimal": optimal},
     feedback="clicks",
 )

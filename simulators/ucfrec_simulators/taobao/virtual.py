@@ -9,11 +9,10 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec_simulators.behaviors import Blend, SessionMixture
+from ucfrec_simulators.behaviors import SessionMixture
 from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.session_env import draw_categories
 from ucfrec_simulators.taobao import ddpg
@@ -26,7 +25,7 @@ from ucfrec_simulators.taobao.environment import (
     USER_BITS,
     TaobaoEnv,
     best_constant_actor,
-    default_action,
+    mix_blends,
 )
 
 SOURCE: Final = "https://github.com/eyounx/VirtualTaobao (virtualTB/data)"
@@ -154,11 +153,7 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     best constant (`QUALITIES`).
     """
     # The search has a fixed seed, so that `seed` does not change the policy's quality.
-    best, default = best_constant_actor(env, 0), default_action()
-    blends = [Blend(best, default, quality, noise, seed) for quality, noise, _ in QUALITIES]
-    return SessionMixture(
-        [Uniform(env, seed), *blends], [0.25, *(share for _, _, share in QUALITIES)], seed
-    )
+    return mix_blends(env, seed, best_constant_actor(env, 0), 0.25, QUALITIES)
 
 
 SIMULATOR: Final = Simulator(

@@ -13,7 +13,7 @@ from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
-from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, announcement, estimated_hours, show
+from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -27,7 +27,7 @@ from ucfrec.results.rows_file import append_rows, read_rows
 from ucfrec.runs.record import RUN, read_record
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.budgets import BUDGETS, COSTS
+from ucfrec_simulators.benchmark.budgets import BUDGETS
 from ucfrec_simulators.benchmark.measure import measure
 from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
@@ -214,13 +214,14 @@ def test_every_cell_of_every_table_has_a_configuration(
 
 
 @pytest.mark.usefixtures("no_data")
-def test_a_task_that_the_budget_leaves_out_is_swept_if_it_is_named(tmp_path: Path) -> None:
-    budget = replace(TINY, seeds=1)
-    assert {cell.task for cell in planned(tmp_path, budget).cells("sweeps")} == {
-        "synthetic-catalog"
-    }
-    named = planned(tmp_path, budget, tasks=["synthetic-taobao"])
-    assert {cell.task for cell in named.cells("sweeps")} == {"synthetic-taobao"}
+@pytest.mark.parametrize("table", ["main", "sweeps"])
+def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
+    tmp_path: Path, table: str
+) -> None:
+    for task in ("synthetic-catalog", "synthetic-taobao"):
+        plan = planned(tmp_path, replace(TINY, seeds=1), tasks=[task])
+        assert {cell.task for cell in plan.cells(table)} == {task}
+        assert plan.missing() == []
 
 
 @pytest.mark.slow
@@ -279,31 +280,6 @@ def test_tables_of_rows_at_hand_are_shown_without_measuring(
     assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
     assert main([*arguments, "--table", "sweeps"]) == 2
     assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
-
-
-def test_time_is_told_of_runs_once(tmp_path: Path) -> None:
-    budget = replace(TINY, seeds=1, tasks=("synthetic-catalog",))
-    cells = [
-        cell for cell in planned(tmp_path, budget).cells("main") if cell.method in ("dt", "ucf")
-    ]
-    dt, ucf = (estimated_hours([cell], COSTS) for cell in cells)
-    assert 0 < dt < ucf
-    again = [replace(cell, table="shared") for cell in cells]
-    shared = estimated_hours([*cells, *again], COSTS) - dt - ucf
-    assert 0 < shared < ucf
-    other = replace(cells[1], run=tmp_path / "other", settings=(*cells[1].settings, "policy.dim=8"))
-    assert (
-        ucf < estimated_hours([cells[1], other], COSTS) < 2 * ucf - 20 / 3600
-    )  # copies are made once
-    assert "about 0.0 hours with --workers 2" in announcement(COSTS, 2)(cells)
-    assert cells[1].run is not None
-    cells[1].run.mkdir(parents=True)
-    (cells[1].run / "run.json").write_text('{"config": {}}')
-    assert estimated_hours([cells[1]], COSTS) == ucf, "a training that was interrupted counts"
-    (cells[1].run / "run.json").write_text('{"config": {}, "policy": {}}')
-    assert 0 < estimated_hours([cells[1]], COSTS) < dt, (
-        "only the evaluation is left of a finished run"
-    )
 
 
 def test_a_given_log_is_dealt_out_by_session() -> None:
@@ -369,12 +345,3 @@ def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path
             suite,
             BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given),
         )
-
-
-def test_one_task_has_the_cells_of_its_methods_alone(tmp_path: Path) -> None:
-    budget = replace(BUDGETS["small"], seeds=1, logs=1, sessions=60)
-    # The second is no task of the budget, but was requested.
-    for task in ("synthetic-catalog", "synthetic-taobao"):
-        plan = planned(tmp_path, budget, tasks=[task])
-        assert {cell.task for cell in plan.cells("main")} == {task}
-        assert plan.missing() == []

@@ -19,7 +19,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
-from ucfrec_simulators.kuai.behaviors import oracle
+from ucfrec_simulators.kuai.behaviors import Oracle
 from ucfrec_simulators.kuai.completion import CompletionConfig, complete
 from ucfrec_simulators.kuai.environment import REGIMES
 from ucfrec_simulators.kuai.kuairand import kuairand, main, read_tags
@@ -65,7 +65,7 @@ def test_planted_clicks_are_found_and_the_environment_pays_them(tmp_path: Path) 
     liked = (env.user_ids[users] % 2) == (env.item_ids[items] % 2)
     assert paid[liked].mean() > 0.8
     assert paid[~liked].mean() < 0.2
-    best = rollout(env, oracle(env, 0), 64, 0).returns.mean()
+    best = rollout(env, Oracle(env, 0), 64, 0).returns.mean()
     assert best > 2 * rollout(env, Uniform(env, 0), 64, 0).returns.mean()
 
 
@@ -115,7 +115,7 @@ def test_real_rows_make_a_environment_that_can_be_believed(
     assert max(map(len, tags.values())) <= 3
     for regime in REGIMES.values():
         env = kuairand(16, tmp_path / "environment", regime=regime)
-        best = rollout(env, oracle(env, 0), 16, 0)
+        best = rollout(env, Oracle(env, 0), 16, 0)
         dull = rollout(env, Uniform(env, 0), 16, 0)
         assert best.returns.mean() > 1.3 * dull.returns.mean()
         assert 0 < dull.returns.sum() / dull.lengths.sum() < 1

@@ -1,0 +1,194 @@
+"""What the report shows of a training: quality of the data, curves and augmentation."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Final
+
+from ucfrec.counterfactual.state_augmentation import AugmentationReport
+from ucfrec.episodes.record import Source
+from ucfrec.logs.kept import REASONS
+from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
+from ucfrec.reporting.tables import Table, format_value
+
+Curves = Mapping[str, Mapping[int, float]]
+"""{name: {step: value}}, as from `ucfrec.fitting.metrics_log.read_metrics`."""
+POINTS: Final = 200
+"""Most points of a drawn curve."""
+REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}
+"""Key to display name of the reference losses of `ucfrec.runs.start.reference_losses`."""
+_TITLES: Final = {
+    "validation_loss": "Validation loss (action, held-out steps)",
+    "action_loss": "Training loss of the action (one batch)",
+    "attention_on_parents": "Attention mass on the causal parents (1: all of it)",
+    "uniform_on_parents": "Attention mass on the causal parents, were it uniform",
+    "mask_loss": "Mask loss of the attention (Eq. 5)",
+    "loss": "Training loss, all terms",
+    "gradient_norm": "Gradient norm before clipping",
+    "samples_per_second": "Samples per second",
+    "waiting_for_data": "Share of time waiting for data",
+}
+"""Logged name to title, in the order of the page; other curves follow."""
+_LOSS_WEIGHTS: Final = {"mask_loss": "lambda_mask", "reward_loss": "reward_weight"}
+"""Loss to the policy setting that is its weight; with weight 0 it is not trained on."""
+_DISTRIBUTIONS: Final = {
+    "session_lengths": ("Sessions by length", "steps of a session"),
+    "rewards": ("Steps by reward", "reward"),
+    "item_popularity": ("Items by popularity", "steps that show the item"),
+}
+"""Name of a distribution in the `summary` of `prepare` to its title and x-axis label."""
+_LEVELS: Final = ("0", "0.25", "0.5", "0.75", "0.99", "1")
+_COUNTS: Final = {
+    "rows_read": "rows read",
+    "unsorted_rows": "rows out of order (sorted)",
+    "equal_times": "rows at equal times (in no order that could be learned)",
+    "steps": "steps kept",
+    "users": "users",
+    "items": "items",
+    "sessions": "sessions",
+    "sessions_cut": "sessions cut at a split",
+    "unknown_propensities": "steps with an unknown propensity",
+}
+_REASONS: Final = {
+    **REASONS,
+    "long_session": "its session, or the part of it in one split, is too long",
+    "short_episode": "its session, or the part of it in one split, is too short",
+}
+
+
+def tabulate_rows(source: Source) -> list[Table]:
+    """Tables of the rows that `prepare` read and dropped; none of a store that it did not make."""
+    total = source.rows_read
+    if total is None:
+        return []
+    counts = [(name, getattr(source, key)) for key, name in _COUNTS.items()]
+    dropped = [
+        (
+            f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}",
+            [format_value(rows), f"{rows / total:.2%}" if total else "–"],
+        )
+        for reason, rows in source.dropped.items()
+    ]
+    rows = [(name, [format_value(count)]) for name, count in counts if count is not None]
+    return [
+        Table("Rows of the logs", "", ["count"], rows),
+        Table("Rows dropped, by reason", "", ["rows", "share of rows read"], dropped),
+    ]
+
+
+def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table | None]:
+    """Chart and table of each distribution that `prepare` summarised, and their quantiles."""
+    pictures, quantiles = [], []
+    for name, (title, x_label) in _DISTRIBUTIONS.items():
+        values = source.summary.get(name) if source.rows_read is not None else None
+        if values is None:
+            continue
+        levels = [format_value(values.quantiles.get(level)) for level in _LEVELS]
+        quantiles.append((title, levels))
+        if total := sum(values.counts):
+            bins = name_bins(values.edges, values.values)
+            cells = [[format_value(count), f"{count / total:.2%}"] for count in values.counts]
+            table = Table(title, x_label, ["count", "share"], list(zip(bins, cells, strict=True)))
+            pictures.append((histogram(title, x_label, values.counts, bins), table))
+    columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
+    return pictures, Table("Quantiles", "", columns, quantiles) if quantiles else None
+
+
+def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
+    """The curves to draw: no loss of weight 0, and no total loss that equals a single term."""
+    policy = config["policy"]
+    unused = {loss for loss, weight in _LOSS_WEIGHTS.items() if policy.get(weight) == 0}
+    curves = {name: curve for name, curve in logged.items() if name not in unused}
+    if curves.get("loss") in [curve for name, curve in curves.items() if name != "loss"]:
+        del curves["loss"]
+    return curves
+
+
+def draw_curves(
+    names: Sequence[str], logged: Sequence[Curves], references: Sequence[Mapping[str, float]]
+) -> list[tuple[Chart, Table]]:
+    """Chart and table of every scalar that at least one run logged.
+
+    Args:
+        names: (R,) names of runs on the same data.
+        logged: (R,) curves that each run logged.
+        references: (R,) losses (nats) of showing items uniformly and by popularity, by key of
+            `REFERENCES`; empty if the loss of the run is not comparable.
+    """
+    scalars = {name for curves in logged for name in curves}
+    pictures = []
+    for name in sorted(scalars, key=lambda n: ([*_TITLES, n].index(n), n)):
+        thinned = {style: _thin(run[name]) for style, run in enumerate(logged) if name in run}
+        curves = {style: curve for style, curve in thinned.items() if curve}
+        if not curves:
+            continue
+        title = _TITLES.get(name, name)
+        levels = {}
+        if name in ("validation_loss", "action_loss"):
+            first, *further = (references[style] for style in curves)
+            if all(losses == first for losses in further):
+                levels = {REFERENCES[key]: first[key] for key in REFERENCES if key in first}
+        lines = [(names[style], style, curve) for style, curve in curves.items()]
+        steps = sorted({step for curve in curves.values() for step in curve})
+        rows = [(f"{s:g}", [format_value(c.get(s)) for c in curves.values()]) for s in steps]
+        table = Table(title, "step", [names[style] for style in curves], rows)
+        pictures.append((line_chart(title, "step", lines, levels), table))
+    return pictures
+
+
+def _thin(curve: Mapping[int, float]) -> dict[float, float]:
+    """The finite points; at most `POINTS` of them, evenly spaced and including the last."""
+    points = [(float(at), value) for at, value in sorted(curve.items()) if math.isfinite(value)]
+    every = -(-len(points) // POINTS) or 1
+    return dict(points[::-1][::every][::-1])
+
+
+def tabulate_augmentation(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Table:
+    """Quality of the reward model and of the edits, one column per run (name, style, report)."""
+    reports = [report for _, _, report in runs]
+    models, moves = [r.reward_model for r in reports], [r.moves for r in reports]
+    actions = [r.actions for r in reports]
+    rows: list[tuple[str, list[Any]]] = [
+        ("R² of the reward model, from state and action", [m.r2_without_z for m in models]),
+        ("R² with the abduced z, which has seen the reward", [m.r2 for m in models]),
+        ("standard deviation of the reward", [m.reward_std for m in models]),
+        ("active latent dimensions",
+         [f"{m.active_dimensions} of {m.latent_dim}" for m in models]),
+        ("share of z in the reward's variance", [m.z_share for m in models]),
+        ("leak: correlation of z with E[r | s, a]", [m.z_leak for m in models]),
+        ("augmented episodes", [r.copies for r in reports]),
+        ("accepted edits", [m.edits for m in moves]),
+        ("acceptance (share of proposals)", [r.acceptance for r in reports]),
+        ("δ, error of the reward model", [r.delta for r in reports]),
+        ("ε_r, tolerance of the gate", [r.epsilon_r for r in reports]),
+        ("bound δ + ε_r", [r.bound for r in reports]),
+        ("mean-move ratio (1: one shift for all states)", [m.mean_move_ratio for m in moves]),
+        ("effective rank of the moves",
+         [f"{format_value(m.effective_rank)} of {m.dimensions}" for m in moves]),
+        ("median length of a move ‖Δ‖₂", [m.length_quantiles.get("0.5") for m in moves]),
+    ]  # fmt: skip
+    if any(actions):
+        rows += [
+            ("other actions proposed", [a and a.proposals for a in actions]),
+            ("copies with another action", [a and a.copies for a in actions]),
+            ("mean change of their reward", [a and a.mean_change for a in actions]),
+            ("share of them with a higher reward", [a and a.earns_more for a in actions]),
+        ]
+    body = [(name, [format_value(value) for value in values]) for name, values in rows]
+    caption = (
+        "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
+    )
+    return Table(caption, "", [name for name, _, _ in runs], body)
+
+
+def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | None:
+    """Distribution of the edit length ‖Δ‖₂ in runs (name, style, report); None without any edit."""
+    curves = []
+    for name, style, report in runs:
+        moves = report.moves
+        if moves.edits:
+            centers = [(low + high) / 2 for low, high in pairwise(moves.histogram_edges)]
+            shares = [count / moves.edits for count in moves.histogram_counts]
+            curves.append((name, style, dict(zip(centers, shares, strict=True))))
+    title = "Accepted edits by the length of their move"
+    return line_chart(title, "‖Δ‖₂", curves) if curves else None

@@ -1,5 +1,6 @@
 """The command line as a stranger meets it: small logs, real commands, clear refusals."""
 
+import json
 import os
 import re
 import shutil
@@ -11,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from safetensors.numpy import load_file
 
+from ucfrec import Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.evaluation.environment import Environment
@@ -220,6 +223,64 @@ def test_score_tells_the_probability_of_every_choice(
     own = pd.read_parquet(out)
     assert main([*arguments, "--temperature", str(rule.temperature)]) == 0
     pd.testing.assert_frame_equal(own, pd.read_parquet(out))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("train", "rank")),
+        *("ope", "evaluate", "recommend", "score"),
+    ],
+)
+def test_a_command_does_what_the_python_api_does(
+    folder: Path, catalog: tuple[str, Path], command: str, tmp_path: Path
+) -> None:
+    """The same numbers, and the same files: two copies of a run end with equal model cards."""
+    environment, logs = "synthetic-catalog", tmp_path / "logs.parquet"
+    pd.read_parquet(catalog[1]).head(400).to_parquet(logs)
+    runs = [tmp_path / place / "run" for place in ("of-command", "of-api")]
+    for run in runs:
+        shutil.copytree(catalog[0], run)
+    policy, out = Recommender.load(runs[1]), tmp_path / "out"
+    if command == "train":
+        shutil.rmtree(runs[1])
+        store = folder / f"{environment}-store"
+        Recommender(settings=TINY).fit(store, runs[1], refit=True)
+        weights = [sorted(run.rglob("*.safetensors")) for run in runs]
+        assert len(weights[0]) > 2
+        for one, other in zip(*weights, strict=True):
+            tensors = load_file(one)
+            for name, tensor in load_file(other).items():
+                np.testing.assert_array_equal(tensors[name], tensor)
+    elif command in ("recommend", "score"):
+        assert main([command, str(runs[0]), str(logs), "--out", str(out)]) == 0
+        log = pd.read_parquet(logs)
+        frame = policy.recommend(log) if command == "recommend" else policy.score(log)
+        written = pd.read_parquet(out)
+        same = [name for name in frame if name != "request_id"]
+        pd.testing.assert_frame_equal(written[same], frame[same], check_dtype=False)
+    else:
+        seeded = ["--seed", "2", "--json", str(out)]
+        if command == "evaluate":
+            few = ["--env", environment, "--episodes", "20", "--behavior", "random"]
+            assert main([command, str(runs[0]), *few, *seeded]) == 0
+            policy.evaluate(environment, 20, behaviors="random", seed=2).save(tmp_path / "api")
+        else:
+            assert main([command, str(runs[0]), str(logs), *seeded]) == 0
+            result = policy.rank(logs, seed=2) if command == "rank" else policy.ope(logs, seed=2)
+            result.save(tmp_path / "api")
+        assert _numbers(out) == _numbers(tmp_path / "api")
+    cards = [(run / "MODEL_CARD.md").read_text() for run in runs]
+    assert cards[0] == cards[1]
+
+
+def _numbers(file: Path) -> list[dict[str, object]]:
+    """Result rows as texts, without what differs between two runs of a command."""
+    rows = json.loads(file.read_text())
+    for row in rows:
+        row.get("details", {}).pop("candidate", None)
+    passing = ("command", "wall_time_s")
+    return [{n: repr(value) for n, value in row.items() if n not in passing} for row in rows]
 
 
 def estimates_in(out: Path) -> dict[str, ResultRow]:

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
     """
-    from ucfrec.python_api.measuring import evaluate_in
+    from ucfrec.reporting.measuring import evaluate_in
     from ucfrec.reporting.tables import evaluation_table
     from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from ucfrec.off_policy.evaluate import EstimateOptions
     from ucfrec.off_policy.selection import choose, names_of
-    from ucfrec.python_api.measuring import TEST_SPLIT, estimate_return
+    from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
     from ucfrec.results.rows_file import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.logs.summary import format_summary
     from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
     from ucfrec.provenance import shorten_paths
-    from ucfrec.python_api.measuring import TEST_SPLIT, rank_policies
+    from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     runs = runs_given(options)

@@ -33,11 +33,7 @@ from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles
-from ucfrec.off_policy.evaluate import (
-    DEFAULTS,
-    EstimateOptions,
-    OffPolicyReport,
-)
+from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import shorten_paths
@@ -52,11 +48,11 @@ from ucfrec.python_api.given_data import (
     split_given,
     store_given,
 )
-from ucfrec.python_api.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.python_api.run_folders import Scratch, kept_beside
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
+from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable

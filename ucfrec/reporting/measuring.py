@@ -6,18 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.liked import LikedExpression
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.evaluation.ranking_table import ranking_rows
-from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.expressions import Expression
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy
 from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen
 from ucfrec.off_policy.scored import evaluate_scored
 from ucfrec.provenance import shorten_paths
-from ucfrec.reporting.cards import card_of_estimates, card_of_evaluation, card_of_ranking
+from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking
 from ucfrec.results.table import Evaluation, Ranking
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -69,7 +69,7 @@ def rank_policies(
         doubts = [] if logs == TEST_SPLIT else seen_too_often(share_seen(policy, logged.store))
         if logged.history_lacking and number == 0:
             doubts.append(logged.history_lacking)
-        card_of_ranking(policy.folder, row, logs, doubts)
+        add_ranking(policy.folder, row, logs, doubts)
         alone = len(candidates) == 1
         warnings += [doubt if alone else f"{policy.folder}: {doubt}" for doubt in doubts]
     return Ranking(rows, warnings)
@@ -104,7 +104,7 @@ def estimate_return(
         rows=[replace(row, checkpoint=checkpoint) for row in report.rows],
         step_rows=[replace(row, checkpoint=checkpoint) for row in report.step_rows],
     )
-    card_of_estimates(trained.folder, logs, report)
+    add_estimates(trained.folder, logs, report)
     return report
 
 
@@ -133,6 +133,6 @@ def evaluate_in(
         row = evaluate_policy(environment, trained, trained.name, episodes, seed, rule)
         conditions = {**row.conditions, "run": shorten_paths(str(run))}
         rows.append(replace(row, conditions=conditions, checkpoint=checkpoint))
-        card_of_evaluation(trained.folder, rows[-1])
+        add_evaluation(trained.folder, rows[-1])
     rows += [evaluate_behavior(environment, name, episodes, seed) for name in behaviors]
     return Evaluation(rows)

@@ -53,7 +53,7 @@ C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     ("terminal", "arguments", "status", "said"),
     [
         (ASCII, ["ucfrec", "settings", "--policy", "ucf"], 0, b"?"),
-        (C_LOCALE, ["ucfrec", "prepare", "--help"], 0, b"s3://, ?"),
+        (C_LOCALE, ["ucfrec", "prepare", "--help-all"], 0, b"s3://, ?"),
         (ASCII, ["ucfrec_control", "--help"], 0, b"usage"),
         (ASCII, ["ucfrec", "prepare", "caf\u00e9-\u4e2d.csv", "--validate"], 2, b"does not exist"),
         (

@@ -53,7 +53,7 @@ def test_damage_is_one_line_a_file(made: Path, capsys: pytest.CaptureFixture[str
     (made / "store" / "mine.txt").unlink()
 
 
-@pytest.mark.parametrize("name", ["a\0b", "\ud800", "a" * 5000, "x\ny"])
+@pytest.mark.parametrize("name", ["\ud800", "a" * 5000, "x\ny"])
 def test_a_listed_name_that_no_file_has_is_a_fault(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

@@ -14,7 +14,7 @@ from tests.support.causes import QUICK as QUICK_SCREENING
 from tests.support.single_session import SingleSession
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import rollout
+from ucfrec.acting.rollout import Step, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.commands.cli import main
 from ucfrec.episodes.distractor import reward_bit
@@ -173,9 +173,13 @@ def _play_and_watch(
     """Steps simulated and the states (M, S) that the policy was given in them."""
     actor = trained.actor(env.num_envs, DecisionRule(1.0), ids)
     shown: list[torch.Tensor] = []
-    played = rollout(
-        env, actor, 16, 0, on_step=lambda step: shown.append(actor._states[step.rows, -1].clone())
-    )
+
+    def watch(step: Step) -> None:
+        states = actor._sessions.states
+        assert states is not None
+        shown.append(states[step.rows, -1].clone())
+
+    played = rollout(env, actor, 16, 0, on_step=watch)
     return int(played.lengths.sum()), torch.cat(shown)
 
 

@@ -17,8 +17,6 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.processes import random_state_kept
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
@@ -208,6 +206,10 @@ def collect_store(
         )
     if not store.exists():
         items = logs / "items.parquet"
+        # Collecting logs needs no DuckDB.
+        from ucfrec.logs.mapping import FeatureTable, LogMapping
+        from ucfrec.logs.prepare import PrepareOptions, prepare
+
         features = (FeatureTable((items,), ITEM_ID),) if items.exists() else ()
         mapping = LogMapping(session_by=SESSION_ID, item_features=features)
         options = PrepareOptions(reward=simulator.feedback)

@@ -51,9 +51,14 @@ def test_the_rows_before_a_step_are_those_of_the_user(
         with patch.object(view_module, "_LONG_ENOUGH", long_enough):
             assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
     episodes, steps = view.all_steps()
+    recent = rows.recent(np.arange(view.n_steps), 4)
     owner, seen = rows.seen(np.arange(view.n_steps))
     for number, row in enumerate(parts[1].itertuples()):
         before = log[(log.user == row.user) & (log.timestamp < row.timestamp)]
+        newest = before.iloc[::-1][:4]
+        count = len(newest)
+        assert recent[0][number].tolist() == [*newest["item"], *[-1] * (4 - count)]
+        assert recent[1][number].tolist() == [*newest["reward"], *[0.0] * (4 - count)]
         assert sorted(seen[owner == number]) == sorted(before["item"])
         pauses = np.diff([*before.timestamp, row.timestamp])
         ended = np.flatnonzero(pauses > (np.inf if gap is None else gap))
@@ -77,7 +82,7 @@ def _rest(part: pd.DataFrame, row, gap: int | None) -> float:  # type: ignore[no
 def test_rows_that_are_in_both_logs_count_once() -> None:
     log = pd.DataFrame({"user": 0, "item": range(8), "reward": 1.0, "timestamp": range(8)})
     rows = UserRows.of(store_of(log[4:], None), np.array([0]), store_of(log, None))
-    assert rows.seen(np.array([3]))[1].tolist() == [*range(7)]
+    assert rows.recent(np.array([3]), 8)[0].tolist() == [[6, 5, 4, 3, 2, 1, 0, -1]]
 
 
 def test_users_that_are_not_known_have_no_earlier_rows() -> None:
@@ -86,4 +91,4 @@ def test_users_that_are_not_known_have_no_earlier_rows() -> None:
     rows = UserRows.of(unknown, np.array([7]), store_of(log, None))
     assert rows.continued(None) is unknown
     with pytest.raises(IndexError):
-        rows.seen(np.array([4]))
+        rows.recent(np.array([4]), 1)

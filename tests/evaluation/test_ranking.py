@@ -31,7 +31,7 @@ from ucfrec.evaluation.ranking import (
     measure,
     rank_steps,
 )
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, baselines
+from ucfrec.evaluation.ranking_baselines import ItemNeighbours, PolicyRanker, baselines
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import read_logged_sessions
@@ -285,6 +285,8 @@ def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)
         assert (logged.store.lengths.sum() > logged.store.n_steps) is np.True_
+        knn = ItemNeighbours(EpisodeStore.open(tmp_path / "store"), torch.ones(30))
+        assert len(np.unique(rank_steps(knn, later, 3).top, axis=0)) > 10
         times = logged.store.column(schema.TIMESTAMP)
         _, places = logged.store.all_steps()
     # `recommend` takes the latest session to go on, which it does not at the first step of another.

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.columns import Columns, StepColumn
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.store import EpisodeStore
@@ -61,6 +61,16 @@ class UserRows:
     def values(self, name: str, rows: IntArray) -> Array:
         """Values of a step column at rows of any shape."""
         return _join(name, self.later, self.earlier, self.source[rows])
+
+    def recent(self, steps: IntArray, count: int) -> tuple[IntArray, Float32Array]:
+        """The items and rewards (B, count) of the user's latest rows before later steps (B,),
+        most recent first; −1 and 0 where there are fewer."""
+        rows = self.place[steps][:, None] - np.arange(1, count + 1)
+        missing = rows < self.first[steps][:, None]
+        rows = np.maximum(rows, 0)
+        items = np.where(missing, -1, self.values(schema.ITEM, rows)).astype(np.int64)
+        rewards = np.where(missing, 0, self.values(schema.REWARD, rows)).astype(np.float32)
+        return items, rewards
 
     def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
         """(rows, items), each (M,): the known items in all rows of the user before later steps

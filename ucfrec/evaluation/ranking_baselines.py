@@ -1,11 +1,9 @@
 """Trained policies as rankers, and simple baselines fitted on the same training rows."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 import torch
@@ -19,28 +17,21 @@ from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.ranking import Ranker, Steps
+from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
+from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.popular import (
-    ItemRatePolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
     decayed_counts,
+    liked_rates,
 )
-from ucfrec.runs.config import resolve_config
-from ucfrec.runs.policy_fit import fit_policy
-from ucfrec.runs.start import new_policy
+from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
+_KNN_HISTORY: Final = 20
+"""Latest rows of the user that item-kNN reads."""
 _ALS_FACTORS: Final = 32
-_BPR: Final = {
-    **{"train.steps": 300, "train.batch_size": 256, "train.learning_rate": 0.01},
-    **{"train.warmup_steps": 0, "train.average": 0.0, "policy.dim": 32},
-}
-_FITTED: Final[Mapping[str, tuple[str, Mapping[str, Any]]]] = {
-    "item-knn": ("item-knn", {}),
-    "boosted clicks": ("boosted", {}),
-    "bpr": ("bpr", _BPR),
-}
-"""Policies and settings of the baselines that learn from single rows, by their names in rows."""
+_Factors = Literal["als", "bpr"]
 
 
 class PolicyRanker:
@@ -96,55 +87,61 @@ class Random:
         return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
 
 
-class FittedPolicy:
-    """Ranks items as a policy that is fitted for the comparison, with settings of its own."""
+class ItemNeighbours:
+    """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
 
-    def __init__(
-        self,
-        name: str,
-        train: EpisodeStore,
-        seed: int,
-        held_out: tuple[EpisodeStore, EpisodeStore] | None = None,
-    ) -> None:
-        """Args:
-        name: of the ranker, one of those in `_FITTED`.
-        train: the episodes that are fitted.
-        held_out: training and validation episodes that choose what is chosen on held-out rows.
-        """
-        self.name, (policy, settings) = name, _FITTED[name]
-        settings = {"policy.context": 21, "policy.dim": 1, **settings}
-        config = resolve_config(policy, None, settings, seed)
-        with TemporaryDirectory() as scratch:
-            folder, choice = Path(scratch), None
-            self._policy = new_policy(train, config)
-            if self._policy.chosen and held_out is not None:
-                first = new_policy(held_out[0], config)
-                fit_policy(first, *held_out, folder / "first", config)
-                choice = folder / "first" / "policy" / "best.safetensors"
-            fit_policy(self._policy, train, None, folder / "whole", config, choice)
+    See `ItemKNNPolicy`; the items are those of all the user's sessions, also before the log.
+    """
+
+    name = "item-knn"
+
+    def __init__(self, train: EpisodeStore, popularity: Tensor) -> None:
+        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
+        self._knn.start_from(train)
+        self._tie_break = 1e-6 * popularity / popularity.max()
 
     def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items), as the policy gives them."""
-        return self._policy.act(steps.windows(self._policy.config.context))
+        """Scores (B, n_items)."""
+        recent = steps.rows.recent(steps.numbers, _KNN_HISTORY)
+        return self._knn.similarity(*map(torch.from_numpy, recent)) + self._tie_break
+
+
+class BoostedClicks:
+    """Ranks items by gradient-boosted clicks; see `BoostedPolicy`."""
+
+    name = "boosted clicks"
+
+    def __init__(self, train: EpisodeStore, seed: int) -> None:
+        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
+        self._policy = BoostedPolicy(config, policy_sizes(train))
+        self._policy.start_from(train)
+        self._policy.make_solver(train, None, Path(), seed)()
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Log-odds of a like (B, n_items)."""
+        return self._policy.act(steps.windows(_KNN_HISTORY + 1))
 
 
 class MatrixFactorisation:
-    """Factors of users and items from the users' liked items: ALS (Hu et al., 2008).
+    """Factors of users and items from the users' liked items: ALS (Hu et al., 2008) or BPR (Rendle
+    et al., 2009).
 
     Needs the package `implicit`.
     """
 
-    name = "als"
-
     def __init__(
         self,
+        name: _Factors,
         train: EpisodeStore,
         popularity: Tensor,
         seed: int,
         liked_of: Liked = liked_rewards,
     ) -> None:
         from implicit.als import AlternatingLeastSquares
+        from implicit.bpr import BayesianPersonalizedRanking
         from threadpoolctl import threadpool_limits
+
+        self.name = name
 
         users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
         items = train.column(schema.ITEM)
@@ -152,9 +149,8 @@ class MatrixFactorisation:
         shape = (int(users.max()) + 1, len(popularity))
         matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
         matrix.eliminate_zeros()
-        model = AlternatingLeastSquares(
-            factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False
-        )
+        kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
+        model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
         with threadpool_limits(1, "blas"):
             model.fit(matrix, show_progress=False)
         # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
@@ -171,42 +167,53 @@ class MatrixFactorisation:
         return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
 
 
+def recent_rankers(
+    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_rewards
+) -> list[Ranker]:
+    """Clicks and click rate with half-lives, which the validation split of the store chooses.
+
+    Args:
+        store: the whole store.
+    """
+    first, validation = store.split("train"), store.split("validation")
+    if not validation.n_episodes:
+        return []
+    rankers: list[Ranker] = []
+    for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
+        hours = kind.best_half_life(first, validation, liked_of)
+        scores = kind.scores_of(decayed_counts(train, hours, liked_of))
+        rankers.append(SameForAll(f"recent {name}", scores.double()))
+    return rankers
+
+
 def baselines(
-    counts: TrainingCounts,
-    train: EpisodeStore | None,
-    seed: int,
-    liked_of: Liked = liked_rewards,
-    held_out: tuple[EpisodeStore, EpisodeStore] | None = None,
+    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_rewards
 ) -> list[Ranker]:
     """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
-    clicks, ALS, BPR, and clicks and click rate with half-lives.
+    clicks, ALS and BPR.
 
-    ALS is included if the package `implicit` is installed (extra `rank`).
+    ALS and BPR are included if the package `implicit` is installed (extra `rank`).
 
     Args:
         train: the training episodes; None if their store is unavailable, which excludes all that
             learn from single rows.
         seed: of the random scores, boosted clicks, ALS and BPR.
-        liked_of: says which training steps were liked, for ALS and the half-lives; `counts` has its
-            own, and item-kNN, boosted clicks and BPR those of the run.
-        held_out: training and validation episodes that choose half-lives and the temperature of
-            item-kNN; without them half-lives are left out.
+        liked_of: says which training steps were liked, for ALS and BPR; `counts` has its own, and
+            boosted clicks those of the run.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     rankers: list[Ranker] = [
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
-        SameForAll("item click rate", ItemRatePolicy.scores_of(counts)),
+        SameForAll("item click rate", liked_rates(counts)),
     ]
-    if train is None:
-        return rankers
-    rankers += [FittedPolicy(name, train, seed, held_out) for name in _FITTED]
-    if find_spec("implicit") is not None:
-        rankers.insert(-1, MatrixFactorisation(train, shown.float(), seed, liked_of))
-    if held_out is not None:
-        for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
-            hours = kind.best_half_life(*held_out, liked_of)
-            scores = kind.scores_of(decayed_counts(train, hours, liked_of))
-            rankers.append(SameForAll(f"recent {name}", scores.double()))
+    if train is not None:
+        rankers.append(ItemNeighbours(train, shown.float()))
+        rankers.append(BoostedClicks(train, seed))
+        if find_spec("implicit") is not None:
+            rankers += [
+                MatrixFactorisation(name, train, shown.float(), seed, liked_of)
+                for name in get_args(_Factors)
+            ]
     return rankers

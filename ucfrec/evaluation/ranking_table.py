@@ -21,7 +21,12 @@ from ucfrec.evaluation.ranking import (
     rank_steps,
     rankers_named,
 )
-from ucfrec.evaluation.ranking_baselines import PolicyRanker, RewardRanker, baselines
+from ucfrec.evaluation.ranking_baselines import (
+    PolicyRanker,
+    RewardRanker,
+    baselines,
+    recent_rankers,
+)
 from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.row import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -68,7 +73,7 @@ def ranking_rows(
     Args:
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
-        train: the store of those rows; None excludes all that learn from single rows.
+        train: the store of those rows; None excludes item-kNN and ALS.
         users: (E,) identifier of the user of each of its episodes.
         k: items that are recommended at a step.
         seed: of the resampled users and of `random`.
@@ -126,10 +131,9 @@ def _rankers(
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    held_out = None
-    if train is not None and (validation := train.split("validation")).n_episodes:
-        held_out = train.split("train"), validation
-    others = baselines(counts, fitted_on, seed, liked, held_out)
+    others = baselines(counts, fitted_on, seed, liked)
+    if train is not None and fitted_on is not None:
+        others += recent_rankers(fitted_on, train, liked)
     return rankers_named([*policies, *model, *others]), liked
 
 

@@ -108,6 +108,19 @@ class ItemKNNPolicy(SequencePolicy):
         # Row t sums earlier steps only. Subtracting step t from its sum would round.
         return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
 
+    def similarity(self, items: Tensor, rewards: Tensor) -> Tensor:
+        """Cosines to some items, summed with their rewards as weights, (B, n_items).
+
+        Args:
+            items: (B, N) int64; −1 for none.
+            rewards: (B, N) of these, in reward units.
+        """
+        weights = (rewards - self.reward_low) * (items >= 0)
+        known = items.clamp(min=0)
+        weighted = (self.cosines[known] * weights.unsqueeze(-1)).flatten(1)
+        scores = weighted.new_zeros(len(items), len(self.cosines))
+        return scores.scatter_add_(1, self.neighbors[known].flatten(1), weighted)
+
     def _logits(self, windows: Windows) -> Tensor:
         assert isinstance(self.head, ItemHead)
         return self.temperature * self.features(windows) + self.head.bias

@@ -147,7 +147,7 @@ def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_policy_that_is_updated_earns_more_than_one_that_is_not(tmp_path: Path) -> None:
-    month = Month(days=3, sessions=300, users=600, settings=("train.steps=500", *SETTINGS))
+    month = Month(days=4, sessions=300, users=600, settings=("train.steps=500", *SETTINGS))
     days: list[Day] = simulate(tmp_path, month)
     reward, frozen = (
         np.mean([getattr(each, name) for each in days[-2:]]) for name in ("reward", "frozen")

@@ -650,8 +650,7 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
     head = fill(
         "Written by `python benchmarks/results_page.py` from the rows in `benchmarks/results`. "
         "[Results](results.md) explains them, the [lab notebook](log.md) lists what was tried. "
-        "Every benchmark prints how long it will take before it starts, and resumes where it was "
-        "interrupted."
+        "Every benchmark resumes where it was interrupted."
     )
     paper = fill(
         "**These are numbers of the paper's own simulators and do not compare with ours.** The "

@@ -513,9 +513,39 @@ def test_an_overlay_of_another_store_is_refused(folder: Path) -> None:
         {"edit_step": good.edit_step + 7},
         {"action_step": good.action_step - 7},
         {"edit_state": good.edit_state[:, :1]},
+        {"action": good.action + 11},
+        {"action": good.action - 11},
+        {"action": np.zeros((3, 3), dtype=np.float32)},
     ):
         with pytest.raises(InputError, match="use the store that the copies were made from"):
             base.with_overlay(replace(good, **wrong))
+    moving = write_store(folder / "vectors", random_episodes(LENGTHS, items=False))
+    copies = random_action_augmentation(moving, 3, seed=5)
+    for action in (copies.action[:, :1], np.zeros(3, dtype=np.int64)):
+        with pytest.raises(InputError, match="use the store that the copies were made from"):
+            moving.with_overlay(replace(copies, action=action))
+
+
+def test_an_overlay_file_whose_arrays_do_not_agree_is_refused(folder: Path) -> None:
+    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
+    good = random_overlay(base, 4, 1)[0].joined(random_action_augmentation(base, 3, seed=5))
+    path = folder / "overlay.safetensors"
+    good.save(path)
+    assert np.array_equal(Overlay.load(path).action, good.action)
+    wrong: list[dict[str, object]] = [
+        {"edit_copy": good.edit_copy + len(good.copy_source)},
+        {"edit_copy": good.edit_copy - len(good.copy_source)},
+    ]
+    for name, values in vars(good).items():
+        if name == "_keys":
+            continue
+        wrong += [{name: values[..., None]}] if values.ndim == 1 and name != "action" else []
+        wrong += [{name: values[1:].copy()}] if name != "copy_source" else []
+        wrong += [{name: values.astype(np.float64)}] if values.dtype == np.int64 else []
+    for change in wrong:
+        replace(good, **change).save(path)  # type: ignore[arg-type]
+        with pytest.raises(InputError):
+            base.with_overlay(Overlay.load(path))
 
 
 # A store in memory.

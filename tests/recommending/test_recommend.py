@@ -21,13 +21,7 @@ from ucfrec.recommending import histories
 from ucfrec.recommending.histories import histories_of_files
 from ucfrec.recommending.recommend import uniforms
 
-SETTINGS = [
-    "train.steps=30",
-    "policy.dim=16",
-    "policy.context=4",
-    "augment.copies=0",
-    "rule.choose=false",
-]
+SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
 SMALL = ["train.steps=3", "policy.dim=8", "policy.context=4"]
 FAST = [*SMALL, "rule.choose=false"]
@@ -52,7 +46,9 @@ def log() -> pd.DataFrame:
 def fitted(log: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> tuple[Recommender, Path]:
     folder = tmp_path_factory.mktemp("recommend")
     store = store_of(log, folder, reward="reward", session_by="gap", gap_minutes=20)
-    return Recommender("ucf", settings=SETTINGS).fit(store, folder / "run"), folder
+    return Recommender("ucf", settings=[*SETTINGS, "rule.choose=false"]).fit(
+        store, folder / "run"
+    ), folder
 
 
 @pytest.mark.parametrize(
@@ -278,8 +274,13 @@ def times_of_every_type() -> dict[str, Callable[[pd.Series], object]]:
 
     return {
         "float": lambda ms: ms.astype(float),
-        "datetime64[us]": lambda ms: utc(ms).astype("datetime64[us]"),
+        "Int64": lambda ms: ms.astype("Int64"),
+        **{
+            f"datetime64[{unit}]": lambda ms, unit=unit: utc(ms).astype(f"datetime64[{unit}]")
+            for unit in ("s", "ms", "us", "ns")
+        },
         "with a zone": lambda ms: utc(ms).dt.tz_localize("UTC").dt.tz_convert("Asia/Tokyo"),
+        "objects": lambda ms: utc(ms).astype(object),
     }
 
 
@@ -334,6 +335,7 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
     "no user": (lambda log: log.drop(columns="user_id"), "no column 'user_id'"),
+    "no item": (lambda log: log.rename(columns={"item_id": "item"}), "no column 'item_id'"),
     "misspelt": (
         lambda log: log.rename(columns={"reward": "rewards"}),
         r"no column 'reward' \(for the reward\); nearest: rewards",
@@ -342,6 +344,11 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
         lambda log: log.assign(timestamp="noon"),
         r"timestamp \(timestamp\) is 'noon', no ISO 8601 time nor milliseconds",
     ),
+    "text for rewards": (lambda log: log.assign(reward="good"), r"reward \(reward\) is VARCHAR"),
+    "fractions for users": (
+        lambda log: log.assign(user_id=log.user_id + 0.5),
+        r"user_id \(user_id\) is DOUBLE",
+    ),
     "values of several types": (
         lambda log: log.assign(user_id=[1, "b", *log.user_id[2:]]),
         "user_id holds values of several types",
@@ -349,6 +356,12 @@ WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "durations for times": (
         lambda log: log.assign(timestamp=pd.to_timedelta(log.timestamp, unit="ms")),
         r"timestamp holds durations; convert them with .dt.total_seconds\(\)",
+    ),
+    "periods for times": (
+        lambda log: log.assign(
+            timestamp=pd.to_datetime(log.timestamp, unit="ms").dt.to_period("h")
+        ),
+        r"timestamp holds periods; convert them with .dt.to_timestamp\(\)",
     ),
     "two columns of a name": (
         lambda log: pd.concat([log, log.item_id], axis=1),
@@ -362,12 +375,22 @@ LEFT_OUT: dict[str, tuple[object, str]] = {
         lambda log: log.assign(user_id=log.user_id.astype("Int64").mask(log.index < 3)),
         r"\(3: user, item or action, time or session is missing",
     ),
+    "null times": (
+        lambda log: log.assign(
+            timestamp=pd.to_datetime(log.timestamp, unit="ms").mask(log.index < 2)
+        ),
+        r"\(2: user, item or action, time or session is missing",
+    ),
     "a clock of 1970": (
         lambda log: log.assign(timestamp=log.timestamp.mask(log.index < 4, 1)),
         r"\(4: time before 2000.*is the time in milliseconds",
     ),
     "no number": (
         lambda log: log.assign(reward=log.reward.mask(log.index < 5)),
+        r"\(5: reward is missing, NaN or infinite",
+    ),
+    "infinite": (
+        lambda log: log.assign(reward=log.reward.mask(log.index < 5, np.inf)),
         r"\(5: reward is missing, NaN or infinite",
     ),
 }
@@ -498,7 +521,9 @@ def test_a_column_that_is_left_out_is_told(
     ("command", "written"),
     [
         ("recommend", "log.parquet"),
+        ("recommend", "run/run.json"),
         ("recommend --exposures same.parquet", "same.parquet"),
+        ("score", "log.parquet"),
     ],
 )
 def test_what_is_read_is_not_written_over(

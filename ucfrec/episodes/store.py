@@ -176,13 +176,24 @@ class EpisodeStore(EpisodeView):
         if fits:
             ends = self._columns.lengths[np.concatenate([edited, overlay.action_source])]
             fits = bool(((steps >= 0) & (steps < ends)).all())
-        if not fits or overlay.edit_state.shape[1] != self.state_size:
+        fits = fits and overlay.edit_state.shape[1] == self.state_size
+        if not fits or not self._has_actions(overlay.action):
             raise InputError(
-                f"{overlay} has other episodes, steps or states than {self.path}; use the store "
-                "that the copies were made from"
+                f"{overlay} has other episodes, steps, states or actions than {self.path}; use the "
+                "store that the copies were made from"
             )
         joined = overlay if self.overlay is None else self.overlay.joined(overlay)
         return EpisodeStore(self._columns, self._selected, joined)
+
+    def _has_actions(self, actions: Array) -> bool:
+        """Whether actions are items (N,) of the catalogue, or vectors (N, A) of its size."""
+        if not len(actions):
+            return True
+        if not self.has_items:
+            return list(actions.shape[1:]) == self.record.columns[schema.ACTION]
+        last = len(self.item_states.embeddings) - 1
+        whole = actions.dtype.kind == "i" and actions.ndim == 1
+        return whole and 0 <= int(actions.min()) <= int(actions.max()) <= last
 
     def without_augmentation(self) -> "EpisodeStore":
         """A view of the same logged episodes, without augmented episodes."""

@@ -211,7 +211,27 @@ class Overlay:
         """
         tensors, _ = load_tensors(path)
         with damage_explained(path, REMEDY):
-            return cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+            overlay = cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+            overlay._require_consistent()
+        return overlay
+
+    def _require_consistent(self) -> None:
+        """Raise ValueError for arrays whose types, shapes or numbers of copies do not agree."""
+        numbers = (
+            *(self.copy_source, self.edit_copy, self.edit_step),
+            *(self.action_source, self.action_step),
+        )
+        if not all(values.dtype == np.int64 and values.ndim == 1 for values in numbers):
+            raise ValueError("its episodes, copies and steps are not lists of int64")
+        edits, copies = len(self.edit_copy), len(self.action_source)
+        if self.edit_state.ndim != 2 or {len(self.edit_step), len(self.edit_state)} != {edits}:
+            raise ValueError("its edits differ in number")
+        if self.action_reward.shape != (copies,) or {
+            len(self.action_step), len(self.action)
+        } != {copies}:  # fmt: skip
+            raise ValueError("its action copies differ in number")
+        if edits and not 0 <= self.edit_copy.min() <= self.edit_copy.max() < len(self.copy_source):
+            raise ValueError("an edit is of a copy that it does not have")
 
 
 def _end_to_end(first: Array, second: Array) -> Array:

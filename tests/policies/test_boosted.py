@@ -11,7 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.policies.boosted import BoostedPolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
-from ucfrec.user_model.trees import BoostedTrees
+from ucfrec.user_model.session_end import BoostedTrees
 
 
 @pytest.fixture(scope="module")

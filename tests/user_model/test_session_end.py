@@ -9,7 +9,7 @@ import torch
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, whole_sessions
+from ucfrec.user_model.session_end import BoostedTrees, LoggedEnds, SessionEnd, whole_sessions
 
 ITEMS = 12
 
@@ -230,3 +230,17 @@ def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
         np.testing.assert_array_equal(getattr(drawn, name), getattr(known, name)[chosen])
     episode = np.searchsorted(np.cumsum(lengths), known.rewards, side="right")
     np.testing.assert_array_equal(known.ended, known.steps == lengths[episode] - 1)
+
+
+def test_another_value_of_one_input_is_as_if_it_were_there() -> None:
+    rng = np.random.default_rng(0)
+    inputs = rng.integers(4, size=(2000, 3)).astype(np.float64)
+    trees = BoostedTrees.fit(inputs, (inputs.sum(1) + rng.normal(size=2000)) > 5, 0)
+    given, other = torch.from_numpy(inputs), torch.from_numpy(rng.integers(4, size=2000))
+    for number in range(3):
+        changed = given.clone()
+        changed[:, number] = other
+        odds = trees.with_values(given, number, [other, given[:, number]])
+        assert torch.equal(odds[0], trees(changed))
+        assert torch.equal(odds[1], trees(given))
+        assert not torch.equal(*odds)

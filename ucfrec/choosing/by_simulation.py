@@ -1,7 +1,7 @@
 """Choose the decision rule in sessions simulated in the user model.
 
 Simulated users have the fixed tastes of training users, which the policy does not know
-(`ucfrec.user_model.training_users`): rewards of the model that acts, which learns from the session,
+(`ucfrec.user_model.reward_fit`): rewards of the model that acts, which learns from the session,
 would pay a policy for its own guesses. What a model says of a policy holds only where the log
 supports it, so a candidate must keep to items that the training log shows often enough, and to more
 than a handful of them; where the log has propensities, it must also leave enough effective users to
@@ -31,9 +31,9 @@ from ucfrec.choosing.choice import (
 from ucfrec.choosing.logged import LoggedEvidence
 from ucfrec.choosing.many_rules import Outcomes, roll_out
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.model import UserModel
-from ucfrec.user_model.simulator import UserSimulator, longest_session
-from ucfrec.user_model.training_users import draw_sessions, halve_users
+from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
+from ucfrec.user_model.reward_fit import draw_sessions
+from ucfrec.user_model.reward_report import halve_users
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""

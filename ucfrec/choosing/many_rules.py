@@ -16,7 +16,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.progress import progress
 from ucfrec.schema import USER_IDS
-from ucfrec.user_model.simulator import UserSimulator
+from ucfrec.user_model.model import UserSimulator
 
 _ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""

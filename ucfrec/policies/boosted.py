@@ -18,7 +18,7 @@ from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
 from ucfrec.policies.popular import PRIOR
 from ucfrec.settings import settings_table
-from ucfrec.user_model.trees import LEAVES, TREES, BoostedTrees
+from ucfrec.user_model.session_end import LEAVES, TREES, BoostedTrees
 
 _MAX_ROWS: Final = 300_000
 _AT_ONCE: Final = 4096

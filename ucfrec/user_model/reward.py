@@ -20,6 +20,8 @@ FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
 LAGS: Final = 10
 """Items shown before a step whose repetition and likeness enter its expected reward."""
+_AT_ONCE: Final = 8192
+"""Items that are compared to what was shown before them at once."""
 CLIP: Final = 5.0
 """Standardised states beyond this many standard deviations are clipped."""
 
@@ -88,6 +90,17 @@ def _solution(matrix: Tensor, right: Tensor) -> Tensor:
         row = system[:, k : k + 1] / system[:, k : k + 1, k : k + 1]
         system = system - (system[:, :, k : k + 1] - units[k]) * row
     return system[:, :, size:]
+
+
+def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Tensor:
+    """Likeness (M, L) of items (M,) to each of those shown before them, (M, L), −1 for none."""
+    parts = [history.new_zeros(history.shape, dtype=torch.float32)[:0]]
+    for start in range(0, len(items), _AT_ONCE):
+        earlier = history[start : start + _AT_ONCE]
+        profiles = likeness.profile(earlier.reshape(-1, 1), torch.ones(earlier.numel(), 1))
+        own_items = items[start : start + _AT_ONCE].repeat_interleave(history.shape[1])
+        parts.append(likeness.to_items(profiles, own_items.unsqueeze(1)).view(earlier.shape))
+    return torch.cat(parts)
 
 
 def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:

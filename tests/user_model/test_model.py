@@ -10,11 +10,10 @@ from tests.support.tagged import tagged_store
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.fatigue import Fatigue, MainTags
-from ucfrec.user_model.model import UserModel
+from ucfrec.user_model.model import LoggedRewards, UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
-from ucfrec.user_model.simulator import LoggedRewards, UserSimulator, longest_session
 
 
 @pytest.fixture(scope="module")

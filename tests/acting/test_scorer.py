@@ -39,7 +39,7 @@ from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
-from ucfrec.policies.item_knn import ItemKNNPolicy
+from ucfrec.policies.baselines import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views

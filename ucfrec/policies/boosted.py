@@ -16,7 +16,7 @@ from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewar
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
-from ucfrec.policies.popular import PRIOR
+from ucfrec.policies.baselines import PRIOR
 from ucfrec.settings import settings_table
 from ucfrec.user_model.session_end import LEAVES, TREES, BoostedTrees
 

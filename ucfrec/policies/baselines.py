@@ -43,6 +43,7 @@ _HOTTEST = 64.0
 """Largest factor on the cosines of neighbours."""
 _HALVINGS = 30
 
+_Scored = Literal["steps", "likes", "rate"]
 LikedOf = Callable[[EpisodeStore, Array], BoolArray]
 
 
@@ -88,7 +89,7 @@ class PopularPolicy(SequencePolicy):
     With a half-life, a row that is h half-lives older than the last training row counts 2^−h.
     """
 
-    scored_by: ClassVar[Literal["steps", "likes", "rate"]] = "steps"
+    scored_by: ClassVar[_Scored] = "steps"
     half_life: Tensor
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
@@ -185,7 +186,7 @@ class RecentRatePolicy(PopularPolicy):
 
     Config = RecentConfig
     chosen = ("half_life",)
-    scored_by = "rate"
+    scored_by: ClassVar[_Scored] = "rate"
 
 
 class RecentClicksPolicy(RecentRatePolicy):

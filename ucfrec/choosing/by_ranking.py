@@ -1,4 +1,4 @@
-"""Choose the reward weight of a run by how it ranks the validation rows of its log.
+"""What rules would have done at logged steps, and the choice of a reward weight by it.
 
 Where the log has no true sessions there is nothing to simulate, but every row shows what a user
 liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
@@ -6,22 +6,28 @@ show, and overlaps with the log enough if it finds liked items better than the t
 do, by a standard error. The choice is repeated on two halves of the users.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
-from ucfrec.acting.scorer import Scorer
+from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice
-from ucfrec.choosing.logged import SHOWN, LoggedScores
+from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.progress import progress
+from ucfrec.results.statistics import effective_number
 
+SHOWN = 10
+"""Items that a rule shows at a step."""
+_AT_ONCE = 256
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
 """Validation rows that are ranked at most, in large and in small catalogues …"""
 _SCORES = 2e8
@@ -30,6 +36,118 @@ _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
 _PRIOR = 10.0
 """Impressions at the mean rate that are added to those of an item."""
+
+
+class LoggedScores:
+    """Scores of all items at M logged steps by rules of one policy.
+
+    Policy and reward model are computed once for all rules of one target, and where the policy has
+    factors kept for rules that are asked for later: the outputs of others are as many as items.
+    """
+
+    def __init__(
+        self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
+    ) -> None:
+        self._scorer, self._view, self._episodes, self._steps = scorer, view, episodes, steps
+        self._queries: dict[tuple[object, ...], Query] = {}
+
+    @torch.no_grad()
+    def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
+        """Scores (B, n_items) by each rule of batches of the steps, and which steps they are."""
+        scorers = [self._scorer.under(rule) for rule in rules]
+        widest = max(scorers, key=lambda scorer: scorer.reach)
+        weighted = any(rule.reward_weight for rule in rules)
+        with progress(len(self._steps), "logged steps under each rule", "rows") as bar:
+            for first in range(0, len(self._steps), _AT_ONCE):
+                part = slice(first, min(first + _AT_ONCE, len(self._steps)))
+                at = self._episodes[part], self._steps[part]
+                queries = self._queries if self._scorer.has_factors else {}
+                sessions: Sessions | None = None
+                scores = list[Tensor]()
+                for scorer in scorers:
+                    rule = scorer.rule
+                    key = first, rule.target, rule.minimum_target, widest.reach, weighted
+                    if key not in queries:
+                        sessions = sessions or sessions_before(widest, self._view, *at)
+                        query = scorer.query(sessions, rewards=weighted)
+                        # What has been read for the query is not needed again.
+                        queries[key] = query._replace(sessions=replace(sessions, states=None))
+                    seen = seen_before(self._view, *at) if rule.exclude_seen else None
+                    scores.append(scorer.scores_of(queries[key], excluded=seen))
+                yield part, scores
+                bar.update(part.stop - part.start)
+
+
+class LoggedEvidence:
+    """Validation sessions on which rules of one policy are compared with the log."""
+
+    def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
+        """Args:
+        scorer: the policy.
+        view: validation episodes.
+        most: about the number of steps of the sessions that are drawn from many.
+        seed: of the draw.
+        """
+        order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
+        last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
+        self._view = view.select(np.sort(order[: last + 1]))
+        self._episodes, self._steps = self._view.all_steps()
+        at = self._episodes, self._steps
+        self._items = torch.from_numpy(self._view.step_values(schema.ITEM, *at).astype(np.int64))
+        self._liked = liked_rewards(self._view, self._view.column(schema.REWARD))
+        self._propensities: Float64Array | None = None
+        if schema.PROPENSITY in view.record.columns:
+            propensities = self._view.step_values(schema.PROPENSITY, *at).astype(np.float64)
+            self._propensities = propensities if (propensities > 0).all() else None
+        owners = np.arange(self._view.n_episodes)
+        if view.has_users:
+            owners = self._view.episode_values(schema.USER)
+        self._users = np.unique(owners, return_inverse=True)[1]
+        self._scores = LoggedScores(scorer, self._view, *at)
+
+    @property
+    def has_propensities(self) -> bool:
+        """Whether all steps have one."""
+        return self._propensities is not None
+
+    @property
+    def users(self) -> int:
+        """The number of users."""
+        return int(self._users.max(initial=-1)) + 1
+
+    def evaluate(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
+        """The evidence of each rule."""
+        shape = len(rules), len(self._steps)
+        logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
+        for part, scores in self._scores.score(rules):
+            items = self._items[part].unsqueeze(1)
+            for n, (rule, values) in enumerate(zip(rules, scores, strict=True)):
+                chances = rule.log_probabilities(values)
+                logs[n, part] = chances.gather(1, items)[:, 0].double().numpy()
+                top = best_items(values, min(SHOWN, values.shape[1]))
+                hits[n, part] = (top == items).any(1).numpy()
+        return [self._evidence(*pair) for pair in zip(logs, hits, strict=True)]
+
+    def _evidence(self, logs: Float64Array, hits: BoolArray) -> Evidence:
+        rate = float(hits[self._liked].mean()) if self._liked.any() else 0.0
+        likelihood = float(np.exp(logs.mean()))
+        if self._propensities is None:
+            return Evidence(rate, likelihood)
+        sums = np.bincount(self._episodes, logs - np.log(self._propensities))
+        weights = np.exp(np.minimum(sums, 100.0))
+        returns = self._view.returns.astype(np.float64)
+        above, below = (
+            np.bincount(self._users, values).astype(np.float64)
+            for values in (weights * returns, weights)
+        )
+        halves = [half for half in (below[::2], below[1::2]) if len(half)]
+        effective_users = 2 * min(effective_number(half) for half in halves)
+        if not below.any():
+            return Evidence(rate, likelihood, 0.0)
+        spread = float(sums[np.isfinite(sums)].var())
+        value = above.sum() / below.sum()
+        error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
+        return Evidence(rate, likelihood, effective_users, spread, float(value), float(error))
 
 
 def choose_by_ranking(problem: Problem) -> RuleChoice:
@@ -199,6 +317,6 @@ def _top_items(scorer: Scorer, weights: Sequence[float], scores: LoggedScores) -
     rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
     tops = [
         [best_items(values, min(SHOWN, values.shape[1])) for values in batch]
-        for _, batch in scores.of(rules)
+        for _, batch in scores.score(rules)
     ]
     return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]

@@ -8,13 +8,13 @@ from pydantic import Field
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.logged import Evidence
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.settings import Count, Share, Weight, settings_table
 from ucfrec.user_model.model import UserModel
 
 FAR_OFF: Final = 0.1
 """Share of the estimated value by which it may be off and still be trusted."""
+_Z: Final = 1.96
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
@@ -92,6 +92,34 @@ class Problem:
     """Of everything random."""
     start: DecisionRule | None = None
     """A rule near which to look for a better one; None to try all candidates."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What validation sessions show of a rule without any model of the users."""
+
+    hits: float
+    """Share of liked steps whose item is among the ten best."""
+    likelihood: float
+    """Geometric mean of the probabilities with which the rule shows what was logged."""
+    effective_users: float | None = None
+    """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
+    weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
+    the number. None without propensities."""
+    spread: float = 0.0
+    """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
+    than the weights how heavy their tail is: few sessions may lack the heavy ones."""
+    value: float | None = None
+    """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
+    error: float | None = None
+    """Its standard error over users."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95% interval of `value`."""
+        if self.value is None or self.error is None:
+            return None
+        return self.value - _Z * self.error, self.value + _Z * self.error
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What rules would have done at logged steps is what `ope` and each rule alone find, and decides."""
+"""What rules would have done at logged steps is what `ope` and each rule alone find; it decides."""
 
 import copy
 from dataclasses import replace

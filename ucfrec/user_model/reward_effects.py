@@ -114,20 +114,11 @@ class Design:
 
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
-        return replace(
-            self,
-            items=self.items[rows],
-            users=self.users[rows],
-            x=self.x[rows],
-            observed=self.observed[rows],
-            exposure=self.exposure[rows],
-            target=self.target[rows],
-            rows=self.rows[rows],
-            weights=self.weights[rows],
-            tastes=self.tastes[rows],
-        )
+        names = ("items", "users", "x", "observed", "exposure", "target", "rows", "weights")
+        parts = {name: getattr(self, name)[rows] for name in (*names, "tastes")}
+        return replace(self, **parts)
 
-    def of_unknown_users(self) -> "Design":
+    def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
         return replace(self, users=torch.full_like(self.users, self.n_users))
 
@@ -154,7 +145,7 @@ class Design:
         if "item" in effects:
             total = total + effects["item"][self.items]
         if "content" in effects:
-            total = total + self.of_content(effects["content"])[self.items]
+            total = total + self.sum_content(effects["content"])[self.items]
         if "user" in effects:
             total = total + effects["user"][self.users]
         if "tastes" in effects:
@@ -171,7 +162,7 @@ class Design:
             total = total + ((self.observed @ effects["context"]) * self.rows).sum(1)
         return total
 
-    def of_content(self, content: Tensor) -> Tensor:
+    def sum_content(self, content: Tensor) -> Tensor:
         """Effects (n_items,) of the items' tags and embeddings."""
         tags = F.pad(content[: self.n_tags], (0, 1))
         return tags[self.tags].sum(1) + self.vectors @ content[self.n_tags :]
@@ -501,7 +492,7 @@ class EffectSearch:
             self._root = root_of_tastes(tastes, self.design.rows)
         self.new_users = True
         self._fixed = Effects((name, self.effects[name]) for name in _ITEMS if name in self.effects)
-        self.design = self.design.of_unknown_users()
+        self.design = self.design.forget_users()
         self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
         self.losses = self._losses(self.effects)
 
@@ -520,7 +511,7 @@ class EffectSearch:
         model, *histories = self.sessions
         usual = self.effects["mean"] + self.effects.get("item", torch.zeros(()))
         if "content" in self.effects:
-            usual = usual + self.design.of_content(self.effects["content"])
+            usual = usual + self.design.sum_content(self.effects["content"])
         model.tastes.usual.copy_(torch.sigmoid(usual) if self.design.binary else usual)
         model.tastes.root.copy_(root)
         model.tastes.weigh(1.0)

@@ -311,5 +311,5 @@ def _select_some(design: Design, seed: int) -> Design:
 
 
 def _finish(model: ItemRewardModel, search: "EffectSearch") -> ItemRewardModel:
-    model.set_effects(search.effects, search.design.of_content)
+    model.set_effects(search.effects, search.design.sum_content)
     return model.eval()

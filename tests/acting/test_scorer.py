@@ -141,7 +141,7 @@ def naive_scores(scorer: Scorer, windows: Windows, excluded: Tensor) -> Tensor:
             score = scorer.reward_model.score(windows.states[:, -1], shown, sessions.users, every)
             if rule.lookahead:
                 assert scorer.session_end is not None
-                score = scorer.reward_model.expected(score)
+                score = scorer.reward_model.expect(score)
                 steps, recent = windows.timesteps[:, -1].numpy(), shown.latest(LAGS)
                 ends = [
                     torch.from_numpy(

@@ -208,7 +208,7 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
     assert not report.binary
     rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
     scores = model.score(rows.states, rows.history, rows.users, rows.items)
-    errors = (model.expected(scores) - rows.rewards).numpy()
+    errors = (model.expect(scores) - rows.rewards).numpy()
     assert 1 - errors.var() / rows.rewards.numpy().var() == pytest.approx(report.r2, abs=0.02)
     assert report.r2 > 0.25
     slope = np.polyfit(planted.of_item, model.item.numpy() * float(model.reward_std), 1)[0]

@@ -347,7 +347,7 @@ class Scorer:
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span = model.reward_high - model.reward_low
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
-        rewards = model.expected(odds)
+        rewards = model.expect(odds)
         scores = scores + weight * rewards
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
         steps = query.sessions.steps

@@ -288,5 +288,5 @@ class EffectTransitions:
         model = self._model
         read = view.transitions(episodes, steps)
         rows = RewardRows.at(view, episodes, steps, model.reach)
-        fixed = model.fixed_part(rows.history, rows.users, rows.items)
+        fixed = model.score_without_state(rows.history, rows.users, rows.items)
         return replace(read, actions=torch.cat([model.vectors[rows.items], fixed[:, None]], 1))

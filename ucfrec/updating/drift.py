@@ -107,7 +107,7 @@ def measure_drift(
     )
     scores = score_rows(model, reward_rows)[0]
     predicted, observed = (
-        model.expected(scores).double().numpy(),
+        model.expect(scores).double().numpy(),
         reward_rows.rewards.double().numpy(),
     )
     slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))

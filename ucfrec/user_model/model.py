@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
@@ -82,14 +82,19 @@ class UserModel:
                 damaged.
         """
         require_blas_memory()
-        reward, report = fit_item_reward_model(train, validation, folder, seed, first=first)
+        reward, report = fit_item_reward_model(train, validation, folder, seed, first)
         users = None
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
-            runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
-            tired = fit_fatigue(*runs) if reward.binary else None
+            fatigue = None
+            if reward.binary:
+                runs, held_out_runs = (
+                    LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS)
+                    for view in (train, validation)
+                )
+                fatigue = fit_fatigue(runs, held_out_runs)
             logged, held_out = (
                 LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
@@ -100,32 +105,36 @@ class UserModel:
                 model = users.model if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
-            fitted = {
-                "fatigue": None if tired is None else dataclasses.asdict(tired),
+            metadata = {
                 "calibration": line,
                 "calibration_report": calibration and dataclasses.asdict(calibration),
                 "session_end": dataclasses.asdict(end_report),
+                "fatigue": fatigue and dataclasses.asdict(fatigue),
             }
-            save_tensors(path, dict(end.tensors), fitted)
+            save_tensors(path, dict(end.tensors), metadata)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
-            fatigue = None if metadata["fatigue"] is None else Fatigue(**metadata["fatigue"])
-            end_report = SessionEndReport(**metadata["session_end"])
-            calibration = metadata["calibration_report"] and UserCalibration(
-                **metadata["calibration_report"]
+            of_calibration, of_fatigue = metadata["calibration_report"], metadata["fatigue"]
+            return cls(
+                reward=reward,
+                reward_report=report,
+                training_users=users,
+                calibration=(slope, intercept),
+                session_end=SessionEnd.of(reward.likeness, tensors),
+                session_end_report=SessionEndReport(**metadata["session_end"]),
+                fatigue=of_fatigue and Fatigue(**of_fatigue),
+                main_tags=tags,
+                calibration_report=of_calibration and UserCalibration(**of_calibration),
             )
-            end = SessionEnd.of(reward.likeness, tensors)
-        line = slope, intercept
-        return cls(reward, report, users, line, end, end_report, fatigue, tags, calibration)
 
     @property
     def rewarding(self) -> ItemRewardModel:
         """The model that rewards of simulated sessions are drawn from."""
         return self.reward if self.training_users is None else self.training_users.model
 
-    def expected(
-        self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor
+    def expect(
+        self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
     ) -> Float64Array:
         """Expected rewards (M,) of one item (M,) each, in reward units.
 
@@ -135,24 +144,24 @@ class UserModel:
             items: (M,) int64.
         """
         slope, intercept = self.calibration
-        scores = self.rewarding.score(states, shown, users, items)
-        rewards = self.rewarding.expected(slope * scores + intercept).double().numpy()
+        scores = self.rewarding.score(states, history, users, items)
+        rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
         if self.fatigue is None:
             return rewards
         low = float(self.rewarding.reward_low)
-        tired = self.fatigue.tired(self.main_tags.runs(shown)).numpy()
+        tired = self.fatigue.is_tired(self.main_tags.runs(history)).numpy()
         return np.where(tired, low + self.fatigue.factor * (rewards - low), rewards)
 
     def report(self) -> dict[str, Any]:
         """What simulated sessions are drawn from, as a JSON object."""
-        calibration = self.calibration_report
-        users = None if self.training_users is None else self.training_users.report
+        users = self.training_users
         return {
             "calibration": list(self.calibration),
-            "calibration_report": calibration and dataclasses.asdict(calibration),
-            "users": None if users is None else dataclasses.asdict(users),
+            "calibration_report": self.calibration_report
+            and dataclasses.asdict(self.calibration_report),
+            "users": users and dataclasses.asdict(users.report),
             "session_end": dataclasses.asdict(self.session_end_report),
-            "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),
+            "fatigue": self.fatigue and dataclasses.asdict(self.fatigue),
         }
 
 
@@ -170,24 +179,13 @@ def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd
         return SessionEnd.of(reward.likeness, tensors)
 
 
-@dataclass(frozen=True)
 class LoggedRewards:
     """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
     expected reward. Paying the mean itself would be wrong where what follows, as the end of the
     session, is not linear in the reward."""
 
-    values: Float64Array
-    """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
-    log_shares: Float64Array
-    """(K,) log of their shares of the steps."""
-    slopes: Float64Array
-    """(G,) ascending, per unit of reward."""
-    means: Float64Array
-    """(G,) mean reward under each slope."""
-
-    @classmethod
-    def of(cls, store: EpisodeStore) -> "LoggedRewards":
-        """Those of all steps of a store."""
+    def __init__(self, store: EpisodeStore) -> None:
+        """Read those of all steps of a store."""
         parts = [
             np.unique(rewards, return_counts=True)
             for (rewards,) in store.column_batches(schema.REWARD)
@@ -202,26 +200,25 @@ class LoggedRewards:
             groups = np.unique((_GROUPS * middle).astype(int), return_inverse=True)[1]
             sums, counts = np.bincount(groups, counts * values), np.bincount(groups, counts)
             values = sums / counts
-        log_shares = np.log(counts / counts.sum())
-        slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
-        return cls(values, log_shares, slopes, _shares(log_shares, slopes, values) @ values)
+        self.values: Float64Array = values
+        """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
+        self._log_shares = np.log(counts / counts.sum())
+        self._slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
+        self._means = self._weigh(self._slopes) @ values
 
-    def drawn(self, expected: Float64Array, uniform: Float64Array) -> Float64Array:
+    def _weigh(self, slopes: Float64Array) -> Float64Array:
+        """(M, K) shares of the values (K,) under slopes (M,) per unit of reward."""
+        exponents = self._log_shares + slopes[:, None] * self.values
+        return np.asarray(torch.from_numpy(exponents).softmax(dim=1))
+
+    def draw(self, expected: Float64Array, uniform: Float64Array) -> Float64Array:
         """Rewards (M,) with the means `expected` (M,), from `uniform` (M,) in [0, 1)."""
         if len(self.values) == 2:
             high, low = self.values
-            drawn: Float64Array = np.where(uniform < (expected - low) / (high - low), high, low)
-            return drawn
-        slopes = np.interp(expected, self.means, self.slopes)
-        bounds = _shares(self.log_shares, slopes, self.values).cumsum(axis=1)[:, :-1]
-        drawn = self.values[(uniform[:, None] >= bounds).sum(axis=1)]
-        return drawn
-
-
-def _shares(log_shares: Float64Array, slopes: Float64Array, values: Float64Array) -> Float64Array:
-    """(M, K) shares of the values (K,) under slopes (M,)."""
-    shares = torch.from_numpy(log_shares + slopes[:, None] * values).softmax(dim=1)
-    return np.asarray(shares)
+            return np.where(uniform < (expected - low) / (high - low), high, low)
+        bounds = self._weigh(np.interp(expected, self._means, self._slopes)).cumsum(axis=1)
+        numbers = (uniform[:, None] >= bounds[:, :-1]).sum(axis=1)
+        return np.asarray(self.values[numbers])
 
 
 class UserSimulator:
@@ -249,11 +246,11 @@ class UserSimulator:
         """
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
-        self._logged = LoggedRewards.of(store)
-        n, self._lags = sessions * times, model.rewarding.lags
-        self._numbers = np.arange(n) % sessions
+        self._logged, self._lags = LoggedRewards(store), model.rewarding.lags
+        self._numbers = np.arange(sessions * times) % sessions
         self._episodes = self._numbers % store.n_episodes
-        self._sessions = Sessions.begun(n, max(self._lags, store.item_states.window))
+        length = max(self._lags, store.item_states.window)
+        self._sessions = Sessions.begun(sessions * times, length)
         if store.has_users:
             users = store.episode_values(schema.USER).astype(np.int64)[self._episodes]
             self._sessions = replace(self._sessions, users=torch.from_numpy(users))
@@ -284,20 +281,20 @@ class UserSimulator:
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         observations = torch.from_numpy(self.observations())
         states = self._sessions.latest_states(self._store.item_states, observations)
-        shown, users = self._sessions.shown.latest(self._lags), self._sessions.users
-        before = self._sessions.steps.numpy()
-        expected = self._model.expected(states, shown, users, items)
-        rewards = self._logged.drawn(expected, self._draws())
-        ends = self._model.session_end.probabilities(shown, items, rewards, before)
+        history, users = self._sessions.shown.latest(self._lags), self._sessions.users
+        steps = self._sessions.steps.numpy()
+        expected = self._model.expect(states, history, users, items)
+        rewards = self._logged.draw(expected, self._draw_uniform())
+        ends = self._model.session_end.probabilities(history, items, rewards, steps)
         self._sessions = self._sessions.with_step(items, torch.from_numpy(rewards))
-        ended: BoolArray = (self._draws() < ends) | (before + 1 >= self._longest)
+        ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)
         going = np.flatnonzero(~ended)
         if len(going) < len(ended):
             self._sessions = self._sessions.at(going)
             self._episodes, self._numbers = self._episodes[going], self._numbers[going]
         return rewards.astype(np.float32), going
 
-    def _draws(self) -> Float64Array:
+    def _draw_uniform(self) -> Float64Array:
         """(M,) from [0, 1)."""
         return self._rng.random(self._different)[self._numbers]
 

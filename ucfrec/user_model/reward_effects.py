@@ -90,10 +90,11 @@ class Design:
         """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
         likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
-        x, history = model.standardised(rows.states), rows.history.latest(model.lags)
+        x, history = model.standardise(rows.states), rows.history.latest(model.lags)
         repeated = (history.items == rows.items.unsqueeze(1)).float()
         alike = compare_to_history(likeness, history.items, rows.items)
-        both, liked = torch.cat([repeated, alike], 1), model.liked(history.rewards).repeat(1, 2)
+        both = torch.cat([repeated, alike], 1)
+        liked = model.scale_rewards(history.rewards).repeat(1, 2)
         is_known = (rows.users >= 0) & (rows.users < last)
         return cls(
             items=rows.items,

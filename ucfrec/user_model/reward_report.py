@@ -250,7 +250,7 @@ def measure_quality(
 ) -> dict[str, Any]:
     """What `ItemRewardReport` says of the predictions of held-out rows."""
     scores, levels = score_rows(model, held_out)
-    predicted = model.expected(scores).double().numpy()
+    predicted = model.expect(scores).double().numpy()
     observed = held_out.rewards.double().numpy()
     variance = float(observed.var()) or float("nan")
     least = least_liked(states.reward_low, states.reward_high)
@@ -311,7 +311,7 @@ class UserCalibration:
         parts = half == 0, half == 1
         first, second = (fit_part(part) if part.sum() >= _FEWEST else line for part in parts)
         slope, intercept = torch.tensor([second, first])[torch.from_numpy(half)].unbind(1)
-        expected = (counts * model.expected(slope * scores + intercept)).double().numpy()
+        expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
         observed = (counts * rows.rewards).double().numpy()
         off = expected.sum() / observed.sum() - 1 if observed.sum() > 0 else 0.0
         by_user = np.bincount(episodes, expected - (1 + off) * observed)

@@ -105,13 +105,13 @@ class UserModel:
                 model = users.model if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
-            metadata = {
+            fitted: dict[str, Any] = {
                 "calibration": line,
                 "calibration_report": calibration and dataclasses.asdict(calibration),
                 "session_end": dataclasses.asdict(end_report),
                 "fatigue": fatigue and dataclasses.asdict(fatigue),
             }
-            save_tensors(path, dict(end.tensors), metadata)
+            save_tensors(path, dict(end.tensors), fitted)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
@@ -215,7 +215,7 @@ class LoggedRewards:
         """Rewards (M,) with the means `expected` (M,), from `uniform` (M,) in [0, 1)."""
         if len(self.values) == 2:
             high, low = self.values
-            return np.where(uniform < (expected - low) / (high - low), high, low)
+            return np.asarray(np.where(uniform < (expected - low) / (high - low), high, low))
         bounds = self._weigh(np.interp(expected, self._means, self._slopes)).cumsum(axis=1)
         numbers = (uniform[:, None] >= bounds[:, :-1]).sum(axis=1)
         return np.asarray(self.values[numbers])

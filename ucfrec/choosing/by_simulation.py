@@ -1,10 +1,9 @@
 """Choose the decision rule in sessions simulated in the user model.
 
 Simulated users have the fixed tastes of training users, which the policy does not know
-(`ucfrec.user_model.reward_fit`): rewards of the model that acts, which learns from the session,
-would pay a policy for its own guesses. What a model says of a policy holds only where the log
-supports it, so a candidate must keep to items that the training log shows often enough, and to more
-than a handful of them; where the log has propensities, it must also leave enough effective users to
+(`ucfrec.user_model.reward_fit`). What a model says of a policy holds only where the log supports
+it, so a candidate must keep to items that the training log shows often enough, and to more than a
+handful of them; where the log has propensities, it must also leave enough effective users to
 evaluate it off-policy.
 """
 
@@ -25,13 +24,10 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.by_ranking import LoggedEvidence
 from ucfrec.choosing.choice import (
-    FAR_OFF,
     Problem,
     RuleChoice,
     SimulatedRule,
     ValueEstimate,
-    describe_choice,
-    list_doubts,
 )
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
@@ -55,7 +51,9 @@ _ERRORS_BEHIND: Final = 3.0
 """… which are those that are so many standard errors behind the best."""
 _SEED_OF_REST: Final = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_LARGEST_ERROR: Final = FAR_OFF / 4
+_FAR_OFF: Final = 0.1
+"""Share of the estimated value by which it may be off and still be trusted."""
+_LARGEST_ERROR: Final = _FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
@@ -81,7 +79,6 @@ class Outcomes:
     """(M,), all that were shown."""
 
     def append(self, more: "Outcomes") -> "Outcomes":
-        """These sessions and more of the same rule."""
         return Outcomes(
             np.concatenate([self.returns, more.returns]),
             np.concatenate([self.lengths, more.lengths]),
@@ -136,11 +133,7 @@ class _ManyRules(PolicyActor):
 
 
 def _batch_rules(rules: IntArray) -> list[list[tuple[int, slice]]]:
-    """Whole rules of about `_ROWS_AT_ONCE` rows, and where their rows are.
-
-    Args:
-        rules: (M,) the rows' rules, sorted.
-    """
+    """Whole rules of about `_ROWS_AT_ONCE` rows, and where they are among the sorted rules (M,)."""
     numbers, first = np.unique(rules, return_index=True)
     batches, size = [list[tuple[int, slice]]()], 0
     for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
@@ -156,10 +149,7 @@ class RuleSearch:
     """Simulates decision rules of one policy in a user model."""
 
     def __init__(self, problem: Problem) -> None:
-        """Args:
-        problem: the policy, the user model and the log; where users are new, training sessions are
-            begun, otherwise validation sessions.
-        """
+        """Where users are new, training sessions are begun, otherwise validation sessions."""
         self.problem, self.users, self._config = problem, problem.users, problem.config
         train, seed = problem.train, problem.seed
         new = self.users.reward_report.new_users
@@ -175,13 +165,11 @@ class RuleSearch:
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
     def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
-        """Roll out each of the rules, side by side, all with the same draws.
+        """Roll out each of the rules, side by side, with the same draws, in `times` the sessions of
+        the configuration.
 
         A rule that is far behind the best one after a part of the sessions is not simulated in the
         rest; its value is that of the best one less the difference.
-
-        Args:
-            times: how many times the sessions of the configuration.
         """
         if not rules:
             return []
@@ -315,8 +303,8 @@ class RuleSearch:
         """The allowed candidates that cannot be told apart from the best: within the standard error
         of the difference over pairs of sessions, or the tolerance.
 
-        If the log can evaluate none, all that it supports are allowed; if it supports none, the
-        rule that the choice starts from, or the one with the most effective items.
+        If the log supports none, the rule that the choice starts from, or the one with the most
+        effective items.
         """
         allowed = self._select_allowed(candidates)
         if not allowed:
@@ -403,10 +391,17 @@ class RuleSearch:
         value = sum(values) / 2
         first, second = (_standard_error(half.returns) for half in halves)
         error = max(math.hypot(first, second) / 2, abs(values[0] - values[1]) / 2)
-        report = self.users.calibration_report
+        report, training, doubts = self.users.calibration_report, self.users.training_users, []
         optimism = None if report is None else (report.optimism, report.optimism_error)
-        has_propensities = schema.PROPENSITY in self.problem.train.record.columns
-        doubts = list(list_doubts(value, error, self.users, has_propensities))
+        if error > _FAR_OFF * abs(value):
+            doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
+        if report is not None and abs(report.optimism) > max(_FAR_OFF, report.optimism_error):
+            doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
+        weighted = training is not None and training.report.weighted
+        if not (weighted if report is None else report.weighted):
+            some = schema.PROPENSITY in self.problem.train.record.columns
+            lack = "some rows of the log have" if some else "the log has"
+            doubts.append(f"{lack} no propensities: its policy may have known more of the users")
         length = max(float(half.lengths.mean()) for half in halves)
         if length > (longest := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")
@@ -454,7 +449,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
-        chosen_by=describe_choice(search.users) + where,
+        chosen_by=_describe_choice(search.users) + where,
         candidates=[best if item.rule == best.rule else item for item in candidates],
         warning=_warning(search, best, estimate),
         estimate=estimate,
@@ -464,6 +459,23 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
             "least_users": search.least_users,
             "halves_agree": list(agree),
         },
+    )
+
+
+def _describe_choice(users: UserModel) -> str:
+    if users.training_users is None:
+        return (
+            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
+            "propensities are used"
+        )
+    report, calibration = users.training_users.report, users.calibration_report
+    whose = "new users" if users.reward_report.new_users else "validation users"
+    weights = "weighted by their propensities" if report.weighted else "without weights"
+    if calibration is not None and calibration.weighted:
+        weights += ", and calibrated by propensities"
+    return (
+        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
+        f"are fitted to {report.steps:,} training rows {weights}"
     )
 
 

@@ -171,7 +171,7 @@ def test_candidates_have_the_logits_that_they_have_among_all() -> None:
         head, _ = exposed_head(tags)
         features, shown = steps(head, 50)[0], shown_before(50)
         some = torch.tensor([0, 3, 4, 31, N - 1])
-        columns = head.logits_of(features, some, shown)
+        columns = head.predict_items(features, some, shown)
         torch.testing.assert_close(columns, head.predict(features, shown)[:, some])
 
 

@@ -184,7 +184,7 @@ class SequencePolicy(nn.Module, ABC):
         Returns-to-go are first raised to the lowest value in the training data: after a session has
         reached its target return, they would otherwise leave the range of the training data.
         """
-        states = ((windows.states - self.state_mean) / self.state_std).clamp(-_CLIP, _CLIP)
+        states = standardise(windows.states, self.state_mean, self.state_std)
         returns_to_go = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
         return replace(windows, states=states, returns_to_go=returns_to_go / self.return_scale)
 
@@ -264,6 +264,11 @@ class SequencePolicy(nn.Module, ABC):
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
         return Exposed.before_last(windows, self.head.exposure.lags)
+
+
+def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """States (..., S) in standard deviations from their mean, clipped."""
+    return ((states - mean) / std).clamp(-_CLIP, _CLIP)
 
 
 def require_items(name: str, sizes: Mapping[str, int]) -> None:

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy, embedding, require_items
-from ucfrec.policies.dt import Block, DTConfig, rows_through
+from ucfrec.policies.dt import Block, DTConfig, pass_rows
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.ucf import Dropout, visible_tokens
 from ucfrec.settings import Share, settings_table
@@ -53,7 +53,7 @@ class SASRecPolicy(SequencePolicy):
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), without what the last block has for other steps."""
         step = slice(-1, None)
-        return self.final_norm(rows_through(self.blocks, *self._tokens(windows), step))[:, 0]  # type: ignore[no-any-return]
+        return self.final_norm(pass_rows(self.blocks, *self._tokens(windows), step))[:, 0]  # type: ignore[no-any-return]
 
     def _tokens(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The first block's tokens (B, K, d), and which of them see which, (B, 1, K, K)."""
@@ -109,7 +109,7 @@ class GSASRecPolicy(SASRecPolicy):
         beta = rate * (t * (1 - 1 / rate) + 1 / rate)
         # Where the bias is the log share of an item, the scores are the loss's best ones.
         offset = math.log(beta / rate)
-        negative = head.logits_of(features, items, exposed) + offset
+        negative = head.predict_items(features, items, exposed) + offset
         positive = head.logit(features, shown, exposed) + offset
         is_negative = items != shown.unsqueeze(1)
         against = (F.softplus(negative) * is_negative).sum(1)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -65,6 +66,7 @@ _NEAR_THE_LOG: Final = (
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
 )
 """Candidates where a rule must leave effective users of a log with propensities."""
+_value = attrgetter("value")
 
 
 @dataclass(frozen=True)
@@ -454,7 +456,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         warning=_warning(search, best, estimate),
         estimate=estimate,
         details={
-            **search.users.report(),
+            **search.users.report,
             "least_items": search.least_items,
             "least_users": search.least_users,
             "halves_agree": list(agree),
@@ -616,10 +618,6 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
         *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
-
-
-def _value(candidate: SimulatedRule) -> float:
-    return candidate.value
 
 
 def _mean(values: Float64Array) -> float:

@@ -203,13 +203,12 @@ class SequencePolicy(nn.Module, ABC):
             features: (B, K, d) of the windows.
             windows: normalised.
         """
-        exposed, padded = self.exposed(windows), some_padding(windows.mask)
+        padded = some_padding(windows.mask)
+        exposed = self.exposed(windows, padded)
 
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
             return values.flatten(0, 1) if padded is None else values[padded]
 
-        if exposed is not None and padded is not None:
-            exposed = exposed.select(padded.flatten())
         inputs = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
             value = self.head.loss(*inputs)  # type: ignore[arg-type]
@@ -254,11 +253,13 @@ class SequencePolicy(nn.Module, ABC):
         best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 
-    def exposed(self, windows: Windows) -> Exposed | None:
-        """What was shown before each of the (B·K) steps; None without `policy.exposure`."""
+    def exposed(self, windows: Windows, steps: Tensor | None = None) -> Exposed | None:
+        """What was shown before each of the (B·K) steps, or of the `steps` of a mask (B, K); None
+        without `policy.exposure`."""
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
-        return Exposed.before(windows, self.head.exposure.lags)
+        exposed = Exposed.before(windows, self.head.exposure.lags)
+        return exposed if steps is None else exposed.select(steps.flatten())
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:

@@ -397,8 +397,7 @@ class BPRPolicy(SequencePolicy):
         assert isinstance(head, ItemHead)
         normalized, liked = self.normalize(windows), self._liked(windows) > 0
         features, shown = self.features(normalized)[liked], windows.actions[liked]
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(liked.flatten())
+        exposed = self.exposed(normalized, liked)
         negative = torch.randint(len(head.bias), shown.shape, device=shown.device)
         apart = head.logit(features, shown, exposed) - head.logit(features, negative, exposed)
         value = -F.logsigmoid(apart).sum() / max(1, len(shown))

@@ -261,8 +261,7 @@ class EDT4RecPolicy(DTPolicy):
         normalized = self.normalize(_consistent(windows))
         features = self.features(normalized)
         imitation, scalars = self.imitation(features, normalized)
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
+        exposed = self.exposed(normalized, windows.mask)
         entropy = self.head.entropy(features[windows.mask], exposed)  # type: ignore[operator]
         multiplier = self.log_multiplier.exp()
         constraint = (

@@ -101,8 +101,7 @@ class GSASRecPolicy(SASRecPolicy):
         normalized = self.normalize(windows)
         valid = windows.mask
         features, shown = self.features(normalized)[valid], windows.actions[valid]
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(valid.flatten())
+        exposed = self.exposed(normalized, valid)
         items = self._drawn(len(head.bias))
         rate = min(1.0, (len(items) - 1) / max(1, len(head.bias) - 1)) or 1.0
         t = self.config.calibration

@@ -122,13 +122,6 @@ def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
     assert weighted.items < plain.items
 
 
-def test_a_rule_simulated_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
-    rule = DecisionRule(2.0, reward_weight=1.0, temperature=0.5)
-    assert search_of(folder, trained).simulate([rule]) == search_of(folder, trained).simulate(
-        [rule]
-    )
-
-
 def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained, replace(FEW, sessions=30))
     rules = [

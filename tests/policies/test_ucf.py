@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import SequencePolicy, some_padding
+from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.convformers import LSDTConfig, LSDTPolicy
 from ucfrec.policies.dt import attend
 from ucfrec.policies.registry import policy_class
@@ -170,17 +170,6 @@ def test_padding_is_inert(name: str, sizes: dict[str, int]) -> None:
         torch.manual_seed(3)
         losses.append(policy.loss(each)[0])
     torch.testing.assert_close(*losses)
-
-
-@both_heads
-@sequence
-def test_padding_is_as_if_the_window_were_shorter(name: str, sizes: dict[str, int]) -> None:
-    policy, windows = build(name, sizes), random_windows(sizes, padding=(4, 4, 4))
-    fields = ("states", "actions", "rewards", "returns_to_go", "timesteps", "mask")
-    short = Windows(**{field: getattr(windows, field)[:, 4:] for field in fields})
-    torch.testing.assert_close(
-        predictions(policy, windows)[:, 4:], predictions(policy, short), rtol=1e-5, atol=1e-5
-    )
 
 
 def test_attention_rows_sum_to_one_and_see_only_what_is_revealed() -> None:
@@ -486,19 +475,6 @@ def test_attention_drops_weights_and_keeps_the_mean() -> None:
     torch.testing.assert_close(
         first[first != 0], torch.full_like(first[first != 0], 1 / 0.7), rtol=1e-3, atol=0
     )
-
-
-def test_everything_or_nothing_can_be_dropped() -> None:
-    values = torch.randn(5)
-    assert torch.equal(Dropout(1.0)(values), torch.zeros(5))
-    assert torch.equal(Dropout(0.0)(values), values)
-
-
-def test_only_windows_with_padding_need_their_mask() -> None:
-    mask = torch.ones(2, 3, dtype=torch.bool)
-    assert some_padding(mask) is None
-    mask[0, 0] = False
-    assert some_padding(mask) is mask
 
 
 def test_every_layer_starts_with_xaviers_weights() -> None:

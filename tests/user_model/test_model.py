@@ -114,15 +114,6 @@ def test_sessions_that_go_on_are_what_they_would_be_with_the_others(store: Episo
     np.testing.assert_array_equal(*paid)
 
 
-def test_equal_seeds_give_equal_sessions(store: EpisodeStore) -> None:
-    rewards = []
-    for seed in (7, 7, 8):
-        users = UserSimulator(users_of(store, 0.0), store, 50, 20, seed)
-        rewards.append([users.step(np.full(50, i))[0] for i in range(6)])
-    assert np.array_equal(rewards[0], rewards[1])
-    assert not np.array_equal(rewards[0], rewards[2])
-
-
 @pytest.mark.parametrize(
     ("lengths", "longest"),
     [

@@ -24,7 +24,7 @@ def test_the_loss_is_that_of_the_paper(
     assert isinstance(policy, GSASRecPolicy)
     n_items = len(store.item_states.embeddings)
     drawn = torch.arange(min(negatives, n_items))
-    monkeypatch.setattr(policy, "_drawn", lambda _: drawn)
+    monkeypatch.setattr(policy, "_draw", lambda _: drawn)
     windows = store.windows(*store.locate(torch.arange(20).numpy()), 6)
     found = policy.loss(windows)[0].detach()
     normalized = policy.normalize(windows)

@@ -114,9 +114,9 @@ class _ManyRules(PolicyActor):
             begin, windows = batch[0][1].start, list[Windows]()
             # Windows depend on the rule's targets alone.
             for _, rules in groupby(batch, lambda entry: self._targets(entry[0])):
-                (first, part), *others = rules
-                end = others[-1][1].stop if others else part.stop
-                windows.append(self._scorers[first].windows(sessions.at(slice(part.start, end))))
+                group = list(rules)
+                part = slice(group[0][1].start, group[-1][1].stop)
+                windows.append(self._scorers[group[0][0]].windows(sessions.at(part)))
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)

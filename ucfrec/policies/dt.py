@@ -193,7 +193,7 @@ class CDT4RecPolicy(DTPolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set the mean and standard deviation of the training rewards."""
-        rewards = torch.from_numpy(train.step_values(schema.REWARD, *train.all_steps()))
+        rewards = torch.from_numpy(train.column(schema.REWARD))
         self.reward_mean.copy_(rewards.mean())
         self.reward_std.copy_(rewards.std(correction=0).clamp(min=1e-6))
 

@@ -88,7 +88,7 @@ class ConservativeQ(nn.Module):
             uniform = self.every[torch.randint(len(self.every), shape)]
         else:
             low, high = self.low, self.high
-            uniform = low + (high - low) * torch.rand(*shape, len(low))
+            uniform = low + (high - low) * torch.rand((*shape, len(low)))
         return torch.cat([logged, uniform], dim=1)
 
     def compare(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:

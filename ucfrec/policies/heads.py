@@ -208,7 +208,7 @@ class ItemHead(nn.Module):
             ]
             return torch.stack(parts).logsumexp(0) - logit
         candidates = self._proposal_now().draw(self.samples)
-        logits = self._weighted(features, candidates, exposed)
+        logits = self._weigh(features, candidates, exposed)
         # The logged item counts as itself, not as one that was drawn.
         column = columns_of(actions, candidates.items)
         rows = torch.nonzero(column >= 0)[:, 0]
@@ -222,7 +222,7 @@ class ItemHead(nn.Module):
             of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
             return of_all
         candidates = self._proposal_now().draw(self.samples)
-        logs = self._weighted(features, candidates, exposed).log_softmax(-1)
+        logs = self._weigh(features, candidates, exposed).log_softmax(-1)
         estimate: Tensor = -(logs.exp() * (logs - candidates.log_weights)).sum(-1).mean()
         return estimate
 
@@ -240,9 +240,7 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def _weighted(
-        self, features: Tensor, candidates: Candidates, exposed: Exposed | None
-    ) -> Tensor:
+    def _weigh(self, features: Tensor, candidates: Candidates, exposed: Exposed | None) -> Tensor:
         """Logits (M, L) of the candidates plus their log weights."""
         items = candidates.items
         bias = self._gather_bias(items) + candidates.log_weights
@@ -337,5 +335,5 @@ def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
     """
     advantage = (returns - values[:, 0]).detach()
     deviation = joint_moments(advantage)[1]
-    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_CLIP).exp()
+    weights = (advantage / deviation.clamp(min=1e-6)).clamp(_CLIP[0], _CLIP[1]).exp()
     return weights / joint_moments(weights)[0]

@@ -106,7 +106,8 @@ class UCFPolicy(SequencePolicy):
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
-        return self._outputs(*self._fuse_streams(windows), _visible(windows.mask))
+        states, tokens = self._fuse_streams(windows)
+        return self._outputs(states, tokens, _visible(windows.mask))
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d): attention has a single query."""

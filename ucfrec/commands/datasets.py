@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InputError: there is no such data set, no folder is named, or it cannot be downloaded.
     """
-    from ucfrec.logs.releases import find_release, load_release
+    from ucfrec.logs.mapping import find_release, load_release
     from ucfrec.reporting.tables import text_table
 
     adapters = _load_adapters()

@@ -424,11 +424,11 @@ def logs_given(
             --column or the mapping file is unusable.
     """
     from ucfrec.logs.expressions import Expression
-    from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
+    from ucfrec.logs.mapping import LogMapping, read_columns, read_mapping
     from ucfrec.plugins import load_plugin
 
     mapping = LogMapping(
-        columns_given(options.column),
+        read_columns(options.column),
         time_format=options.time_format,
         earliest=options.earliest,
         where=options.where and Expression(options.where, "--where"),

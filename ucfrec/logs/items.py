@@ -1,20 +1,24 @@
-"""Item embeddings and user features, learnt from the training split only."""
+"""Item embeddings and user features of a store, learnt from the training split only.
+
+A policy that was trained on them goes on with those of a store that has grown, so these lie in the
+same space: old rows stay where they are.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import numpy as np
 from scipy import sparse
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
+from ucfrec.episodes.item_table import DISTINCT_TAGS, ITEM_STATES, write_item_table
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
-from ucfrec.logs.measures import Moments
-from ucfrec.logs.spectral import SparseRows, right_singular_vectors
+from ucfrec.logs.features import EncodedFeatures
+from ucfrec.logs.sessions import Moments
 from ucfrec.processes import require_blas_memory
 
 PRIOR_COUNT: Final = 3.0
@@ -29,6 +33,8 @@ BLOCK_STEPS: Final = 2**19
 """Training steps in memory at a time, or more if one user has more."""
 EXPOSURE: Final = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
+_ALIKE: Final = 0.5
+"""Share of items that two tags must have in common (Jaccard) to be the same tag."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         held.append(batch)
         if sum(len(batch.users) for batch in held) < BLOCK_STEPS:
             continue
-        joined = joined_steps(held)
+        joined = join_steps(held)
         changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
         if not len(changes):
             held = [joined]
@@ -63,7 +69,7 @@ def training_steps(folder: Path) -> Iterator[TrainingSteps]:
         yield _part(joined, slice(end))
         held = [_part(joined, slice(end, None))]
     if held:
-        yield joined_steps(held)
+        yield join_steps(held)
 
 
 def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSteps]:
@@ -91,7 +97,7 @@ def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSte
             begin = end
 
 
-def joined_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
+def join_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
     """The steps of all batches as one."""
     return TrainingSteps(
         np.concatenate([batch.users for batch in batches]),
@@ -104,34 +110,18 @@ def _part(batch: TrainingSteps, rows: slice) -> TrainingSteps:
     return TrainingSteps(batch.users[rows], batch.items[rows], batch.rewards[rows])
 
 
-def write_item_states(
-    folder: Path,
-    scratch: Path,
-    item_features: sparse.csr_matrix | None,
-    user_features: sparse.csr_matrix | None,
-    n_items: int,
-    n_users: int,
-    size: int,
-    tags: IntArray | None = None,
-) -> None:
+def write_item_states(folder: Path, scratch: Path, known: EncodedFeatures, size: int) -> None:
     """Learn the item embeddings and user features of the store at `folder` and write them there.
 
     Args:
-        folder: episode store, which receives the file of item states.
         scratch: folder for files that are of no use afterwards.
-        item_features: (n_items, F) as from `ucfrec.logs.features.encode_features`; None for none.
-        user_features: (n_users, G) likewise.
-        tags: (n_items, T) as from `ucfrec.logs.features.item_tags`; None for none.
+        size: most dimensions of an item embedding.
 
     Raises:
         InputError: the rewards of the training split are all equal.
     """
-    counts = np.zeros(n_items, dtype=np.int64)
-    trained = np.zeros(n_users, dtype=bool)
     moments, low, highest = Moments(1), np.inf, -np.inf
     for batch in training_steps(folder):
-        counts += np.bincount(batch.items, minlength=n_items)
-        trained[batch.users] = True
         moments.add(batch.rewards)
         low = min(low, float(batch.rewards.min(initial=np.inf)))
         highest = max(highest, float(batch.rewards.max(initial=-np.inf)))
@@ -140,18 +130,18 @@ def write_item_states(
         raise InputError(
             f"all {moments.count} rewards of the training split equal {low}; choose another reward"
         )
-    matrix = Exposure(scratch / "exposure.bin", counts)
+    matrix = Exposure(scratch / "exposure.bin", known.item_counts)
     for batch in training_steps(folder):
         liking = np.clip((batch.rewards - low) / (high - low), 0, 1)
         matrix.add(batch.users, batch.items, EXPOSURE + liking)
-    embeddings = item_embeddings(matrix, item_features, size)
-    user_vectors = np.zeros((n_users, 0), dtype=np.float32)
-    if user_features is not None:
-        trained_rows = np.flatnonzero(trained)
-        user_vectors = _reduce(user_features, trained_rows, USER_SIZE)
+    embeddings = item_embeddings(matrix, known.items, size)
+    user_vectors = np.zeros((len(known.user_counts), 0), dtype=np.float32)
+    if known.users is not None:
+        trained_rows = np.flatnonzero(known.user_counts)
+        user_vectors = _reduce(known.users, trained_rows, USER_SIZE)
         spread = user_vectors[trained_rows].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
-    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, tags)
+    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, known.tags)
 
 
 class Exposure:
@@ -231,14 +221,14 @@ def item_embeddings(
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
     combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
-        combined = predicted_from_features(features, trained, cooccurrence, counts)
+        combined = predict_from_features(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
 
 
-def predicted_from_features(
+def predict_from_features(
     features: sparse.csr_matrix,
     trained: IntArray,
     cooccurrence: Float64Array,
@@ -281,3 +271,243 @@ def _axes(trained_rows: sparse.csr_matrix, size: int) -> Array:
 def _unit_rows(rows: Array) -> Array:
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(norms > 0, norms, 1)
+
+
+_OVERSAMPLES: Final = 10
+_SMALL: Final = 1e-10
+"""Eigenvalues below this share of the largest are rounding errors."""
+
+
+class SparseRows:
+    """A sparse matrix on disk, in blocks of consecutive rows."""
+
+    def __init__(self, path: Path, n_columns: int) -> None:
+        """
+        Args:
+            path: of a new file for scratch.
+            n_columns: of the matrix.
+        """
+        self._file: IO[bytes] = path.open("w+b")
+        self._blocks: list[tuple[int, int]] = []
+        self.shape = (0, n_columns)
+
+    def append(self, rows: sparse.csr_matrix) -> None:
+        """Append rows with float32 values."""
+        for array, dtype in ((rows.indptr, "<i8"), (rows.indices, "<i4"), (rows.data, "<f4")):
+            self._file.write(np.ascontiguousarray(array, dtype=dtype).data)
+        self._blocks.append((rows.shape[0], rows.nnz))
+        self.shape = (self.shape[0] + rows.shape[0], self.shape[1])
+
+    def blocks(self) -> Iterator[sparse.csr_matrix]:
+        """The rows, as they were appended."""
+        self._file.seek(0)
+        for rows, values in self._blocks:
+            starts = np.fromfile(self._file, "<i8", rows + 1)
+            columns = np.fromfile(self._file, "<i4", values)
+            data = np.fromfile(self._file, "<f4", values)
+            index = starts.astype(np.int32) if values < 2**31 else starts
+            yield sparse.csr_matrix((data, columns, index), shape=(rows, self.shape[1]))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def right_singular_vectors(
+    matrix: SparseRows, by_column: Float64Array, rank: int
+) -> tuple[Float64Array, Float64Array]:
+    """Largest singular values and right singular vectors of a matrix whose columns are divided.
+
+    The randomised subspace iteration of Halko, Martinsson and Tropp (2011), with the sizes, numbers
+    of iterations and random start of scikit-learn's `randomized_svd`, so that both agree but for
+    rounding (products are in float32) and signs. Only matrices with a row for each column are in
+    memory; scikit-learn would also need some with a row for each row.
+
+    Args:
+        matrix: (m, n).
+        by_column: (n,) what columns are divided by, above 0.
+        rank: number of vectors, at most min(m, n).
+
+    Returns:
+        Singular values (rank,), and vectors (rank, n), each with its largest entry above 0. Values
+        beyond the rank of the matrix are 0, and so are their vectors.
+    """
+    m, n = matrix.shape
+    random = np.random.RandomState(0)
+    width = rank + _OVERSAMPLES
+    if m < n:
+        basis = np.zeros((n, width))
+        for block in matrix.blocks():
+            basis += block.T @ random.normal(size=(block.shape[0], width)).astype(np.float32)
+        basis /= by_column[:, None]
+    else:
+        basis = random.normal(size=(n, width))
+    for _ in range(7 if rank < 0.1 * min(m, n) else 4):
+        basis = _there_and_back(matrix, by_column, _orthonormal(basis))
+    basis, _ = np.linalg.qr(basis)
+    gram = np.zeros((basis.shape[1], basis.shape[1]))
+    back = _there_and_back(matrix, by_column, basis, gram)
+    if m < n:
+        values, vectors = _largest(gram, rank)
+        directions = (basis @ vectors).T
+    else:
+        # With A V = Q R, the right singular vectors of Qᵀ A are those of R⁻ᵀ (Aᵀ A V)ᵀ.
+        roots, axes = _largest(gram, len(gram))
+        projected = (back @ (axes * _inverse(roots))).T
+        values, vectors = _largest(projected @ projected.T, rank)
+        directions = (vectors * _inverse(values)).T @ projected
+    signs = np.sign(directions[np.arange(rank), np.abs(directions).argmax(axis=1)])
+    return values, directions * np.where(signs == 0, 1, signs)[:, None]
+
+
+def _orthonormal(basis: Float64Array) -> Float64Array:
+    """A basis of the same space that is orthonormal up to rounding errors."""
+    try:
+        # Several times faster than a QR decomposition, and exact enough between iterations.
+        triangle = np.linalg.cholesky(basis.T @ basis)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.qr(basis)[0])
+    return np.asarray(basis @ np.linalg.inv(triangle).T)
+
+
+def _inverse(values: Float64Array) -> Float64Array:
+    """1 / x, and 0 for 0."""
+    return np.divide(1, values, out=np.zeros_like(values), where=values > 0)
+
+
+def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64Array]:
+    """Square roots of the largest eigenvalues, descending, 0 for rounding errors; eigenvectors."""
+    values, vectors = np.linalg.eigh(symmetric)
+    values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
+    if rank > len(values):
+        missing = rank - len(values)
+        values = np.pad(values, (0, missing))
+        vectors = np.pad(vectors, ((0, 0), (0, missing)))
+    values = np.where(values > _SMALL * max(values[0], 0), values, 0)
+    return np.sqrt(values), np.where(values > 0, vectors, 0)
+
+
+def _there_and_back(
+    matrix: SparseRows,
+    by_column: Float64Array,
+    basis: Float64Array,
+    gram: Float64Array | None = None,
+) -> Float64Array:
+    """AᵀA V for the matrix A with divided columns and a basis V; adds (A V)ᵀ(A V) to `gram`."""
+    scaled = (basis / by_column[:, None]).astype(np.float32)
+    back = np.zeros(basis.shape)
+    for block in matrix.blocks():
+        product = block @ scaled
+        if gram is not None:
+            gram += product.T @ product
+        back += block.T @ product
+    return back / by_column[:, None]
+
+
+def write_grown_states(
+    store: Path, folder: Path, new_shards: Iterable[int], known: EncodedFeatures
+) -> None:
+    """Write the item states of the store at `folder`, grown from `store`.
+
+    With feature tables, new items and users have the vectors that a ridge regression of the old
+    ones on the features predicts, and old ones keep theirs. Without, new ones begin at the mean,
+    and items move towards what their users were shown besides as new training steps outweigh the
+    old.
+
+    Args:
+        new_shards: those of the new log's steps.
+    """
+    from ucfrec.episodes.states import ItemStates  # needs torch
+
+    steps, old = [*steps_of_shards(folder, new_shards)], ItemStates.load(store / ITEM_STATES)
+    step_counts = np.zeros(len(known.item_counts), dtype=np.int64)
+    for batch in steps:
+        step_counts += np.bincount(batch.items, minlength=len(step_counts))
+    old_counts = np.maximum(known.item_counts - step_counts, 0)
+    vectors = _extend_rows(old.embeddings.numpy(), known.items, old_counts)
+    if known.items is None and step_counts.any():
+        new, low = join_steps(steps), old.reward_low
+        liking = np.clip((new.rewards - low) / (old.reward_high - low), 0, 1)
+        vectors = _fold_in(vectors, new, EXPOSURE + liking, old_counts, step_counts)
+    features = _extend_rows(old.user_features.numpy(), known.users, known.user_counts)
+    write_item_table(
+        folder / ITEM_STATES,
+        vectors.astype(np.float32),
+        features.astype(np.float32),
+        old.reward_low,
+        old.reward_high,
+        _number_tags(old.tags.numpy(), known.tags, len(vectors)),
+    )
+
+
+def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: IntArray) -> Array:
+    """(n, D): the old rows, and for others what their features predict, or the mean."""
+    trained = np.flatnonzero(counts[: len(old)])
+    mean = old[trained].mean(axis=0) if len(trained) else np.zeros(old.shape[1])
+    rows = np.tile(mean, (len(counts), 1)).astype(np.float64)
+    if features is not None and len(trained) and old.shape[1]:
+        rows += predict_from_features(features, trained, old[trained] - mean, counts[trained])
+        # Of an id without any feature nothing is predicted.
+        rows[np.diff(features.indptr) == 0] = mean
+    rows[: len(old)] = old
+    return rows
+
+
+def _fold_in(
+    vectors: Float64Array,
+    new: TrainingSteps,
+    liking: Float64Array,
+    old_counts: IntArray,
+    step_counts: IntArray,
+) -> Float64Array:
+    """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD).
+
+    A user's vector is the mean of those of the items shown, weighted by liking. What an item has
+    in new steps weighs as much as their number, against the number of old ones.
+    """
+    _, rows = np.unique(new.users, return_inverse=True)
+    shape = (int(rows.max()) + 1, len(vectors))
+    weights = sparse.csr_matrix((liking, (rows, new.items)), shape=shape)
+    of_users = (weights @ vectors) / np.asarray(weights.sum(axis=1))
+    folded = weights.T @ (of_users - of_users.mean(axis=0))
+    norms = np.linalg.norm(vectors[old_counts > 0], axis=1)
+    lengths = np.linalg.norm(folded, axis=1, keepdims=True)
+    folded *= (norms.mean() if len(norms) else 1.0) / np.where(lengths > 0, lengths, 1.0)
+    share = (step_counts / (step_counts + old_counts + PRIOR_COUNT))[:, None]
+    return np.asarray((1 - share) * vectors + share * folded)
+
+
+def _number_tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
+    """(n_items, T) tags by the old numbers; −1 for tags of new items that the store lacks.
+
+    Args:
+        old: (n_old, T).
+        new_tags: (n_items, T') of the new tables, numbered otherwise; T' is 0 without tables.
+    """
+    tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
+    tags[: len(old)] = old
+    if not (old.shape[1] and new_tags.shape[1]):
+        return tags
+    # A new tag is the old one that most of the same items have.
+    sizes = int(new_tags.max()) + 1, int(old.max()) + 1
+    have_new, have_old = _incidence(new_tags[: len(old)], sizes[0]), _incidence(old, sizes[1])
+    both = (have_new.T @ have_old).toarray()
+    union = have_new.sum(axis=0).T + have_old.sum(axis=0) - both
+    share = np.asarray(both / np.maximum(union, 1))
+    best = share.argmax(axis=1)
+    same = {
+        tag: int(best[tag])
+        for tag in range(min(sizes[0], DISTINCT_TAGS + 1))
+        if share[tag, best[tag]] >= _ALIKE
+    }
+    for item in range(len(old), n_items):
+        shared = [same[tag] for tag in new_tags[item].tolist() if tag in same][: old.shape[1]]
+        tags[item, : len(shared)] = shared
+    return tags
+
+
+def _incidence(tags: IntArray, size: int) -> sparse.csr_matrix:
+    """(n, size) 1 where an item has a tag."""
+    rows, columns = np.nonzero(tags >= 0)
+    values = np.ones(len(rows))
+    return sparse.csr_matrix((values, (rows, tags[rows, columns])), shape=(len(tags), size))

@@ -14,8 +14,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import bind, explained
-from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined
 from ucfrec.logs.tables import (
@@ -24,9 +23,9 @@ from ucfrec.logs.tables import (
     first_and_more,
     is_number,
     open_tables,
-    quoted,
+    quote_name,
 )
-from ucfrec.logs.typed import WANTED, typed_columns
+from ucfrec.logs.typed import WANTED, LogTables, type_columns
 
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
@@ -126,7 +125,7 @@ def join_feedback(
     ):
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
-        with explained(connection, (*shown_tables, *tables), folder):
+        with explain_errors(connection, (*shown_tables, *tables), folder):
             further = _make_exposures(connection, shown_tables)
             columns = _make_feedback(connection, tables, mapping)
             connection.execute(
@@ -175,7 +174,7 @@ def _make_exposures(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
-    typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
+    typed = type_columns(LogTables(connection, tables, _keys_of(LogMapping()), "0", "user"))
     further: dict[str, _Further] = {}
     for table in tables:
         for key, name in _names_of(table).items():
@@ -212,7 +211,7 @@ def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -
             columns.append(name)
             is_other = key in _OTHERS
             values[key if is_other else further[key].alias] = (
-                f"CAST({quoted(name)} AS {_OTHERS[key]})" if is_other else quoted(name)
+                f"CAST({quote_name(name)} AS {_OTHERS[key]})" if is_other else quote_name(name)
             )
     selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
     return f"{selects} FROM {keys.with_texts(columns, texts).sql}"
@@ -233,7 +232,7 @@ def _make_feedback(
                 "their folder or as a pattern in quotes that the shell does not expand, and then "
                 "files of feedback"
             )
-    typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
+    typed = type_columns(LogTables(connection, tables, _keys_of(mapping), "0", "user"))
     keys = {
         column.casefold()
         for table in tables
@@ -304,7 +303,7 @@ def _feedback_columns(
         ((values, words, sample),) = connection.sql(
             "SELECT count(x), count(x) FILTER (n), min(x) FILTER (n) FROM (SELECT x, "
             "NOT coalesce(isfinite(TRY_CAST(x AS DOUBLE)), false) AS n FROM (SELECT "
-            f"trim(CAST({quoted(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
+            f"trim(CAST({quote_name(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
         ).fetchall()
         found_words = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
         if words and key in columns:
@@ -332,7 +331,7 @@ def _value(n: int) -> str:
 
 def _cast_number(name: str, kind: str) -> str:
     """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
-    value = quoted(name) if _holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
+    value = quote_name(name) if _holds_feedback(kind) else f"CAST({quote_name(name)} AS VARCHAR)"
     return f"CAST({value} AS DOUBLE)"
 
 
@@ -352,7 +351,9 @@ def _write(
     values = {FEEDBACK: FEEDBACK, **{name: _value(n) for n, name in enumerate(columns)}}
     largest = "".join(f", max({_value(n)}) AS {_value(n)}" for n in range(len(columns)))
     again = {name.casefold() for name in values}
-    selects = [f"{c.alias} AS {quoted(c.name)}" for key, c in further.items() if key not in again]
+    selects = [
+        f"{c.alias} AS {quote_name(c.name)}" for key, c in further.items() if key not in again
+    ]
     for name, value in values.items():
         sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
         if earlier is not None and earlier.is_number:
@@ -361,7 +362,7 @@ def _write(
                 if name == FEEDBACK
                 else f"greatest({sql}, CAST(coalesce({earlier.alias}, 0) AS DOUBLE))"
             )
-        selects.append(f"{sql} AS {quoted(name)}")
+        selects.append(f"{sql} AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
     user = "CAST(user_id AS BIGINT) AS user_id" if _are_users_numbers(connection) else "user_id"
     query = (

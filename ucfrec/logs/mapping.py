@@ -1,17 +1,21 @@
-"""Column mappings of logs, written as data, and the datasets that supply them."""
+"""Column mappings of logs, written as data, and the datasets and releases that supply them."""
 
 import glob
+import hashlib
+import tarfile
 import warnings
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Final
+from pathlib import Path, PurePosixPath
+from textwrap import shorten
+from typing import Final, get_args
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.atomic import read_toml
+from ucfrec.files.atomic import atomic_folder, read_toml
 from ucfrec.files.remote import RECORDS
 from ucfrec.logs.expressions import Expression
 from ucfrec.settings import nearest
@@ -32,8 +36,7 @@ OPTIONAL_COLUMNS: Final = (
 )
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
-SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
-"""Ways in which rows form sessions."""
+SESSIONS: Final = get_args(schema.SessionBy)
 
 
 @dataclass(frozen=True)
@@ -198,7 +201,7 @@ class Dataset:
     """Public data sets of this kind, by name."""
 
 
-def columns_given(assignments: Sequence[str]) -> dict[str, str]:
+def read_columns(assignments: Sequence[str]) -> dict[str, str]:
     """Read `--column` arguments: "user_id=uid" is {"user_id": "uid"}.
 
     Raises:
@@ -352,3 +355,93 @@ def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
 def is_table(path: Path) -> bool:
     """Whether `path` is a file with a suffix that `prepare` reads."""
     return path.is_file() and path.name.lower().endswith(SUFFIXES)
+
+
+def load_release(
+    adapter: str, dataset: Dataset, name: str, folder: Path, part: str | None = None
+) -> LogFiles:
+    """The logs of a release with their columns mapped, downloaded where they are not there yet.
+
+    Args:
+        folder: of the archive, and of what it holds in a folder of the release's name.
+        part: key of `Release.parts`; None for the first.
+
+    Raises:
+        InputError: there is no such part, the archive can be neither found nor downloaded, it has
+            another checksum, or it does not hold the part.
+    """
+    release = dataset.releases[name]
+    part = next(iter(release.parts)) if part is None else part
+    if part not in release.parts:
+        raise InputError(f"{name} has no part {part!r}; it has {', '.join(release.parts)}")
+    path = _unpack(name, release, folder) / release.parts[part]
+    if not path.exists():
+        raise InputError(f"{path} is missing; delete {folder / name} and load it again")
+    files, mapping = dataset.resolve([path], LogMapping())
+    return LogFiles(files, mapping, adapter)
+
+
+def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
+    """Name of the adapter that has a release.
+
+    Raises:
+        InputError: none has.
+    """
+    adapters = {release: key for key, dataset in datasets.items() for release in dataset.releases}
+    if name not in adapters:
+        raise InputError(f"no data set is called {name!r}; there are {', '.join(sorted(adapters))}")
+    return adapters[name]
+
+
+def _unpack(name: str, release: Release, folder: Path) -> Path:
+    """The folder with the files of a release."""
+    target = folder / name
+    if target.is_dir():
+        return target
+    archive = folder / PurePosixPath(release.url).name
+    if not archive.is_file():
+        _download(name, release, archive)
+    _require_checksum(release, archive)
+    with atomic_folder(target) as scratch:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as content:
+                content.extractall(scratch)
+        else:
+            with tarfile.open(archive) as content:
+                # Names that lead elsewhere, links out of the folder and devices are refused.
+                content.extractall(scratch, filter="data")
+        if release.convert is not None:
+            release.convert(scratch)
+    return target
+
+
+def _download(name: str, release: Release, archive: Path) -> None:
+    by_hand = (
+        f"download {release.url} ({release.size / 1e6:,.0f} MB, see {release.homepage}) to "
+        f"{archive}, then repeat this"
+    )
+    try:
+        import pooch
+    except ModuleNotFoundError:
+        raise InputError(
+            f"downloading {name} needs pooch; install ucfrec[datasets], or {by_hand}"
+        ) from None
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        pooch.retrieve(release.url, release.checksum, archive.name, archive.parent)
+    except Exception as error:  # of several libraries, for names, connections, certificates, status
+        if "does not match the known hash" in str(error):
+            raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
+        reason = shorten(str(error) or type(error).__name__, 200, placeholder=" …")
+        raise InputError(f"{name} cannot be downloaded ({reason}); {by_hand}") from None
+
+
+def _require_checksum(release: Release, archive: Path) -> None:
+    kind, _, stated = release.checksum.partition(":")
+    with archive.open("rb") as file:
+        checksum = hashlib.file_digest(file, kind).hexdigest()
+    if checksum != stated:
+        raise InputError(
+            f"{archive} has {kind} {checksum}, the release {stated}; it is damaged or another "
+            "version: delete it and load it again"
+        )

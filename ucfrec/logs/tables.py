@@ -90,7 +90,7 @@ class Table:
 
     def text_of(self, name: str) -> str:
         """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
-        return f"CAST({quoted(name if self.columnar else raw_name(name))} AS VARCHAR)"
+        return f"CAST({quote_name(name if self.columnar else raw_name(name))} AS VARCHAR)"
 
     @property
     def sql(self) -> str:
@@ -99,13 +99,13 @@ class Table:
         selected = [*kinds, *folders] if self.selected is None else self.selected
         values = []
         for name in (name for name in selected if name in kinds):
-            column, kind = quoted(name), kinds[name]
+            column, kind = quote_name(name), kinds[name]
             if name in self.raw and kind != "VARCHAR":
                 column = f"CAST({column} AS {kind})"
-            values.append(f"{_value_of(column, kind)} AS {quoted(name)}")
-        values += [f"{quoted(name)} AS {quoted(raw_name(name))}" for name in self.raw]
+            values.append(f"{_value_of(column, kind)} AS {quote_name(name)}")
+        values += [f"{quote_name(name)} AS {quote_name(raw_name(name))}" for name in self.raw]
         values += [
-            f"{_folder_value(name, folders[name])} AS {quoted(name)}"
+            f"{_folder_value(name, folders[name])} AS {quote_name(name)}"
             for name in selected
             if name in folders
         ]
@@ -114,14 +114,14 @@ class Table:
     @property
     def source(self) -> str:
         """SQL call of the DuckDB table function that reads the files."""
-        files = ", ".join(text(glob_pattern(file)) for file in self.files)
+        files = ", ".join(quote(glob_pattern(file)) for file in self.files)
         options = "hive_partitioning = false"
         if self.partitions:
-            options += f", filename = {text(_FILE)}"
+            options += f", filename = {quote(_FILE)}"
         if self.columnar:
             return f"read_parquet([{files}], {options})"
         types = ", ".join(
-            f"{text(name)}: {text('VARCHAR' if name in self.raw or kind == NOTHING else kind)}"
+            f"{quote(name)}: {quote('VARCHAR' if name in self.raw or kind == NOTHING else kind)}"
             for name, kind in self.types
         )
         # DuckDB would take quotes for text if the first rows have none, and sometimes leave out
@@ -139,8 +139,8 @@ def raw_name(name: str) -> str:
 def _folder_value(name: str, kind: str = "VARCHAR") -> str:
     """SQL of the value of a column in the name of a folder."""
     pattern = f"(?:^|[/\\\\]){re.escape(name)}=([^/\\\\]*)[/\\\\]"
-    value = f"url_decode(regexp_extract({quoted(_FILE)}, {text(pattern)}, 1))"
-    return f"CAST(nullif({value}, {text(_NO_VALUE)}) AS {kind})"
+    value = f"url_decode(regexp_extract({quote_name(_FILE)}, {quote(pattern)}, 1))"
+    return f"CAST(nullif({value}, {quote(_NO_VALUE)}) AS {kind})"
 
 
 def _wider_type(kind: str) -> str:
@@ -171,12 +171,12 @@ def glob_pattern(file: Path) -> str:
     return _MAGIC.sub(r"[\g<0>]", str(file))
 
 
-def text(value: str) -> str:
+def quote(value: str) -> str:
     """`value` as a SQL string literal."""
     return "'" + value.replace("'", "''") + "'"
 
 
-def quoted(name: str) -> str:
+def quote_name(name: str) -> str:
     """`name` as a SQL identifier."""
     return '"' + name.replace('"', '""') + '"'
 
@@ -201,7 +201,7 @@ def is_vector(kind: str) -> bool:
     return _NUMBERS.fullmatch(kind) is not None
 
 
-def as_timestamp(sql: str, kind: str) -> str | None:
+def cast_timestamp(sql: str, kind: str) -> str | None:
     """SQL of the TIMESTAMP in UTC that a date or time of a DuckDB type means; None for others."""
     if kind == "DATE" or kind.startswith("TIMESTAMP"):
         # DuckDB casts TIMESTAMPTZ_NS only by way of TIMESTAMPTZ.
@@ -257,7 +257,7 @@ def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tu
         if column is None:
             continue
         source = replace(table, partitions=((name, "VARCHAR"),)).source
-        value = f"CAST({quoted(column)} AS VARCHAR)"
+        value = f"CAST({quote_name(column)} AS VARCHAR)"
         differing = connection.sql(
             f"SELECT {value} FROM {source} WHERE {value} IS DISTINCT FROM {_folder_value(name)} "
             "LIMIT 1"
@@ -307,7 +307,7 @@ def _columns(
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         if is_parquet:
-            metadata = f"parquet_file_metadata({text(glob_pattern(file))})"
+            metadata = f"parquet_file_metadata({quote(glob_pattern(file))})"
             ((rows,),) = connection.sql(f"SELECT num_rows FROM {metadata}").fetchall()
             require_plausible_rows(file, rows)
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
@@ -390,19 +390,19 @@ def _types_of_all_rows(
     # A column without a value is text; most columns of text have one in the first rows.
     words = [name for name, kind in types if kind == "VARCHAR"]
     counts = _first_row(
-        connection, Table((file,), types), [f"count({quoted(n)})" for n in words], 1000
+        connection, Table((file,), types), [f"count({quote_name(n)})" for n in words], 1000
     )
     words = [name for name, count in zip(words, counts, strict=False) if not count]
     changes: list[tuple[str, str, str]] = [
-        (name, NOTHING, f"count({quoted(name)}) = 0") for name in words
+        (name, NOTHING, f"count({quote_name(name)}) = 0") for name in words
     ]
     for name, kind in types:
-        column = quoted(name)
+        column = quote_name(name)
         if kind in _EXACT:
             differs = f"TRY_CAST({column} AS {_EXACT[kind]}) <> TRY_CAST({column} AS {kind})"
             changes.append((name, _EXACT[kind], f"bool_or({differs})"))
         if kind == "DATE" or kind.startswith("TIMESTAMP"):
-            iso = f"regexp_full_match(trim({column}), {text(ISO_TIME)})"
+            iso = f"regexp_full_match(trim({column}), {quote(ISO_TIME)})"
             changes.append((name, "VARCHAR", f"bool_or(NOT {iso})"))
         if kind == "BIGINT":
             changes.append((name, "VARCHAR", f"bool_or(regexp_full_match({column}, '-?0\\d+'))"))

@@ -13,7 +13,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark_users import GivenLog, by_users
+from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.off_policy.score import (
     SESSION,
     about_scores,
@@ -59,18 +59,18 @@ def score_with_spark(
     require_items(trained)
     columns, options = training_options(trained, mapping)
     assert options.reward is not None
-    log = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
+    log = UserLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
         run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
         part = _ScorePart(run, folder.absolute(), memory_limit, rule, filter_seen)
-        sessions = by_users(log, folder.parent, master, part)
+        sessions = map_users(log, folder.parent, master, part)
         number_sessions(folder, sessions)
     return sum(sessions)
 
 
 @dataclass(frozen=True)
 class _ScorePart:
-    """Scores the sessions of a part, see `ucfrec.logs.spark_users.Work`."""
+    """Scores the sessions of a part, see `ucfrec.logs.spark.Work`."""
 
     run: RunOnWorkers
     out: Path

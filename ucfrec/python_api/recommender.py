@@ -31,8 +31,8 @@ from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
-from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles
+from ucfrec.logs.rows import DAY_MS
 from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
-from ucfrec.logs.kept import REASONS
+from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
 

@@ -32,6 +32,7 @@ from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import SessionEndReport
 
@@ -214,7 +215,7 @@ class RunRecord(TrainingRecord):
     """The same as seen from the run; None on another drive of Windows."""
     reward: Text
     """The expression that computed the rewards."""
-    session_by: Text | None
+    session_by: SessionBy | None
     session_gap_ms: Count | None
     observation_size: Count
     train_episodes: Count

@@ -1,4 +1,4 @@
-"""Public data sets: downloads, checksums, archives by hand, and what is said where it fails."""
+"""Mappings of files and Python; public data sets: downloads, checksums, archives by hand."""
 
 import hashlib
 import io
@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, LogMapping, Release, log_files
-from ucfrec.logs.releases import find_release, load_release
+from ucfrec.logs.mapping import Dataset, LogMapping, Release, find_release, load_release, log_files
 
 ROWS = b"user_id,item_id,timestamp,reward\n1,2,2024-05-01,1\n"
 

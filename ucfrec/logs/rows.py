@@ -1,27 +1,33 @@
-"""The usable rows of a log in order of user and time: one ORDER BY, then one pass.
+"""Which rows of a log count, and in which order: one rule for files, frames and requests.
 
-`coded_ids` and `in_order` are run by DuckDB or by Spark and mean the same to both. Their order says
-all that is to be known of a row: what follows compares it with the row before.
+One ORDER BY, then one pass: the SQL is run by DuckDB or by Spark and means the same to both, and
+what follows compares a row with the one before.
+
+Rows of one user at one time, such as a page that was logged at once or a log of days, have no order
+that could be learned: theirs is that of a hash of user, time and item. Any other order, such as
+that of the ids, is one that a policy predicts.
 """
 
+import hashlib
 import io
 import mmap
-from collections.abc import Iterable, Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import as_numpy
-from ucfrec.logs.kept import HASH, REASONS, TIE, faults, order_duplicates
-from ucfrec.logs.tables import MAX_FLOAT
-from ucfrec.logs.typed import ROWS, WANTED, TypedLog
+from ucfrec.logs.engine import to_numpy
+from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, quote
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
 
 USER, ITEM, SESSION = "user_code", "item_code", "session"
 """Columns of the sorted rows: numbers of the ids, in the order of the ids."""
@@ -34,8 +40,37 @@ CODES: Final = {
 _NO_SESSION: Final = 2**31 - 1
 """Number of rows without a session, where sessions are formed otherwise."""
 FAULTY: Final = "faulty"
-"""View of all rows, as of `with_faults`."""
+"""View of all rows, as of `mark_faults`."""
 FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
+DUPLICATES: Final = {
+    "highest": "has the highest",
+    "lowest": "has the lowest",
+    "first": "comes first in the files",
+    "last": "comes last in the files",
+}
+"""Which of several rows with the same user, item or action, and time is kept: rule to its
+description."""
+PRIME: Final = 2**31 - 1
+USER_FACTOR: Final = 7919
+HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
+"""SQL of `hash_ids`, for Spark and, where `conv` is a macro, for DuckDB."""
+TIE: Final = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME})"
+"""SQL of the place of a row among those of one user and time, by the hash of the user, the time and
+the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
+two items are as often in one order as in the other."""
+DAY_MS: Final = 86_400_000
+"""One day in ms."""
+REASONS: Final = {
+    "left_out": "does not fulfil --where",
+    "null_key": "user, item or action, time or session is missing",
+    "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "
+    "more than a day ahead of now",
+    "vector_not_finite": "action is missing or holds NaN or infinity",
+    "unknown_item": "item is not in the store",
+    "duplicate": "repeats user, item or action, and time of another row, which is kept",
+    "reward_not_finite": "reward is missing, NaN or infinite",
+}
+"""Reason to its description; a row is dropped for the first reason that applies."""
 
 
 class RowVectors:
@@ -45,20 +80,18 @@ class RowVectors:
     """
 
     def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
-        """
+        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation`.
+
         Args:
-            batches: `row`, from 1 on in order, and `observation`, finite.
             size: of an observation.
-            file: to write; None for memory.
         """
-        rows, self._file = 0, file
-        memory = io.BytesIO()
+        rows, self._file, memory = 0, file, io.BytesIO()
         with memory if file is None else file.open("xb") as out:
             for batch in batches:
-                places = as_numpy(batch.column("row"))
+                places = to_numpy(batch.column("row"))
                 # What is at the place of a row must be its own: the engine keeps their order.
                 assert np.array_equal(places, np.arange(rows + 1, rows + 1 + len(places)))
-                values = as_numpy(batch.column(schema.OBSERVATION).flatten())
+                values = to_numpy(batch.column(schema.OBSERVATION).flatten())
                 out.write(np.ascontiguousarray(values).data)
                 rows += len(places)
             self._memory = memory.getvalue()
@@ -83,10 +116,7 @@ class RowFile:
     """Batches of rows, column by column, in a scratch folder or in memory."""
 
     def __init__(self, folder: Path | None) -> None:
-        """
-        Args:
-            folder: of the files; it is made, and must not exist; None for memory.
-        """
+        """Make the folder of the files; None for memory."""
         if folder is not None:
             folder.mkdir()
         self._folder = folder
@@ -152,17 +182,16 @@ class SortedRows:
     """Number of rewards that are too large to train with."""
 
     def add(self, batch: dict[str, Array], duplicates: str, by_session: bool) -> None:
-        """Add rows as of `in_order`, all of their users, without duplicates and undefined rewards.
+        """Add rows as of `order_rows`, all of their users; leave out duplicates, undefined rewards.
 
         Args:
-            duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
             by_session: whether the rows of a session follow each other, as sessions of one user may
                 overlap.
         """
         keys = (USER, schema.TIMESTAMP, ITEM if ITEM in batch else schema.ACTION)
         repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
         if repeated.any():
-            batch = self._order_duplicates(batch, repeated, duplicates)
+            batch = self._put_winners_first(batch, repeated, duplicates)
             winners = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
             rewards = batch[schema.REWARD]
             lost, counted = rewards[repeated], rewards[winners[repeated]]
@@ -193,14 +222,10 @@ class SortedRows:
             batch = {name: values[order] for name, values in batch.items()}
         self.file.append(batch)
 
-    def _order_duplicates(
+    def _put_winners_first(
         self, batch: dict[str, Array], repeated: BoolArray, duplicates: str
     ) -> dict[str, Array]:
-        """The rows with the one that counts as the first of its duplicates.
-
-        Args:
-            repeated: (M,) whether a row has the user, time and choice of the one before.
-        """
+        """The rows with the one that counts as the first of those that repeat the one before."""
         places = np.flatnonzero(repeated | np.append(repeated[1:], False))
         some = {name: values[places] for name, values in batch.items()}
         if self.observations is not None:
@@ -257,9 +282,8 @@ def sort_rows(
     """Sort the rows of a log with DuckDB.
 
     Args:
-        log: its engine may open `known_items`.
         known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
+        duplicates: key of `DUPLICATES`.
         folder: scratch folder; None for a log in memory.
         by_session: whether the rows of a session follow each other.
 
@@ -267,26 +291,26 @@ def sort_rows(
         InputError: a reward is too large to train with.
     """
     connection = log.connection
-    connection.execute(f"CREATE VIEW {FAULTY} AS {with_faults(log, ROWS, known_items)}")
+    connection.execute(f"CREATE VIEW {FAULTY} AS {mark_faults(log, ROWS, known_items)}")
     connection.execute("CREATE MACRO conv(digits, a, b) AS CAST('0x' || digits AS BIGINT)")
     for name, table in code_tables(log).items():
-        connection.execute(f"CREATE TABLE {table} AS {coded_ids(name, ROWS)}")
+        connection.execute(f"CREATE TABLE {table} AS {code_ids(name, ROWS)}")
     counts = dict(connection.sql(FAULT_COUNTS).fetchall())
 
     def read(query: str) -> Iterator[pa.RecordBatch]:
         yield from connection.sql(query).to_arrow_reader(log.batch_rows)
 
     observations = read(f"SELECT row, {schema.OBSERVATION} FROM {ROWS}")
-    batches = read(in_order(log, FAULTY))
+    batches = read(order_rows(log, FAULTY))
     return check_sorted(log, counts, observations, batches, duplicates, folder, by_session)
 
 
 def code_tables(log: TypedLog) -> dict[str, str]:
-    """Id columns of the log, and the tables of `coded_ids`."""
+    """Id columns of the log, and the tables of `code_ids`."""
     return {name: table for name, (table, _) in CODES.items() if name in log.columns}
 
 
-def coded_ids(name: str, rows: str) -> str:
+def code_ids(name: str, rows: str) -> str:
     """SQL of the ids in a column of some typed rows: `code`, its place in their order, `hash`."""
     return (
         f"SELECT {name}, CAST(row_number() OVER (ORDER BY {name}) - 1 AS INTEGER) AS code, "
@@ -295,32 +319,41 @@ def coded_ids(name: str, rows: str) -> str:
     )
 
 
-def with_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
-    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault from 1.
+def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
+    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1.
 
-    Actions get a hash.
-
-    Args:
-        rows: relation of some of its typed rows.
-        known_items: `items.parquet` of a store: other items are a fault; None for none.
+    Actions get a hash. With `known_items`, of a store, other items are a fault.
     """
+    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
+    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
+    latest = int(time.time() * 1000) + DAY_MS
+    conditions = {"left_out": f"NOT {WANTED}"} if log.has_condition else {}
+    conditions |= {
+        "null_key": " OR ".join(f"{key} IS NULL" for key in keys if key != schema.ACTION),
+        "clock_out_of_range": f"{schema.TIMESTAMP} NOT BETWEEN {log.earliest_ms} AND {latest}",
+    }
+    if schema.ACTION in log.vector_size:
+        conditions["vector_not_finite"] = not_finite(schema.ACTION)
+    if known_items is not None:
+        source = f"read_parquet({quote(glob_pattern(known_items))}, hive_partitioning = false)"
+        known_ids = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
+        conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known_ids})"
     cases = " ".join(
-        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}"
-        for reason, sql in faults(log, known_items).items()
+        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
     )
     columns = [f"* EXCLUDE ({WANTED})" if log.has_condition else "*"]
     if log.key == schema.ACTION:
         text = f"md5(CAST({schema.ACTION} AS VARCHAR))"
         columns.append(f"CAST('0x' || left({text}, 7) AS BIGINT) AS action_hash")
-    fault = f"CAST({f'CASE {cases} ELSE 0 END' if cases else 0} AS SMALLINT) AS fault"
+    fault = f"CAST(CASE {cases} ELSE 0 END AS SMALLINT) AS fault"
     return f"SELECT {', '.join(columns)}, {fault} FROM {rows}"
 
 
-def in_order(log: TypedLog, rows: str) -> str:
-    """SQL of the rows without a fault in order of user, time, the hash of `kept.TIE` and choice.
+def order_rows(log: TypedLog, rows: str) -> str:
+    """SQL of the rows without a fault in order of user, time, the hash of `TIE` and choice.
 
     Args:
-        rows: relation of rows as of `with_faults`; beside it are the tables of `code_tables`.
+        rows: relation as of `mark_faults`; beside it are the tables of `code_tables`.
     """
     tables = code_tables(log)
     joins = [
@@ -364,10 +397,8 @@ def check_sorted(
     Args:
         fault_counts: number of rows of the log by `fault`.
         observations: as of `RowVectors`; read only of a log with observations.
-        batches: as of `in_order`, read after the observations.
-        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
+        batches: as of `order_rows`, read after the observations.
         folder: scratch folder; None for a log in memory.
-        by_session: whether the rows of a session follow each other.
 
     Raises:
         InputError: a reward is too large to train with.
@@ -399,7 +430,83 @@ def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     for name in batch.schema.names:
         column = batch.column(name)
         if name in log.vector_size:
-            columns[name] = as_numpy(column.flatten()).reshape(-1, log.vector_size[name])
+            columns[name] = to_numpy(column.flatten()).reshape(-1, log.vector_size[name])
         else:
-            columns[name] = as_numpy(column)
+            columns[name] = to_numpy(column)
     return columns
+
+
+def choose_rows(
+    rows: Mapping[str, Array], duplicates: str, user_id: int | str | None = None
+) -> IntArray:
+    """(K,) positions of the rows of a log in memory that count, in order of user and time.
+
+    `order_rows` and `SortedRows.add` do the same for logs of any size.
+
+    Args:
+        rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
+            (position in the log) and perhaps those that break ties. `user` holds identifiers but
+            for `user_id`.
+        duplicates: key of `DUPLICATES`.
+        user_id: the only user.
+    """
+    users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
+    order = np.lexsort((times, users))
+    apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
+    if apart.all():
+        return np.asarray(order[finite[order]])
+    tied = np.zeros(len(users), dtype=bool)
+    tied[order[1:]] |= ~apart
+    tied[order[:-1]] |= ~apart
+    items, ties = np.zeros((2, len(users)), dtype=np.int64)
+    ids, items[tied] = np.unique(rows[schema.ITEM][tied], return_inverse=True)
+    names, places = np.unique(users[tied], return_inverse=True)
+    of_users = hash_ids([user_id] * len(names) if user_id is not None else names.tolist())[places]
+    multiplier = 1 + np.fmod(of_users * USER_FACTOR + times[tied], PRIME - 1)
+    ties[tied] = np.fmod(multiplier * (1 + hash_ids(ids.tolist())[items[tied]]), PRIME)
+    keys = [users, times, ties, items]
+    order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    return np.asarray(order[first & finite[order]])
+
+
+def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
+    """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
+    is the first.
+
+    Args:
+        rows: (N,) `reward`, `row` (position in the log) and those of `observation`, `propensity`,
+            `session` and `is_random` that the log has, which decide between rows that are equal to
+            the rule, so that the order of rows and files does not matter.
+        duplicates: key of `DUPLICATES`.
+    """
+    rewards = rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
+    rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
+    keys = [~finite, np.where(finite, rule[duplicates], 0)]
+    for name in (schema.OBSERVATION, schema.PROPENSITY, "session", schema.IS_RANDOM):
+        if name in rows:
+            keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
+    return keys[::-1]
+
+
+def hash_ids(ids: Sequence[object]) -> IntArray:
+    """A number (N,) below 2**28 of the text of each identifier, so that 7 and '7' have one.
+
+    It is that of `HASH`.
+    """
+    # Text of JSON may hold half a character.
+    texts = (str(identifier).encode("utf-8", "surrogatepass") for identifier in ids)
+    digests = (hashlib.md5(text, usedforsecurity=False).hexdigest() for text in texts)
+    return np.asarray([int(digest[:7], 16) for digest in digests], dtype=np.int64)
+
+
+def mix_bits(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
+    values have different results."""
+    values = values + np.uint64(0x9E3779B97F4A7C15)
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))

@@ -57,7 +57,7 @@ def test_what_is_dropped_might_never_have_been_logged(items: bool, tmp_path: Pat
     plain = train_screened(never, tmp_path / "plain", config, None)
     assert record.dropped_observations == FLAGGED
     assert record.sizes == plain.sizes
-    for name in ("overlay", "policy/last", "policy/best"):
+    for name in ("augmented", "policy/last", "policy/best"):
         one, other = (
             load_tensors(tmp_path / run / f"{name}.safetensors")[0] for run in ("dropped", "plain")
         )

@@ -32,7 +32,7 @@ def verdicts(flagged: Sequence[int]) -> Callable[[EpisodeStore, int], ScreeningR
 
     def screen(store: EpisodeStore, seed: int) -> ScreeningReport:
         found = [
-            DimensionReport(d, None, (), None, None, None, d in flagged, d not in flagged)
+            DimensionReport(d, measures_reward=d in flagged, causes=d not in flagged)
             for d in range(store.observation_size)
         ]
         return ScreeningReport(tuple(found), None, 100)

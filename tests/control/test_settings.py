@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("mujoco", reason="needs ucfrec[control]")
 
-from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.errors import InputError
 from ucfrec.settings import describe
 from ucfrec_control.data.collect import CollectConfig
@@ -21,7 +20,7 @@ SOURCE = [Path(__file__).parents[2] / name for name in ("control", "ucfrec")]
 RL = RLConfig("iql", 100, "hopper", "medium")
 
 
-@pytest.mark.parametrize("table", [RL, ScreeningConfig(), CollectConfig(), SacConfig()])
+@pytest.mark.parametrize("table", [RL, CollectConfig(), SacConfig()])
 def test_every_field_means_something_and_is_read(table: Any) -> None:
     read = {
         node.attr
@@ -45,10 +44,6 @@ def test_every_field_means_something_and_is_read(table: Any) -> None:
             r"rl\.algorithm is 'sac'; it must be 'iql' or 'cql'",
         ),
         (lambda: replace(RL, steps=0), r"rl\.steps is 0; it must be a whole number from 1"),
-        (
-            lambda: ScreeningConfig(level=2),
-            r"screening\.level is 2; it must be a number from 0 to 1",
-        ),
         (lambda: CollectConfig(size=0), "size is 0; it must be a whole number from 1"),
         (lambda: CollectConfig(steps=10_000), "learning starts after 10000"),
         (lambda: SacConfig(target_rate=0), r"sac\.target_rate is 0; it must be a number above 0"),

@@ -21,13 +21,12 @@ def run(options: argparse.Namespace) -> None:
     """
     from dataclasses import asdict
 
-    from ucfrec.counterfactual.screening import describe_screening
     from ucfrec.episodes.store import EpisodeStore
     from ucfrec.files.atomic import write_json
     from ucfrec.provenance import provenance
     from ucfrec.runs.screened import screen_store
 
     report = screen_store(EpisodeStore.open(options.store), options.seed)
-    print(describe_screening(report))
+    print(report.describe())
     if options.json is not None:
         write_json(options.json, asdict(report) | provenance())

@@ -12,42 +12,29 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.record import StoreRecord
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Overlay, Transitions, Windows
+from ucfrec.episodes.windows import Transitions, Windows
 from ucfrec.errors import InputError
 
-_OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
-"""Step columns in which an action copy differs from its source."""
 _BATCH_STEPS = 2**20
 _LONG_ENOUGH = 1000
 """Mean number of steps from which consecutive steps are read as slices."""
 
 
 class EpisodeView:
-    """Some episodes of a store: E logged episodes, then C augmented episodes, then N action copies.
+    """E episodes of a store. Wherever a method takes `episodes`, these are positions in the view,
+    0 to E − 1."""
 
-    Wherever a method takes `episodes`, these are positions in the view, 0 to E + C + N − 1. An
-    action copy ends with the step that has another action; only this step of it counts and is
-    drawn, because the steps before it are those of its source.
-    """
-
-    def __init__(
-        self, columns: Columns, episode_ids: IntArray | None = None, overlay: Overlay | None = None
-    ) -> None:
+    def __init__(self, columns: Columns, episode_ids: IntArray | None = None) -> None:
         """
         Args:
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
         """
         self._columns, self._selected = columns, episode_ids
-        self.overlay = overlay
-        """Edited copies of episodes and action copies, or None."""
 
     def __repr__(self) -> str:
-        facts = [f"{self.n_steps:,} steps", f"{len(self.episode_ids):,} episodes"]
-        if self.overlay is not None:
-            facts[1] += f" and {len(self.overlay.copy_source):,} augmented episodes"
-            if len(self.overlay.action_source):
-                facts[1] += f" and {len(self.overlay.action_source):,} action copies"
+        facts = [f"{self.n_steps:,} steps", f"{len(self):,} episodes"]
         if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
         facts.append(f"reward={self.record.reward}")
@@ -71,49 +58,37 @@ class EpisodeView:
         """The content of `meta.json`."""
         return self._columns.record
 
+    @property
+    def return_to_go(self) -> ReturnToGo:
+        """What the returns-to-go count."""
+        return self._columns.return_to_go
+
     @cached_property
     def episode_ids(self) -> IntArray:
-        """(E,) numbers in the store of the logged episodes of the view; excludes copies."""
+        """(E,) numbers in the store of the episodes of the view."""
         return np.arange(self.record.n_episodes) if self._selected is None else self._selected
 
     @cached_property
-    def _sources(self) -> IntArray:
-        """(E + C + N,) number in the store of every episode; a copy has its source's."""
-        if self.overlay is None:
-            return self.episode_ids
-        copies = (self.overlay.copy_source, self.overlay.action_source)
-        return np.concatenate([self.episode_ids, *copies])
-
-    @cached_property
-    def _first_action_copy(self) -> int:
-        return self.n_episodes - (0 if self.overlay is None else len(self.overlay.action_source))
-
-    @cached_property
     def lengths(self) -> IntArray:
-        """(E + C + N,) number of steps of each episode."""
-        lengths = self._columns.lengths[self._sources]
-        if self.overlay is not None:
-            lengths[self._first_action_copy :] = self.overlay.action_step + 1
-        return lengths
+        """(E,) number of steps of each episode."""
+        return self._columns.lengths[self.episode_ids]
 
     @property
     def n_episodes(self) -> int:
-        """E + C + N, the number of episodes of the view, including copies."""
-        return len(self._sources)
+        """E, the number of episodes of the view."""
+        return len(self.episode_ids)
 
     @cached_property
     def n_steps(self) -> int:
-        """Number of steps of the view, including those of copies; 1 of each action copy."""
+        """Number of steps of the view."""
         return int(self._counts.sum())
 
     @cached_property
     def _counts(self) -> IntArray:
-        """(E + C + N,) number of steps of each episode that count, which are its last."""
-        counts = self.lengths.copy()
-        if self._columns.skipped is not None:
-            counts -= self._columns.skipped[self._sources]
-        counts[self._first_action_copy :] = 1
-        return counts
+        """(E,) number of steps of each episode that count, which are its last."""
+        if self._columns.skipped is None:
+            return self.lengths
+        return self.lengths - self._columns.skipped[self.episode_ids]
 
     @cached_property
     def has_items(self) -> bool:
@@ -149,33 +124,28 @@ class EpisodeView:
         return self._columns.has_episode_column(name)
 
     def episode_values(self, name: str) -> Array:
-        """An episode column, (E + C + N,); a copy has the value of its source.
+        """An episode column, (E,).
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._columns.episode_column(name)[self._sources]
+        return self._columns.episode_column(name)[self.episode_ids]
 
     @property
     def terminated(self) -> BoolArray:
-        """(E + C + N,) whether each session is known to have ended with its last step."""
-        ended = np.ones(self.n_episodes, dtype=bool)
-        if self._columns.has_episode_column(schema.TERMINATED):
-            ended = self.episode_values(schema.TERMINATED).astype(bool)
-        ended[self._first_action_copy :] = False
-        return ended
+        """(E,) whether each session is known to have ended with its last step."""
+        if not self.has_episode_values(schema.TERMINATED):
+            return np.ones(self.n_episodes, dtype=bool)
+        return self.episode_values(schema.TERMINATED).astype(bool)
 
     @cached_property
     def returns(self) -> Float32Array:
-        """(E + C + N,) undiscounted return of each episode, in reward units."""
+        """(E,) undiscounted return of each episode, in reward units."""
         episodes = np.arange(self.n_episodes)
         return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
 
     def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
-        """Values of a step column at the given steps; edits of states do not apply.
-
-        In the last step of an action copy, action and reward are its own, and its returns-to-go
-        count this reward. All else is the source's.
+        """Values of a step column at the given steps.
 
         Args:
             episodes: positions in the view, of any shape.
@@ -187,47 +157,8 @@ class EpisodeView:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._step_values(episodes, steps, name)[0]
-
-    def _step_values(self, episodes: IntArray, steps: IntArray, *names: str) -> list[Array]:
-        """`step_values` of several columns."""
-        index = self._columns.starts[self._sources[episodes]] + steps
-        columns = self._columns.step_values(index, *names)
-        if self._first_action_copy < self.n_episodes:
-            copies = np.broadcast_arrays(episodes - self._first_action_copy, steps)
-            for name, values in zip(names, columns, strict=True):
-                if name in _OF_ACTIONS:
-                    self._change_actions(name, values, *copies)
-        return columns
-
-    def _change_actions(self, name: str, values: Array, copies: IntArray, steps: IntArray) -> None:
-        """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
-
-        Args:
-            values: at the steps of the sources, changed in place.
-            copies: numbers of action copies; below 0 for other episodes.
-            steps: steps of them, of the same shape.
-        """
-        assert self.overlay is not None
-        in_copies = np.asarray(copies >= 0)
-        ahead = self.overlay.action_step[copies[in_copies]] - steps[in_copies]
-        if name == schema.RETURN_TO_GO:
-            counted = self._columns.return_to_go.weights(ahead)
-            values[in_copies] += counted * self._reward_changes[copies[in_copies]]
-            return
-        values_of_copies = (
-            self.overlay.action_reward if name == schema.REWARD else self.overlay.action
-        )
-        in_copies[in_copies] = ahead == 0
-        values[in_copies] = values_of_copies[copies[in_copies]]
-
-    @cached_property
-    def _reward_changes(self) -> Float64Array:
-        """(N,) reward of each action copy less that of its source, in reward units."""
-        assert self.overlay is not None
-        index = self._columns.starts[self.overlay.action_source] + self.overlay.action_step
-        (logged,) = self._columns.step_values(index, schema.REWARD)
-        return self.overlay.action_reward.astype(np.float64) - logged
+        index = self._columns.starts[self.episode_ids[episodes]] + steps
+        return self._columns.step_values(index, name)[0]
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of the session before each step, in reward units.
@@ -257,8 +188,7 @@ class EpisodeView:
         return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
 
     def all_steps(self) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (n_steps,): every step of the view, episode by episode; of an
-        action copy, the last."""
+        """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
@@ -289,11 +219,11 @@ class EpisodeView:
         """
         if not self.n_steps:
             return
-        ends = (self._columns.starts + self._columns.lengths)[self._sources]
+        ends = (self._columns.starts + self._columns.lengths)[self.episode_ids]
         begins = ends - self._counts
         apart = begins[1:] != ends[:-1]
         begins, ends = begins[np.append(True, apart)], ends[np.append(apart, True)]
-        if self.overlay is not None or len(begins) > self.n_steps // _LONG_ENOUGH:
+        if len(begins) > self.n_steps // _LONG_ENOUGH:
             for steps in self.step_batches():
                 yield tuple(self.step_values(name, *steps) for name in names)
             return
@@ -347,18 +277,20 @@ class EpisodeView:
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
         action = schema.ITEM if self.has_items else schema.ACTION
         names = action, schema.REWARD, schema.RETURN_TO_GO
-        columns = self._step_values(episodes[:, None], np.maximum(steps, 0), *names)
+        numbers = self.episode_ids[episodes]
+        index = self._columns.starts[numbers][:, None] + np.maximum(steps, 0)
+        columns = self._columns.step_values(index, *names)
         actions, rewards, returns_to_go = map(torch.from_numpy, columns)
         return Windows.of(
             torch.from_numpy(steps),
-            self._edited_states(episodes, steps),
+            self._columns.states(numbers, steps),
             actions.long() if self.has_items else actions,
             rewards,
             returns_to_go,
         )
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states; next states are as logged, also where augmented.
+        """Single steps with their next states.
 
         Args:
             episodes: (M,) positions in the view.
@@ -370,7 +302,7 @@ class EpisodeView:
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1
         next_steps = np.where(last, steps, steps + 1)
-        next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
+        next_states = self._columns.states(self.episode_ids[episodes], next_steps[:, None])[:, 0]
         is_last = torch.from_numpy(last)
         return Transitions(
             states=window.states[:, 0],
@@ -379,15 +311,6 @@ class EpisodeView:
             next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
             last=is_last,
         )
-
-    def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
-        states = self._columns.states(self._sources[episodes], steps)
-        if self.overlay is not None:
-            copies = episodes[:, None] - len(self.episode_ids)
-            rows, columns, edits = self.overlay.edits_at(copies, steps)
-            states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
-        return states
 
     def _require_steps(self, episodes: IntArray, ends: IntArray, length: int) -> None:
         if episodes.ndim != 1 or episodes.shape != ends.shape or length < 1:

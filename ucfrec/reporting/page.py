@@ -11,7 +11,7 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.metrics_log import read_metrics

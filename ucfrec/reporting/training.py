@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
 from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins

@@ -20,8 +20,8 @@ from pydantic import (
 from ucfrec.acting.decision import SavedRule
 from ucfrec.choosing.choice import ValueEstimate
 from ucfrec.choosing.logged import Evidence
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo

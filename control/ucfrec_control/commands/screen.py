@@ -5,12 +5,11 @@ import dataclasses
 from pathlib import Path
 
 from ucfrec.commands.grid_options import seed_given
-from ucfrec.counterfactual.screening import describe_screening
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import write_json
 from ucfrec.provenance import provenance
-from ucfrec.runs.screened import screen_store
 from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.training.screening import screen_store
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +22,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control screen`."""
     report = screen_store(EpisodeStore.open(options.store), options.seed)
-    print(describe_screening(report))
+    print(report.describe())
     if options.json is not None:
         write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))

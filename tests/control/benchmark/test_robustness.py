@@ -11,8 +11,7 @@ from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Evaluation, opened
-from ucfrec.counterfactual.measured_reward import MeasurementConfig
-from ucfrec.counterfactual.screening import ScreeningConfig, screen
+from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import read_rows
@@ -28,6 +27,7 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.screening import ScreeningConfig, screen_states
 from ucfrec_control.training.train import train_control
 
 TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")
@@ -102,7 +102,7 @@ def begin(
     # Begun here, where screening may be made quick, and gone on with by the command.
     few = MeasurementConfig(trees=5)
     quickest = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50, measurement=few)
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: quickest)
+    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: quickest)
     runs, stages = {}, SharedStages(tmp_path / "stages")
     for cell in plan.robustness_cells(tmp_path, out, budget):
         assert cell.run is not None
@@ -183,7 +183,7 @@ QUICKEST = ScreeningConfig(
 def test_training_with_screening_records_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICKEST)
+    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICKEST)
     columns = hopper_like((20, 30) * 12)
     columns["rewards"] = columns["observations"][:, 0]
     columns["observations"][:, 4] = 0.0  # a constant causes nothing
@@ -210,6 +210,6 @@ def test_the_distractor_is_flagged_and_no_true_dimension(tmp_path: Path) -> None
     read = read_d4rl(data_folder("control") / "hopper_medium-zoo.hdf5")
     store = add_distractor(read.write_store(tmp_path / "clean"), tmp_path / "store")
     config = ScreeningConfig(hidden=128, shared_steps=700, own_steps=250, max_transitions=50_000)
-    report = screen(training_views(store)[0], config, seed=0)
+    report = screen_states(training_views(store)[0], config, seed=0)
     assert report.flagged == (11,)
     assert store.record.columns[schema.OBSERVATION] == [12]

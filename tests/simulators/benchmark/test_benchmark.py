@@ -229,7 +229,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)

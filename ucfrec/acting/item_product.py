@@ -242,7 +242,7 @@ class ItemProduct:
             else:
                 yield self._tags.to_candidates(profile, items) > 0
         if rule.tag_run:
-            tired = self._main_tags.tired(shown, rule.tag_run).unsqueeze(1)
+            tired = self._main_tags.find_tired(shown, rule.tag_run).unsqueeze(1)
             main = self._main_tags.tags
             yield ((main if items is None else main[items]) == tired) & (tired >= 0)
 

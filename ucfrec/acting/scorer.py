@@ -347,17 +347,17 @@ class Scorer:
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span = model.reward_high - model.reward_low
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
-        rewards = model.expected(odds)
+        rewards = model.expect(odds)
         scores = scores + weight * rewards
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
         steps = query.sessions.steps
         some, recent = rewards.gather(1, best), shown.latest(model.lags)
         if self._outcomes is not None and end.uses_rewards:
             rewarded = [torch.full_like(some, reward) for reward in self._outcomes]
-            low, high = end.of_items(recent, best, rewarded, steps)
+            low, high = end.score_items(recent, best, rewarded, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
-            (ends,) = end.of_items(recent, best, [some], steps)
+            (ends,) = end.score_items(recent, best, [some], steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)

@@ -18,8 +18,7 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import ValueEstimate
-from ucfrec.choosing.logged import Evidence
+from ucfrec.choosing.choice import Evidence, ValueEstimate
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.item_table import ITEM_STATES

@@ -10,11 +10,10 @@ from tests.support.tagged import tagged_store
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.user_model.fatigue import Fatigue, MainTags
-from ucfrec.user_model.model import UserModel
+from ucfrec.user_model.model import LoggedRewards, UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import reward_model_sizes
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
-from ucfrec.user_model.simulator import LoggedRewards, UserSimulator, longest_session
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +65,13 @@ def test_drawn_rewards_are_logged_ones_with_the_expected_mean(kind: str) -> None
     logged = logged.astype(np.float32)
     items = {"item": np.zeros(n, dtype=np.int64), "reward": logged}
     states = ItemStates(torch.ones(1, 2), torch.zeros(0, 0), 0.0, 1.0)
-    rewards = LoggedRewards.of(EpisodeStore.from_arrays(items, np.full(n // 4, 4), None, states))
+    rewards = LoggedRewards(EpisodeStore.from_arrays(items, np.full(n // 4, 4), None, states))
     low, high = np.quantile(rewards.values, [0.05, 0.95])
     for mean in np.linspace(low, high, 7):
-        drawn = rewards.drawn(np.full(100_000, mean), rng.random(100_000))
+        drawn = rewards.draw(np.full(100_000, mean), rng.random(100_000))
         assert drawn.mean() == pytest.approx(mean, abs=0.02 * np.ptp(rewards.values))
         assert set(drawn) <= set(rewards.values)
-    same = rewards.drawn(np.full(100_000, logged.mean()), rng.random(100_000))
+    same = rewards.draw(np.full(100_000, logged.mean()), rng.random(100_000))
     assert same.std() == pytest.approx(logged.std(), rel=0.1)
 
 

@@ -1,4 +1,5 @@
-"""Long-Short Decision Transformer (Wang et al., 2025): attention and dynamic convolution."""
+"""Decision ConvFormer (Kim et al., 2024): DT with convolutions instead of attention; and the
+Long-Short Decision Transformer (Wang et al., 2025): attention and dynamic convolution."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -8,8 +9,8 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec import settings
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies import layers
 from ucfrec.policies.base import (
     Heads,
     Kernel,
@@ -17,17 +18,78 @@ from ucfrec.policies.base import (
     PolicyConfig,
     SequencePolicy,
     Timesteps,
-    TokenEmbedding,
-    interleave,
+    init_linear,
 )
-from ucfrec.settings import Dropout, require, settings_table
+from ucfrec.policies.ucf import Dropout, TokenEmbedding, interleave, visible_tokens
+from ucfrec.settings import require, settings_table
+
+
+@settings_table("policy")
+class DCConfig(PolicyConfig):
+    """Settings of Decision ConvFormer; defaults are those of the official code."""
+
+    layers: Layers = 3
+    """Blocks, each a convolution and a perceptron."""
+    kernel: Kernel = 6
+    """Kernel size of the convolutions in tokens, 3 per step."""
+
+
+class DCPolicy(SequencePolicy):
+    """Pre-LN blocks over R_0, s_0, a_0, R_1, … with one depthwise convolution per modality.
+
+    Source: https://github.com/beanie00/Decision-ConvFormer. There, zero padding is embedded like
+    valid steps and affects the first steps. Here, padded tokens are set to zero before every
+    convolution, so that padding a window does not change its outputs.
+    """
+
+    Config = DCConfig
+    config: DCConfig
+
+    def __init__(self, config: DCConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        self.embed = TokenEmbedding(config, sizes["state"])
+        self.dropout = Dropout(config.dropout)
+        self.blocks = nn.ModuleList(_ConvBlock(config) for _ in range(config.layers))
+        self.final_norm = nn.LayerNorm(config.dim)
+        init_linear(self.blocks)
+
+    def features(self, windows: Windows) -> Tensor:
+        """Features (B, K, d): outputs at the tokens s_t."""
+        hidden = self.dropout(interleave(*self.embed(windows, self.head.embed(windows.actions))))
+        valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
+        for block in self.blocks:
+            hidden = block(hidden, valid)
+        return self.final_norm(hidden[:, 1::3])  # type: ignore[no-any-return]
+
+
+class _ConvBlock(nn.Module):
+    def __init__(self, config: DCConfig) -> None:
+        super().__init__()
+        dim = config.dim
+        self.reach = config.kernel - 1
+        self.mixer_norm = nn.LayerNorm(dim)
+        self.mixers = nn.ModuleList(
+            nn.Conv1d(dim, dim, config.kernel, stride=3, groups=dim) for _ in range(3)
+        )
+        self.mlp_norm = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(
+            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), Dropout(config.dropout)
+        )
+
+    def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
+        normed = self.mixer_norm(hidden).masked_fill(~valid, 0.0).transpose(1, 2)  # (B, d, 3K)
+        padded = F.pad(normed, (self.reach, 0))
+        # Each modality has its own filter; stride 3 computes only the outputs of that modality.
+        mixed = [conv(padded[..., i:]).transpose(1, 2) for i, conv in enumerate(self.mixers)]
+        hidden = hidden + interleave(*mixed)
+        return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]
 
 
 @settings_table("policy")
 class LSDTConfig(PolicyConfig):
     """Settings of LSDT; defaults are those of the official code."""
 
-    dropout: Dropout = 0.25
+    dropout: settings.Dropout = 0.25
     """Dropout after the mixed branches and the perceptron."""
     max_timestep: Timesteps = 4096
     """Rows of the timestep embedding; later steps share the last row. 1 hides the time."""
@@ -35,9 +97,9 @@ class LSDTConfig(PolicyConfig):
     """Blocks, each attention and convolution in parallel, then a perceptron."""
     heads: Heads = 2
     """Attention heads per block; must divide half of `dim`."""
-    attention_dropout: Dropout = 0.1
+    attention_dropout: settings.Dropout = 0.1
     """Dropout after attention."""
-    kernel_dropout: Dropout = 0.2
+    kernel_dropout: settings.Dropout = 0.2
     """Dropout of the kernels, which are computed from each token."""
     kernel: Kernel = 6
     """Kernel size of the convolutions in tokens; the last is the output's own token."""
@@ -72,7 +134,7 @@ class LSDTPolicy(SequencePolicy):
     def __init__(self, config: LSDTConfig, sizes: Mapping[str, int]) -> None:
         super().__init__(config, sizes)
         self.embed = TokenEmbedding(config, sizes["state"])
-        self.blocks = nn.ModuleList(_Block(config) for _ in range(config.layers))
+        self.blocks = nn.ModuleList(_LongShortBlock(config) for _ in range(config.layers))
         for part in (self.embed, self.blocks, self.head):
             part.apply(_initialise)
 
@@ -98,7 +160,7 @@ def _initialise(module: nn.Module) -> None:
             nn.init.zeros_(module.bias)
 
 
-class _Block(nn.Module):
+class _LongShortBlock(nn.Module):
     def __init__(self, config: LSDTConfig) -> None:
         super().__init__()
         dim = config.dim
@@ -111,10 +173,10 @@ class _Block(nn.Module):
             nn.Linear(dim, 4 * dim),
             nn.GELU(),
             nn.Linear(4 * dim, dim),
-            layers.Dropout(config.dropout),
+            Dropout(config.dropout),
         )
         self.mlp_norm = nn.LayerNorm(dim)
-        self.dropout = layers.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         long, short = hidden.chunk(2, dim=-1)
@@ -130,7 +192,7 @@ class _Attention(nn.Module):
         super().__init__()
         self.heads = config.heads
         self.query_key_value = nn.Linear(config.dim // 2, 3 * (config.dim // 2))
-        self.dropout = layers.Dropout(config.attention_dropout)
+        self.dropout = Dropout(config.attention_dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape
@@ -139,7 +201,7 @@ class _Attention(nn.Module):
             x.view(batch, tokens, self.heads, dim // self.heads).transpose(1, 2)
             for x in self.query_key_value(hidden).chunk(3, dim=-1)
         )
-        visible = layers.visible_tokens(valid)
+        visible = visible_tokens(valid)
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
         return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
 
@@ -155,7 +217,7 @@ class _DynamicConvolution(nn.Module):
         self.taps = nn.Linear(dim, config.kernel_groups * config.kernel)
         self.bias = nn.Parameter(torch.zeros(dim))
         self.out = nn.Linear(dim, dim)
-        self.dropout = layers.Dropout(config.kernel_dropout)
+        self.dropout = Dropout(config.kernel_dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
         batch, tokens, dim = hidden.shape

@@ -18,15 +18,14 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import save_tensors
 from ucfrec.runs.run import training_views
 from ucfrec.user_model.reward import LAGS, ItemRewardModel
-from ucfrec.user_model.reward_fit import fit_item_reward_model, reward_model_sizes
-from ucfrec.user_model.reward_report import RewardRows
-from ucfrec.user_model.training_users import (
+from ucfrec.user_model.reward_fit import (
     TrainingUsers,
-    UserCalibration,
     draw_sessions,
+    fit_item_reward_model,
     fit_training_users,
-    propensity_weights,
+    reward_model_sizes,
 )
+from ucfrec.user_model.reward_report import RewardRows, UserCalibration, weigh_by_propensity
 
 USERS, LENGTH, ITEMS, KINDS = 250, 40, 20, 5
 LIKED, OTHER = 0.8, 0.1
@@ -79,7 +78,7 @@ def store_of(
 def chances(users: TrainingUsers, rows: RewardRows) -> Float64Array:
     """(M,) the calibrated chances that users like what is shown in the rows."""
     slope, intercept = users.report.calibration
-    scores = users.model.score(rows.states, rows.shown, rows.users, rows.items)
+    scores = users.model.score(rows.states, rows.history, rows.users, rows.items)
     return torch.sigmoid(slope * scores + intercept).double().numpy()
 
 
@@ -167,7 +166,7 @@ def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
     states = ItemStates(torch.ones(1, 2), torch.zeros(2, 0), 0.0, 1.0)
     users = np.array([1, 0, 1])
     view = EpisodeStore.from_arrays(columns, np.array([3, 4, 1]), {"user": users}, states)
-    weights = propensity_weights(view, *view.all_steps(), items)
+    weights = weigh_by_propensity(view, *view.all_steps(), items)
     assert weights is not None
     shares = np.minimum(10.0, 1 / (np.float32(logged) * items))
     for user in (0, 1):
@@ -183,7 +182,7 @@ def test_logs_without_all_propensities_have_no_weights(told: dict[str, Float64Ar
     columns = {"item": np.zeros(3, dtype=np.int64), "reward": np.array([0.0, 1.0, 0.0]), **told}
     states = ItemStates(torch.ones(1, 2), torch.zeros(1, 0), 0.0, 1.0)
     view = EpisodeStore.from_arrays(columns, np.array([3]), {"user": np.array([0])}, states)
-    assert propensity_weights(view, *view.all_steps(), 1) is None
+    assert weigh_by_propensity(view, *view.all_steps(), 1) is None
 
 
 def test_sessions_are_drawn_by_the_seed() -> None:

@@ -12,8 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from tests.support.gymnasium_environments import ITEMS, LENGTH
-from ucfrec.acting.rollout import Step, rollout
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items

@@ -214,7 +214,7 @@ def _choose_best(
     none = torch.isneginf(total)
     if none.any():
         scores[none[:, 0]] = 0.0
-    items, propensities = rule.ranked(scores, k, draws)
+    items, propensities = rule.rank_items(scores, k, draws)
     values = scores.gather(1, items) - total
     return items, values.masked_fill(none, -torch.inf), propensities
 

@@ -17,9 +17,8 @@ from tests.support.kuai_reference import Plain
 from tests.support.single_session import SingleSession
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect

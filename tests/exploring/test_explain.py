@@ -10,7 +10,7 @@ import pytest
 from tests.recommending.test_recommend import random_log
 from ucfrec import DecisionRule, FeatureTable, LogMapping, Recommender
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
+from ucfrec.exploring.explain import PARTS, Explained, explain, read_pasted
 from ucfrec.python_api.given_data import histories_given
 
 
@@ -72,8 +72,8 @@ def test_excluded_items_have_their_reason(policy: Recommender) -> None:
     assert not explained(policy, DecisionRule(2.0)).excluded
 
 
-def test_a_pasted_history_is_recommended_for(policy: Recommender) -> None:
-    frame = pasted_history("3, 1\n\n5\n 7,0 ")
+def test_a_read_pasted_is_recommended_for(policy: Recommender) -> None:
+    frame = read_pasted("3, 1\n\n5\n 7,0 ")
     assert frame.item_id.tolist() == ["3", "5", "7"]
     assert frame.reward.tolist() == [1, 0, 0]
     (user,) = histories_given(policy.trained, frame, None, None)
@@ -86,4 +86,4 @@ def test_a_pasted_history_is_recommended_for(policy: Recommender) -> None:
         ("1\n" * 1001, "1,001 rows; paste at most 1,000"),
     ):
         with pytest.raises(InputError, match=message):
-            pasted_history(text)
+            read_pasted(text)

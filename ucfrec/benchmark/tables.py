@@ -1,15 +1,25 @@
-"""Tables of result rows: means and spreads over logs and seeds, and differences to a method."""
+"""Tables and plots of result rows: means and spreads over logs and seeds, and differences to a
+method."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from ucfrec.reporting.plot_style import LIGHT, PLAIN, save, styled
+from ucfrec.reporting.plot_style import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
 from ucfrec.results.row import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
-"""Probability that the distractor is on in an evaluation; None: an environment without a
-distractor."""
+"""Probability that the distractor is on in an evaluation, for each of these names; None: an
+environment without a distractor."""
 OURS: Final = "ucf"
 MEAN: Final = "mean"
 NEAR: Final = 0.05
@@ -33,8 +43,10 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     less = difference_to_ours(rows)
     for (environment, method), group in grouped(rows, _line).items():
         spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
-        chosen = (_targets(group), mean_and_sd(numbers(group, "estimated_value")))
-        lines.append((environment, method, len(group), *spread, *chosen, less[environment, method]))
+        targets = {f"{row.target_return:g}" for row in group if row.target_return is not None}
+        spread.append(", ".join(sorted(targets, key=float)) or NONE)
+        spread.append(mean_and_sd(numbers(group, "estimated_value")))
+        lines.append((environment, method, len(group), *spread, less[environment, method]))
     return markdown_table(head, lines)
 
 
@@ -133,19 +145,14 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         name: max((c[name].mean for c in cells.values() if c[name].count), default=0.0)
         for name in (*tasks, MEAN)
     }
-    return [
-        {
-            "method": method,
-            "seeds": _format_count([scores[task].count for task in tasks]),
-            **{name: _format_score(score, best[name]) for name, score in scores.items()},
-        }
-        for method, scores in cells.items()
-    ]
-
-
-def _format_count(counts: Sequence[int]) -> str:
-    fewest, most = min(filter(None, counts)), max(counts)
-    return str(most) if fewest == most else f"{fewest}–{most}"
+    lines = []
+    for method, of_method in cells.items():
+        counts = [of_method[task].count for task in tasks]
+        fewest, most = min(filter(None, counts)), max(counts)
+        seeds = str(most) if fewest == most else f"{fewest}–{most}"
+        texts = {name: _format_score(score, best[name]) for name, score in of_method.items()}
+        lines.append({"method": method, "seeds": seeds, **texts})
+    return lines
 
 
 def _format_score(scores: Summary, best: float) -> str:
@@ -156,7 +163,7 @@ def _format_score(scores: Summary, best: float) -> str:
     return f"**{text}**" if scores.mean >= best - NEAR * abs(best) else text
 
 
-def of_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
+def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Rows of the target return with the highest mean over seeds, for each dataset, method and
     checkpoint."""
     best: list[ResultRow] = []
@@ -166,7 +173,7 @@ def of_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     return best
 
 
-def over_seeds(
+def average_seeds(
     lines: Sequence[Mapping[str, Any]], by: Sequence[str], values: Sequence[str]
 ) -> list[dict[str, Any]]:
     """One line per combination of `by`: `values` as mean ± standard deviation over seeds.
@@ -175,16 +182,13 @@ def over_seeds(
         lines: as `ResultRow.as_line` returns them; a value may be missing or None.
         by: names of the columns to group by.
     """
-    groups = grouped(lines, lambda line: tuple(line[name] for name in by))
-    return [
-        {
-            **dict(zip(by, key, strict=True)),
-            **{
-                n: mean_and_sd(line[n] for line in group if line.get(n) is not None) for n in values
-            },
-        }
-        for key, group in groups.items()
-    ]
+    averages = []
+    for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items():
+        average: dict[str, Any] = dict(zip(by, key, strict=True))
+        for name in values:
+            average[name] = mean_and_sd(line[name] for line in group if line.get(name) is not None)
+        averages.append(average)
+    return averages
 
 
 def difference_table(
@@ -258,6 +262,67 @@ def _line(row: ResultRow) -> tuple[str, str]:
     return str(row.environment), row.method
 
 
-def _targets(rows: Sequence[ResultRow]) -> str:
-    chosen = {f"{row.target_return:g}" for row in rows if row.target_return is not None}
-    return ", ".join(sorted(chosen, key=float)) or NONE
+def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:
+    """One plot per environment: return of every method, mean and standard deviation over seeds.
+
+    Args:
+        kind: what the files are called, before the environment.
+    """
+    return _plot_environments(kind, _draw_bars, rows, folder)
+
+
+def plot_distractor(rows: Sequence[ResultRow], folder: Path) -> list[Path]:
+    """One plot per environment with a distractor: returns without it, with it off, and with it on.
+
+    Only rows whose target return is the largest training return are shown.
+    """
+    rows = [row for row in rows if row.conditions["quantiles"] == "1"]
+    planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
+    return _plot_environments(
+        "distractor", _draw_triples, [r for r in rows if r.environment in planted], folder
+    )
+
+
+def _draw_bars(axes: "Axes", rows: Sequence[ResultRow]) -> None:
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    returns = [summary(row.value for row in group) for _, group in by_method]
+    colors = [OURS_COLOR if name == OURS else PLAIN for name, _ in by_method]
+    means, spreads = [r.mean for r in returns], [r.sd for r in returns]
+    axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
+    axes.set_xlabel("return per session (mean ± sd over training seeds)")
+
+
+def _draw_triples(axes: "Axes", rows: Sequence[ResultRow]) -> None:
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    conditions = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS_COLOR, LIGHT), strict=True)
+    for index, (rate, label, color) in enumerate(conditions):
+        returns = [
+            summary(row.value for row in group if row.conditions["distractor"] == rate)
+            for _, group in by_method
+        ]
+        positions = np.arange(len(by_method)) + 0.25 * (1 - index)
+        means = [r.mean for r in returns]
+        axes.barh(positions, means, height=0.25, color=color, label=label)
+    axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
+    axes.set_xlabel("return per session (mean over training seeds)")
+    axes.legend()
+
+
+@styled
+def _plot_environments(
+    kind: str,
+    draw: Callable[["Axes", Sequence[ResultRow]], None],
+    rows: Sequence[ResultRow],
+    folder: Path,
+) -> list[Path]:
+    from matplotlib.figure import Figure
+
+    files = []
+    environments = grouped(select_checkpoint(rows, "best"), lambda row: row.environment)
+    for environment, group in environments.items():
+        figure, name = Figure(figsize=(5.2, 4.2)), f"{kind}-{environment}"
+        axes = figure.add_subplot()
+        axes.set_title(name)
+        draw(axes, group)
+        files += save(figure, folder, name)
+    return files

@@ -1,6 +1,6 @@
 """The command-line parser, which imports only the module of the called command.
 
-Command modules import heavy dependencies inside `run`, so that `--help` answers at once and no
+These modules import heavy dependencies inside `run`, so that `--help` answers at once and no
 command loads what only another one needs.
 """
 
@@ -15,10 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module, metadata
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final
 
 from ucfrec import __version__
-from ucfrec.commands.options import FieldHelp
+from ucfrec.commands.options import Table, add_options
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
 from ucfrec.files.remote import local_paths
 from ucfrec.processes import Interrupted, interruptions_raised
@@ -31,11 +31,19 @@ class Program:
     name: str
     summary: str
     package: str
-    """Package with one module per command, each with `add_options(parser)` and `run(options)`."""
+    """Package with the modules of the commands, each a `Table` called as the command."""
     commands: Mapping[str, str]
     """Command name to its one-line summary in `--help`."""
     sections: Mapping[str, str] = field(default_factory=dict)
     """First command of each section of `--help` to the title of the section."""
+    modules: Mapping[str, str] = field(default_factory=dict)
+    """Command name to its module, if that has another name."""
+
+    def find_table(self, command: str) -> type[Table]:
+        """The table of a command."""
+        module = import_module(f"{self.package}.{self.modules.get(command, command)}")
+        table: type[Table] = getattr(module, command.capitalize())
+        return table
 
 
 UCFREC = Program(
@@ -68,6 +76,13 @@ UCFREC = Program(
         "benchmark": "measure every method and print tables; resumes",
     },
     {"prepare": "from logs to recommendations", "join": "every day", "demo": "advanced"},
+    {
+        **dict.fromkeys(("report", "promote", "verify"), "runs"),
+        **dict.fromkeys(("join", "compare"), "update"),
+        **dict.fromkeys(("tune", "screen"), "train"),
+        **dict.fromkeys(("evaluate", "collect"), "simulate"),
+        **{"score": "ope", "explore": "serve", "export": "recommend", "datasets": "prepare"},
+    },
 )
 
 
@@ -93,8 +108,9 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         with interruptions_raised(), notes_on_one_line(program.name):
             options = build_parser(program, arguments).parse_args(arguments)
             name = f"{program.name} {options.command}"
+            table = program.find_table(options.command)
             with local_paths(options) as options:
-                _module(program, options.command).run(options)
+                table.read(options).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -181,9 +197,13 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
 
     Options of the other commands would need their modules, whose imports take seconds.
     """
+    listed = []
+    for name, summary in program.commands.items():
+        listed += [f"\n{program.sections[name]}:"] if name in program.sections else []
+        listed.append(f"  {name:<12}{summary}")
     parser = argparse.ArgumentParser(
         prog=program.name,
-        description=f"{program.summary}\n{_list_commands(program)}",
+        description="\n".join([program.summary, *listed]),
         epilog=f"{program.name} COMMAND --help describes a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="%(prog)s [options] COMMAND …",
@@ -197,18 +217,9 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
     for name, summary in program.commands.items():
         command = commands.add_parser(name, description=summary, prog=f"{program.name} {name}")
         if name == called:
-            _module(program, name).add_options(command)
+            add_options(command, program.find_table(name))
             command.usage = command.usage or command.describe_usage()
     return parser
-
-
-def _list_commands(program: Program) -> str:
-    lines = []
-    for name, summary in program.commands.items():
-        if title := program.sections.get(name):
-            lines.append(f"\n{title}:")
-        lines.append(f"  {name:<12}{summary}")
-    return "\n".join(lines)
 
 
 class _ShowAll(argparse.Action):
@@ -220,10 +231,7 @@ class _ShowAll(argparse.Action):
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Reads the help of an option from the docstring of a field where it is shown."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return action.help.read() if isinstance(action.help, FieldHelp) else action.help
+    """Does not break options at hyphens."""
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
@@ -298,18 +306,6 @@ def _shorten(actions: list[argparse.Action]) -> Iterator[argparse.Action]:
             short = copy.copy(action)
             short.help = (action.help or "").partition(";")[0]
             yield short
-
-
-class _Command(Protocol):
-    """Interface of a command module."""
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None: ...
-
-    def run(self, options: argparse.Namespace) -> None: ...
-
-
-def _module(program: Program, command: str) -> _Command:
-    return cast(_Command, import_module(f"{program.package}.{command.replace('-', '_')}"))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated
 environments."""
 
-import argparse
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
@@ -9,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.commands.options import option
+from ucfrec.commands.options import Table
 from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress, progress
 
@@ -70,41 +69,40 @@ FULL = DemoConfig(
 """Sizes at which the methods differ as in the documentation: a quarter of an hour on two cores."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec demo`."""
-    option(
-        parser,
-        "--out",
-        Path,
-        "folder for logs, stores, runs and the report; resumed (default: demo-out, or "
-        "demo-out-full with --full)",
-    )
-    option(parser, "--seed", 0, "seed of the logs and trainings")
-    text = "four times the sessions, five times the training steps and all methods"
-    option(parser, "--full", False, f"{text} (default: two minutes of one core)")
+class Demo(Table):
+    """`ucfrec demo`."""
 
+    out: Path | None = None
+    """Folder for logs, stores, runs and the report; resumed (default: demo-out, or demo-out-full
+    with --full)"""
+    seed: int = 0
+    """Seed of the logs and trainings."""
+    full: bool = False
+    """Four times the sessions, five times the training steps and all methods (default: two minutes
+    of one core)"""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec demo`; print its result table and what it shows."""
-    config = FULL if options.full else DemoConfig()
-    out = options.out or Path("demo-out-full" if options.full else "demo-out")
-    _say(
-        f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
-        f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
-        f"simulators. Everything goes to {out}."
-    )
-    from ucfrec.files.locks import lock_path, remove_leftovers
-    from ucfrec.reporting.tables import evaluation_table
+    def execute(self) -> None:
+        """Print the result table and what it shows."""
+        config = FULL if self.full else DemoConfig()
+        out = self.out or Path("demo-out-full" if self.full else "demo-out")
+        _say(
+            f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
+            f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
+            f"simulators. Everything goes to {out}."
+        )
+        from ucfrec.files.locks import lock_path, remove_leftovers
+        from ucfrec.reporting.tables import evaluation_table
 
-    with lock_path(out, "filled"):
-        remove_leftovers(out.parent)
-        rows = demo(out, options.seed, config)
-    _say(f"\n{evaluation_table(rows)}\n")
-    _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
-    for environment in ENVIRONMENTS:
-        _say(conclusion(environment, {r.method: r for r in rows if r.environment == environment}))
-    _say(f"Report with all curves and tables: {out / 'report.html'}")
-    _say("Next: ucfrec prepare --help, for a log of your own; docs/quickstart.md has every step.")
+        with lock_path(out, "filled"):
+            remove_leftovers(out.parent)
+            rows = demo(out, self.seed, config)
+        _say(f"\n{evaluation_table(rows)}\n")
+        _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
+        for environment in ENVIRONMENTS:
+            by_method = {row.method: row for row in rows if row.environment == environment}
+            _say(conclusion(environment, by_method))
+        _say(f"Report with all curves and tables: {out / 'report.html'}")
+        _say("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
 
 def _say(text: str) -> None:

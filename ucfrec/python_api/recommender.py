@@ -48,7 +48,7 @@ from ucfrec.python_api.given_data import (
     split_given,
     store_given,
 )
-from ucfrec.python_api.run_folders import Scratch, kept_beside
+from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
@@ -57,8 +57,6 @@ from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.table import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
-from ucfrec.runs.refit import refit_within
-from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
@@ -218,16 +216,13 @@ class Recommender:
             folder = scratch.enter_context(scratch_folder(parent, "run"))
             store = store_given(data, mapping, folder, options)
             if own is not None and store.path.parent == folder:
-                store = kept_beside(own, store)
+                store = keep_beside(own, store)
             out = folder / "run" if own is None else own
             watchers = Callbacks(on_step, on_validation)
-            record = train_screened(store, out, self.config, screen, callbacks=watchers)
+            record = train_policy(store, out, self.config, screen, refit, watchers)
             if warning := record.learned_nothing(read_metrics(out / "policy")):
                 with in_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            if refit:
-                refit_within(store, out)
-            write_card(out)
             trained = TrainedPolicy.load(out)
             kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
         self._trained, self._scratch = trained, kept

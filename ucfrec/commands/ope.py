@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, Table, settings_given
+from ucfrec.commands.options import OUTPUT, Table, settings_given
 from ucfrec.commands.shared_options import (
     LogOptions,
     MemoryOption,
     RuleOptions,
+    RunArgument,
     SparkOption,
     find_runs,
 )
@@ -51,14 +52,13 @@ class EstimateOptions(Table):
 class Ope(EstimateOptions, RuleOptions, MemoryOption, LogOptions):
     """`ucfrec ope`."""
 
+    described_by = "ucfrec.python_api.recommender:Recommender.ope"
     usage = "%(prog)s RUN... [LOGS...] [options]"
     epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
         "targets or rules are ranked, with a band that holds all at once."
     )
 
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     targets: Annotated[str | None, "RETURN,…"] = None
     """Compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1"""
     temperatures: Annotated[str | None, "T,…"] = None
@@ -67,16 +67,11 @@ class Ope(EstimateOptions, RuleOptions, MemoryOption, LogOptions):
     """LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: one row
     per session is in memory, and there are no reward models (DM, FQE, DR)"""
     seed: int = 0
-    """Of folds and bootstrap."""
     json: Path | None = None
     """Write the result rows here."""
 
     def execute(self) -> None:
-        """Print the estimates and the verdict of every candidate.
-
-        Raises:
-            InputError: no run or no log is named, or one of them cannot be used.
-        """
+        """Print the estimates and the verdict of every candidate."""
         from ucfrec.off_policy import evaluate
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
@@ -261,16 +256,12 @@ def _read_target(part: str, trained: "TrainedPolicy") -> float:
     return trained.target_return(value) if quantile else value
 
 
-class Score(RuleOptions, MemoryOption, LogOptions, SparkOption):
+class Score(RuleOptions, MemoryOption, SparkOption, LogOptions, RunArgument):
     """`ucfrec score`."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
-    """Run folder of `ucfrec train`."""
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
+    described_by = "ucfrec.python_api.recommender:Recommender.score"
+
     filter_seen: bool = False
-    """Exclude items that the user was shown before, as serve and recommend do without --keep-seen:
-    for logs of what they showed"""
     out: Annotated[Path, OUTPUT]
     """Parquet file (with --engine spark: folder) to write."""
     engine: Literal["torch", "spark"] = "torch"
@@ -278,11 +269,7 @@ class Score(RuleOptions, MemoryOption, LogOptions, SparkOption):
     users, which write the parts of a folder --out"""
 
     def execute(self) -> None:
-        """Write the policy's probability of every logged choice as Parquet.
-
-        Raises:
-            InputError: the run or the logs cannot be used.
-        """
+        """Write the policy's probability of every logged choice as Parquet."""
         from ucfrec.files.parquet import write_frames
         from ucfrec.logs.summary import format_report
         from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, read_logged_sessions, score

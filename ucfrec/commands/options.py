@@ -1,13 +1,14 @@
 """Tables of options: the fields of a command's class are its options, their docstrings the help.
 
 A class with a `title` is a group, which `--help` lists by name and `--help-all` describes. A field
-without a docstring has that of the field of `described_by`, a settings table, whose module is read
-but not imported: help answers at once.
+without a docstring has that of the same field or argument of `described_by`, a settings table or a
+method of the Python API, whose module is read but not imported: help answers at once.
 """
 
 import argparse
 import ast
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
@@ -61,11 +62,11 @@ class Table:
     title: ClassVar[str | None] = None
     """Title of the group of the options and, after a semicolon, more of its description."""
     described_by: ClassVar[str] = ""
-    """`MODULE:TABLE` of the settings that fields without a docstring stand for."""
+    """`MODULE:TABLE`, or `MODULE:CLASS.METHOD`, that fields without a docstring are of."""
     prefix: ClassVar[str] = ""
-    """What the names of these fields begin with, before those of the settings."""
+    """What the names of these fields begin with, before those that they have there."""
     shows_defaults: ClassVar[bool] = True
-    """Whether the help has the defaults of these settings."""
+    """Whether the help has the defaults that they have there."""
     usage: ClassVar[str | None] = None
     epilog: ClassVar[str | None] = None
 
@@ -73,7 +74,11 @@ class Table:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def execute(self) -> None:
-        """Run the command."""
+        """Run the command.
+
+        Raises:
+            InputError: what the command line names cannot be used.
+        """
         raise NotImplementedError
 
     @classmethod
@@ -95,7 +100,10 @@ def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[s
 def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
     """Add the options of a command to its parser, with help and groups."""
     groups: dict[Any, Any] = {"": parser}
-    for field, kind, marks in _list_fields(table):
+    usage, hints = ["%(prog)s"], get_type_hints(table, include_extras=True)
+    for field in fields(table):  # type: ignore[arg-type]
+        hint = hints[field.name]
+        kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         owner = next(cls for cls in table.__mro__ if field.name in inspect.get_annotations(cls))
         title, _, more = (vars(owner).get("title") or "").partition("; ")
         if title not in groups:
@@ -105,31 +113,24 @@ def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
             if owner not in groups:
                 groups[owner] = group.add_mutually_exclusive_group()
             group = groups[owner]
-        name = field.name if ARGUMENT in marks else _name_option(field.name)
+        name = f"--{field.name.replace('_', '-')}"
+        if ARGUMENT in marks:
+            name, group = field.name, parser
         text = _describe(owner, field, marks).replace("%", "%%")
-        group.add_argument(name, help=text, **_read_words(kind, marks, field.default))
-    parser.usage, parser.epilog = table.usage, table.epilog
-
-
-def _list_fields(table: type[Any]) -> list[tuple["Field[Any]", Any, Sequence[Any]]]:
-    """The fields, their types without `None`, and their marks."""
-    hints = get_type_hints(table, include_extras=True)
-    listed: list[tuple[Field[Any], Any, Sequence[Any]]] = []
-    for field in fields(table):
-        hint = hints[field.name]
-        kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        if get_origin(kind) in (Union, UnionType):
-            kind = get_args(kind)[0]
-        listed.append((field, kind, marks))
-    return listed
-
-
-def _name_option(field: str) -> str:
-    return f"--{field.replace('_', '-')}"
+        action = group.add_argument(name, help=text, **_read_words(kind, marks, field.default))
+        word = str(action.metavar or field.name.upper())
+        if ARGUMENT in marks:
+            word += "..." if action.nargs in ("+", "*") else ""
+            usage.append(f"[{word}]" if action.nargs in ("?", "*") else word)
+        elif action.required:
+            usage.append(f"{name} {word}")
+    parser.usage, parser.epilog = table.usage or " ".join([*usage, "[options]"]), table.epilog
 
 
 def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]:
     """Arguments of `add_argument` for a field of some type."""
+    if get_origin(kind) in (Union, UnionType):
+        kind = get_args(kind)[0]  # the other one is None
     positional, required, origin = ARGUMENT in marks, default is MISSING, get_origin(kind)
     how: dict[str, Any] = {} if required else {"default": default}
     if kind is bool:
@@ -151,7 +152,7 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
     elif required:
         how["required"] = True
     if metavar is not None:
-        how["metavar"] = metavar.removesuffix("…")
+        how["metavar"] = metavar.removesuffix("…") if several else metavar
     if names := [mark.find() for mark in marks if isinstance(mark, Names) and mark.closed]:
         how["choices"] = names[0]
     for limits in (mark for mark in marks if isinstance(mark, range)):
@@ -170,33 +171,42 @@ def _read_number(limits: range, word: str) -> int:
 
 def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> str:
     """The help of an option, with its default if that is a value."""
-    text = _read_docstrings(owner.__module__)[owner.__name__, field.name][0]
-    default = None if field.default is MISSING or field.default == () else field.default
+    text, _ = _read_docstrings(owner.__module__)[f"{owner.__name__}.{field.name}"]
+    default = field.default
     if not text:
         module, _, table = owner.described_by.partition(":")
-        name = field.name.removeprefix(owner.prefix)
-        text, value = _read_docstrings(module)[table, name]
-        default = value if owner.shows_defaults else None
+        name = f"{table}.{field.name.removeprefix(owner.prefix)}"
+        text, borrowed = _read_docstrings(module)[name]
+        text = text[:1].upper() + text[1:]
+        if vars(owner).get("shows_defaults", True):
+            text = re.sub(r"[;,] None for ([^.]*)", r" (default: \1)", text)
+            default = default or borrowed
     text = text.rstrip(".")
     for names in (mark for mark in marks if isinstance(mark, Names)):
         text += f": {', '.join(names.find())}"
-    shown = default is not None and default is not False and default != ""
-    return f"{text} (default: {default})" if shown else text
+    unknown = default in (MISSING, None, (), "") or default is False
+    return text if unknown or "(default: " in text else f"{text} (default: {default})"
 
 
 @cache
-def _read_docstrings(module: str) -> Mapping[tuple[str, str], tuple[str, str]]:
-    """Class and field to its docstring, on one line, and its default, as the module writes them."""
+def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
+    """`CLASS.FIELD` and `CLASS.METHOD.ARGUMENT` of a module to what its source says of them, on one
+    line, and to the default of a field."""
     spec = find_spec(module)
     assert spec is not None
     assert spec.origin is not None
-    found = {}
+    texts = {}
     for cls in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
-        lines = cls.body if isinstance(cls, ast.ClassDef) else []
-        for line, after in zip_longest(lines, lines[1:]):
+        if not isinstance(cls, ast.ClassDef):
+            continue
+        for line, after in zip_longest(cls.body, cls.body[1:]):
             if isinstance(line, ast.AnnAssign):
                 text = ast.literal_eval(after.value) if isinstance(after, ast.Expr) else ""
                 default = "" if line.value is None else ast.unparse(line.value)
-                key = cls.name, ast.unparse(line.target)  # type: ignore[attr-defined]
-                found[key] = " ".join(text.split()), "" if default in ("None", "False") else default
-    return found
+                default = "" if default in ("None", "False") else default.strip("'")
+                texts[f"{cls.name}.{ast.unparse(line.target)}"] = " ".join(text.split()), default
+            elif isinstance(line, ast.FunctionDef):
+                arguments = (ast.get_docstring(line) or "").partition("Args:\n")[2]
+                for name, text in re.findall(r"^    (\w+): (.+(?:\n     .+)*)", arguments, re.M):
+                    texts[f"{cls.name}.{line.name}.{name}"] = " ".join(text.split()), ""
+    return texts

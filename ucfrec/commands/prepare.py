@@ -1,11 +1,10 @@
 """`ucfrec prepare`: turn logs into an episode store; `datasets`: find public ones."""
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, Table
+from ucfrec.commands.options import ARGUMENT, OUTPUT, Table
 from ucfrec.commands.shared_options import LogOptions, SparkOption
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import origin
@@ -15,32 +14,27 @@ class PreparedLogs(LogOptions):
     """Which rows are prepared."""
 
     title = "reading logs"
+    described_by = "ucfrec.logs.prepare:PrepareOptions"
 
     duplicates: Literal["highest", "lowest", "first", "last"] | None = None
-    """Of rows with the same user, item and time, keep that with the highest or lowest reward, or
-    the first or last in the files (default: highest)"""
     max_session: Annotated[int | None, "N"] = None
-    """Exclude and count sessions of more than N rows, as of bots (default: none)"""
 
 
 class EngineOptions(SparkOption):
     """What reads the logs, in how much memory."""
 
     title = "engine"
+    described_by = "ucfrec.logs.prepare:PrepareOptions"
 
     memory_limit: Annotated[str | None, "SIZE"] = None
-    """Memory of the whole command, from 800MB on; beyond it rows spill to a scratch folder beside
-    the store, to at most 90% of the free disk (default: 2GB)"""
     engine: Literal["duckdb", "spark"] = "duckdb"
-    """What reads and sorts the rows; DuckDB on this machine, or Spark, for logs that outgrow it;
-    the store is the same"""
 
 
 class Prepare(EngineOptions, PreparedLogs):
     """`ucfrec prepare`."""
 
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
+    described_by = "ucfrec.logs.prepare:PrepareOptions"
+
     out: Annotated[Path | None, OUTPUT, "STORE"] = None
     """New folder for the store; also at s3://, gs://, hdfs://, …"""
     reward: Annotated[str | None, "SQL"] = None
@@ -50,7 +44,6 @@ class Prepare(EngineOptions, PreparedLogs):
     """Start a new session after a pause, once per user, or with a new session_id (default: of the
     dataset or --mapping, else session_id if the log has it, else gap)"""
     gap_minutes: Annotated[float | None, "MINUTES"] = None
-    """With --session-by gap: a longer pause of the user ends the session (default: 30)"""
     split: Annotated[str | None, "TRAIN,VALIDATION,TEST"] = None
     """Shares of the rows in order of time; or two ISO times (UTC) at which validation and test
     begin (default: 0.8,0.1,0.1)"""
@@ -58,12 +51,7 @@ class Prepare(EngineOptions, PreparedLogs):
     """Check the logs without writing a store."""
 
     def execute(self) -> None:
-        """Print what was read, dropped and kept.
-
-        Raises:
-            InputError: the logs cannot be used, options do not go together, or neither --out nor
-                --validate is given.
-        """
+        """Print what was read, dropped and kept."""
         from ucfrec.logs.expressions import Expression
         from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
         from ucfrec.logs.summary import format_report
@@ -116,11 +104,7 @@ class Datasets(Table):
     """Of open-bandit: logging policy and campaign (default: random/all)"""
 
     def execute(self) -> None:
-        """Print the list, or how the loaded logs are prepared.
-
-        Raises:
-            InputError: there is no such data set, no folder is named, or it cannot be downloaded.
-        """
+        """Print the list, or how the loaded logs are prepared."""
         from ucfrec.logs.releases import find_release, load_release
         from ucfrec.plugins import load_plugin, plugin_names
         from ucfrec.reporting.tables import text_table

@@ -1,12 +1,11 @@
 """`ucfrec rank`: how policies rank what users were shown and clicked later."""
 
 import math
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from ucfrec.commands.options import ARGUMENT, INPUT, POSITIVE
+from ucfrec.commands.options import POSITIVE
 from ucfrec.commands.shared_options import LogOptions, RuleOptions, find_runs
 
 if TYPE_CHECKING:
@@ -16,34 +15,23 @@ if TYPE_CHECKING:
 class Rank(LogOptions, RuleOptions):
     """`ucfrec rank`."""
 
+    described_by = "ucfrec.python_api.recommender:Recommender.rank"
     usage = "%(prog)s RUN... [LOGS...] [options]"
     epilog = (
         "Without LOGS, the policies rank the test split of the store of the first run. Matrix "
         "factorisation, a baseline, needs ucfrec[rank]."
     )
 
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     k: Annotated[int, POSITIVE] = 10
-    """Items recommended at each step."""
     keep_seen: bool = False
     """Also recommend items that the user has seen; (default: leave them out)"""
     seed: int = 0
-    """Seed of the bootstrap over users and of the random baseline."""
     liked: Annotated[str | None, "SQL"] = None
-    """What counts as liked, a truth value over the column reward, e.g. 'reward >= 4'; (default: at
-    least 60% of the way from the lowest training reward to the highest, or to two standard
-    deviations above the mean, if that is less)"""
     json: Annotated[Path | None, "FILE"] = None
     """Also write the rows, with intervals, as JSON."""
 
     def execute(self) -> None:
-        """Print one row per policy.
-
-        Raises:
-            InputError: a run or log cannot be used, the runs have different stores, or there is no
-                test split to rank that none of the runs was trained on.
-        """
+        """Print one row per policy."""
         from ucfrec.evaluation.ranking_table import require_one_catalogue
         from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions

@@ -16,6 +16,7 @@ from ucfrec.commands.shared_options import (
     MemoryOption,
     RequestLimits,
     RuleOptions,
+    RunArgument,
     SparkOption,
 )
 from ucfrec.errors import InputError, InputNote
@@ -52,13 +53,11 @@ class LogAnswerOptions(EngineOptions, AnswerOptions):
     temperature; says the recall (default: exactly)"""
 
 
-class Recommend(LogAnswerOptions, RequestLimits, MemoryOption, LogOptions):
+class Recommend(LogAnswerOptions, RequestLimits, MemoryOption, LogOptions, RunArgument):
     """`ucfrec recommend`."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
-    """Run folder of `ucfrec train`."""
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
+    """Log files, folders or globs; also at s3://, …"""
     k: int = 10
     """Items for each user; if a request does not say how many."""
     exposures: Annotated[Path | None, "FILE"] = None
@@ -74,11 +73,7 @@ class Recommend(LogAnswerOptions, RequestLimits, MemoryOption, LogOptions):
     """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
 
     def execute(self) -> None:
-        """Write the recommendations as Parquet, or answer a stream.
-
-        Raises:
-            InputError: the run or the logs cannot be used.
-        """
+        """Write the recommendations as Parquet, or answer a stream."""
         if self.stream:
             self._answer_stream()
             return
@@ -200,22 +195,17 @@ class Recommend(LogAnswerOptions, RequestLimits, MemoryOption, LogOptions):
         )
 
 
-class Export(RuleOptions):
+class Export(RuleOptions, RunArgument):
     """`ucfrec export`."""
 
-    run: Annotated[Path, ARGUMENT, "RUN"]
-    """Run folder of `ucfrec train`."""
+    described_by = "ucfrec.python_api.recommender:Recommender.export"
+
     onnx: Annotated[Path, "OUT"]
     """Folder to make, with the graph."""
     k: int | None = None
-    """Items that the graph chooses (default: 100, or all if fewer)"""
 
     def execute(self) -> None:
-        """Write the policy with its rule as an ONNX graph, and compare it with torch.
-
-        Raises:
-            InputError: the run cannot be used or exported.
-        """
+        """Write the policy with its rule as an ONNX graph, and compare it with torch."""
         from ucfrec.recommending.export import export
         from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -25,11 +25,7 @@ class Report(Table):
     """HTML file to write."""
 
     def execute(self) -> None:
-        """Write one HTML page about training runs.
-
-        Raises:
-            InputError: no run is named, or a run, result or item file cannot be used.
-        """
+        """Write one HTML page about training runs."""
         from ucfrec.reporting.page import write_report
         from ucfrec.runs.record import RUN
 
@@ -54,11 +50,7 @@ class Promote(Table):
     """Return to the run that was current before."""
 
     def execute(self) -> None:
-        """Print which run `ucfrec serve` answers with from now on.
-
-        Raises:
-            InputError: the run cannot be promoted, or there is none to return to.
-        """
+        """Print which run `ucfrec serve` answers with from now on."""
         from ucfrec.files.record import RUN_RECORD
         from ucfrec.runs.promoted import POINTER, promote, promote_back
 
@@ -81,12 +73,7 @@ class Verify(Table):
     (.jsonl)"""
 
     def execute(self) -> None:
-        """Print one line per path, and one per file with a fault.
-
-        Raises:
-            InputError: a file is missing, has another content than was written, or cannot be
-                verified.
-        """
+        """Print one line per path, and one per file with a fault."""
         faults = sum(_verify(path) for path in self.paths)
         if faults:
             raise InputError(

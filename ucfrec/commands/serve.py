@@ -68,12 +68,7 @@ class Serve(ServerOptions, RequestLimits, AnswerOptions):
     """Also recommend items that the user has seen; (default: leave them out)"""
 
     def execute(self) -> None:
-        """Answer until Ctrl-C or TERM, after which requests in flight are answered.
-
-        Raises:
-            InputError: the run cannot be used or has no checksums, a file of it was changed, the
-                extra `serve` is not installed, or the address cannot be listened on.
-        """
+        """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
         from ucfrec.recommending.workers import MOST, Workers
 
         if not 1 <= self.workers <= MOST:
@@ -198,12 +193,7 @@ class Explore(Table):
     """0 for a free one."""
 
     def execute(self) -> None:
-        """Show policies until Ctrl-C or TERM.
-
-        Raises:
-            InputError: a run or file cannot be used, the extra `serve` is not installed, or the
-                port cannot be listened on.
-        """
+        """Show policies until Ctrl-C or TERM."""
         from ucfrec.exploring.page import Explorer, application
         from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
         from ucfrec.reporting.samples import read_features

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import EXCLUSIVE, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Table, settings_given
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
 
@@ -22,11 +22,20 @@ if TYPE_CHECKING:
 _UNITS_MS: Final = {"s": 1_000, "m": 60_000, "h": 3_600_000, "d": 86_400_000}
 
 
+class RunArgument(Table):
+    """A run, named before logs."""
+
+    run: Annotated[Path, ARGUMENT, "RUN"]
+    """Run folder of `ucfrec train`."""
+
+
 class LogOptions(Table):
-    """How logs are read."""
+    """Logs, and how they are read."""
 
     title = "reading logs"
 
+    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
+    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     dataset: Annotated[str | None, "NAME"] = None
     """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there is one,
     else generic)"""

@@ -12,6 +12,8 @@ from ucfrec.errors import InputError
 class Evaluate(EnvironmentOptions, RuleOptions):
     """`ucfrec evaluate`."""
 
+    described_by = "ucfrec.python_api.recommender:Recommender.evaluate"
+
     runs: Annotated[Sequence[Path], ARGUMENT, "RUN"] = ()
     """Run folders of `ucfrec train`."""
     env: str
@@ -20,7 +22,6 @@ class Evaluate(EnvironmentOptions, RuleOptions):
     seed: int = 0
     """Seed of the sessions."""
     episodes: int = 1000
-    """Episodes of each policy."""
     behavior: Sequence[str] = ()
     """Also evaluate this built-in policy of the simulator, e.g. random; repeatable (default:
     none)"""
@@ -28,11 +29,7 @@ class Evaluate(EnvironmentOptions, RuleOptions):
     """Also write the rows as JSON."""
 
     def execute(self) -> None:
-        """Print one row per policy.
-
-        Raises:
-            InputError: neither a run nor a built-in policy is named, or one of them cannot be used.
-        """
+        """Print one row per policy."""
         from ucfrec.reporting.measuring import evaluate_in
         from ucfrec.reporting.tables import evaluation_table
         from ucfrec.runs.trained_policy import TrainedPolicy
@@ -77,11 +74,7 @@ class Collect(EnvironmentOptions):
     """New folder for the logs."""
 
     def execute(self) -> None:
-        """Simulate sessions and write them as Parquet logs.
-
-        Raises:
-            InputError: the simulator has no such logging policy, or --out exists.
-        """
+        """Simulate sessions and write them as Parquet logs."""
         from ucfrec.evaluation.collect import collect
 
         environment = self.make_environment(self.env)

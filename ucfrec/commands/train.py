@@ -52,11 +52,7 @@ class Train(TrainingOptions):
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""
 
     def execute(self) -> None:
-        """Train, in this process or as one of those of `torchrun`.
-
-        Raises:
-            InputError: the store or a setting cannot be used, or --out holds a different run.
-        """
+        """Train, in this process or as one of those of `torchrun`."""
         import torch
 
         from ucfrec.episodes.store import EpisodeStore
@@ -142,12 +138,7 @@ class Tune(Table):
     """Seed of the search and of every training."""
 
     def execute(self) -> None:
-        """Print the best settings.
-
-        Raises:
-            InputError: the store, a policy or a setting cannot be used, Optuna is not installed, or
-                the folder holds another search.
-        """
+        """Print the best settings."""
         from ucfrec.reporting.tables import text_table
         from ucfrec.runs.config import settings_given
         from ucfrec.tuning.space import Search, read_space
@@ -200,11 +191,7 @@ class Screen(Table):
     """Write the report here (default: none)"""
 
     def execute(self) -> None:
-        """Print which logged observation columns have no effect.
-
-        Raises:
-            InputError: the store has no logged observations, or too few episodes.
-        """
+        """Print which logged observation columns have no effect."""
         from dataclasses import asdict
 
         from ucfrec.counterfactual.screening import describe_screening

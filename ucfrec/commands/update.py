@@ -4,30 +4,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE
-from ucfrec.commands.shared_options import LogOptions, MemoryOption, read_duration
+from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE, Table
+from ucfrec.commands.shared_options import LogOptions, MemoryOption, RunArgument, read_duration
 from ucfrec.errors import InputError
 from ucfrec.files.remote import origin
 
 
-class Join(LogOptions, MemoryOption):
-    """`ucfrec join`."""
+class Exposures(Table):
+    """What was shown, named before the feedback."""
 
     exposures: Annotated[str, ARGUMENT, INPUT, "EXPOSURES"]
     """File, folder or quoted glob that serve or recommend --exposures wrote."""
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "FEEDBACK"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
+
+
+class Join(MemoryOption, LogOptions, Exposures):
+    """`ucfrec join`."""
+
     within: Annotated[str, "TIME"]
     """Longest time from exposure to feedback: 90s, 30m, 2h, 1d."""
     out: Annotated[Path, OUTPUT]
     """Parquet log to write."""
 
     def execute(self) -> None:
-        """Print what was matched.
-
-        Raises:
-            InputError: a file cannot be used, or --within is not a duration.
-        """
+        """Print what was matched."""
         from ucfrec.logs.join import join_feedback
 
         within = read_duration("--within", self.within)
@@ -38,13 +37,13 @@ class Join(LogOptions, MemoryOption):
         print(f"{joined}\n\n{origin(self.out)}")
 
 
-class Update(LogOptions, MemoryOption):
+class Update(MemoryOption, LogOptions, RunArgument):
     """`ucfrec update`."""
+
+    described_by = "ucfrec.python_api.recommender:Recommender.update"
 
     run: Annotated[Path, ARGUMENT, "RUN"]
     """Finished run on the older logs; or a folder of runs, for the one that was promoted."""
-    logs: Annotated[Sequence[str], ARGUMENT, INPUT, "NEW_LOGS"]
-    """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     out: Annotated[Path, "RUN2"]
     """Folder of the new run; an interrupted update in it is resumed."""
     store: Annotated[Path | None, "STORE"] = None
@@ -58,19 +57,13 @@ class Update(LogOptions, MemoryOption):
     """Once the runs are compared, do not go on learning from the validation and test rows;
     (default: RUN2 acts by the weights that learned from all rows)"""
     filter_seen: bool = False
-    """Exclude items that the user was shown before, as serve and recommend do without --keep-seen:
-    for logs of what they showed"""
     seed: int | None = None
     """Of everything random (default: that of RUN)"""
     threads: Annotated[int | None, POSITIVE] = None
     """CPU threads (default: all cores)"""
 
     def execute(self) -> None:
-        """Print what was read, the drift and the verdict.
-
-        Raises:
-            InputError: the run or the logs cannot be used, or --out holds something else.
-        """
+        """Print what was read, the drift and the verdict."""
         import torch
 
         from ucfrec.logs.append import SPLIT, AppendOptions
@@ -139,11 +132,7 @@ class Compare(MemoryOption):
     """Also write the numbers as JSON."""
 
     def execute(self) -> None:
-        """Print both arms and their difference.
-
-        Raises:
-            InputError: a log cannot be used, or there are not two arms.
-        """
+        """Print both arms and their difference."""
         from dataclasses import asdict
 
         from ucfrec.files.atomic import write_json

@@ -18,7 +18,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, Explained, explain, read_pasted
 from ucfrec.files.record import CARD
-from ucfrec.python_api.given_data import histories_given
+from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
 from ucfrec.recommending.server import AllowedHosts
@@ -224,7 +224,7 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
     """
     run, text = trained.folder.name, fields.get("history", "").strip()
     if text:
-        (history,) = histories_given(trained, read_pasted(text), None, ["pasted"])
+        (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
         unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
         if len(unknown):
             raise InputError(
@@ -243,7 +243,7 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"
         )
-    (history,) = histories_given(trained, None, None, [user])
+    (history,) = read_histories(trained, None, None, [user])
     return history
 
 

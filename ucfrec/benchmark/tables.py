@@ -26,7 +26,6 @@ NEAR: Final = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
 _BySeed = Mapping[tuple[int | None, int | None], float]
 """Values by the seeds of the log and of the training."""
-_SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
@@ -37,45 +36,52 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     of the same log and seed: mean ± standard error over the pairs, and in brackets over the means
     of logs, which counts what logs differ by.
     """
-    columns = (*_SHOWN, "coverage", "target", "estimate")
-    head = ("environment", "method", "logs × seeds", *columns, f"− {OURS}")
-    lines, rows = [], select_checkpoint(rows, checkpoint)
-    less = difference_to_ours(rows)
-    for (environment, method), group in grouped(rows, _line).items():
-        spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
+    rows = select_checkpoint(rows, checkpoint)
+    of_ours = grouped((row for row in rows if row.method == OURS), lambda row: row.environment)
+
+    def describe(group: Sequence[ResultRow]) -> list[str]:
         targets = {f"{row.target_return:g}" for row in group if row.target_return is not None}
-        spread.append(", ".join(sorted(targets, key=float)) or NONE)
-        spread.append(mean_and_sd(numbers(group, "estimated_value")))
-        lines.append((environment, method, len(group), *spread, less[environment, method]))
-    return markdown_table(head, lines)
+        less = NONE
+        if group[0].method != OURS:
+            ours = _index_by_seeds(of_ours.get(group[0].environment, ()))
+            less = _format_difference(_subtract(_index_by_seeds(group), ours))
+        estimate = mean_and_sd(list_metric(group, "estimated_value"))
+        return [", ".join(sorted(targets, key=float)) or NONE, estimate, less]
 
-
-def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
-    """By (environment, method): its return less that of UCF, as in `method_table`; a dash for
-    UCF."""
-    texts: dict[tuple[str, str], str] = {}
-    for environment, group in grouped(rows, lambda row: str(row.environment)).items():
-        values = {
-            name: {_seeds(row): row.value for row in rows_of_method}
-            for name, rows_of_method in grouped(group, lambda row: row.method).items()
-        }
-        ours = values.get(OURS, {})
-        texts |= {
-            (environment, name): NONE if name == OURS else _format_difference(_less(seeds, ours))
-            for name, seeds in values.items()
-        }
-    return texts
+    columns = ("R_cum", "R_avg_pooled", "R_avg_episode", "length", "coverage")
+    more = ("target", "estimate", f"− {OURS}")
+    return _make_table(rows, "method", dict(zip(columns, columns, strict=True)), more, describe)
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
-    head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
-    lines, metrics = [], ("R_cum", "validation_loss", "acceptance")
-    groups = grouped(select_checkpoint(rows, checkpoint), _line)
-    for (environment, method), group in groups.items():
-        spread = [mean_and_sd(numbers(group, name)) for name in metrics]
-        lines.append((environment, method, len(group), *spread))
-    return markdown_table(head, lines)
+    columns = {
+        "R_cum": "R_cum",
+        "validation loss": "validation_loss",
+        "acceptance": "acceptance",
+    }
+    return _make_table(select_checkpoint(rows, checkpoint), "setting", columns)
+
+
+def _make_table(
+    rows: Sequence[ResultRow],
+    name: str,
+    columns: Mapping[str, str],
+    more: Sequence[str] = (),
+    describe: Callable[[Sequence[ResultRow]], list[str]] = lambda group: [],
+) -> str:
+    """Mean and spread of metrics, one line per environment and method.
+
+    Args:
+        name: head of the column of methods.
+        columns: head of a column to its metric.
+        more: heads of the columns that `describe` makes of the rows of a line.
+    """
+    lines = []
+    for (environment, method), group in grouped(rows, lambda r: (r.environment, r.method)).items():
+        spread = [mean_and_sd(list_metric(group, metric)) for metric in columns.values()]
+        lines.append((environment, method, len(group), *spread, *describe(group)))
+    return markdown_table(("environment", name, "logs × seeds", *columns, *more), lines)
 
 
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
@@ -94,20 +100,17 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
     for (environment, quantile, method), group in sorted(
         groups.items(), key=lambda item: item[0][:2]
     ):
-        by_pair = [
-            {_seeds(row): row.value for row in group if row.conditions["distractor"] == rate}
-            for rate in DISTRACTOR_RATES
-        ]
-        pairs = [pair for pair in by_pair[0] if all(pair in values for values in by_pair)]
+        by_rate = grouped(group, lambda row: row.conditions["distractor"])
+        indexed = [_index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
+        pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
         if not pairs:  # an environment in which no distractor was planted
             continue
-        clean, off, on = ([values[pair] for pair in pairs] for values in by_pair)
+        clean, off, on = ([values[pair] for pair in pairs] for values in indexed)
         drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
         lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
     head = ("environment", "target quantile", "method", "logs × seeds")
-    columns = ("no distractor", "distractor off", "distractor on", "drop, %")
-    return markdown_table((*head, *columns), lines)
+    return markdown_table((*head, *DISTRACTOR_NAMES, "drop, %"), lines)
 
 
 def select_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
@@ -115,7 +118,7 @@ def select_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[Result
     return [row for row in rows if row.checkpoint in (None, checkpoint)]
 
 
-def numbers(rows: Sequence[ResultRow], name: str) -> list[float]:
+def list_metric(rows: Sequence[ResultRow], name: str) -> list[float]:
     """Values of metric `name` of the rows that have it."""
     return [row.metrics[name] for row in rows if name in row.metrics]
 
@@ -205,24 +208,29 @@ def difference_table(
     lines = []
     for method in dict.fromkeys(row.method for row in rows if row.method != first):
         of_tasks = [
-            _less(values.get((method, task), {}), values.get((first, task), {})) for task in tasks
+            _subtract(values.get((method, task), {}), values.get((first, task), {}))
+            for task in tasks
         ]
         if any(of_tasks):
-            texts = [*map(_format_difference, of_tasks), _format_signed(_summarise_tasks(of_tasks))]
+            mean = _format_signed(_summarise_tasks(of_tasks))
+            texts = [*map(_format_difference, of_tasks), mean]
             lines.append({"method": method, **dict(zip((*tasks, MEAN), texts, strict=True))})
     return lines
 
 
 def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
     """The metric, where a row has it, by seeds, of each method and task."""
+    rows = [row for row in rows if metric in row.metrics]
+    groups = grouped(rows, lambda row: (row.method, row.task))
+    return {pair: _index_by_seeds(group, metric) for pair, group in groups.items()}
+
+
+def _index_by_seeds(rows: Sequence[ResultRow], metric: str | None = None) -> _BySeed:
+    """A metric, or None for what a row is about, by the seeds of the log and of the training."""
     return {
-        pair: {_seeds(row): row.metrics[metric] for row in group if metric in row.metrics}
-        for pair, group in grouped(rows, lambda row: (row.method, row.task)).items()
+        (row.log_seed, row.training_seed): row.value if metric is None else row.metrics[metric]
+        for row in rows
     }
-
-
-def _seeds(row: ResultRow) -> tuple[int | None, int | None]:
-    return row.log_seed, row.training_seed
 
 
 def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
@@ -234,7 +242,7 @@ def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
     return summary([summary(task.mean for task in means).mean] if all(of_tasks) else [])
 
 
-def _less(values: _BySeed, reference: _BySeed) -> _BySeed:
+def _subtract(values: _BySeed, reference: _BySeed) -> _BySeed:
     """By how much `values` exceed those of the same seeds in `reference`; a value that no log or
     seed changes is compared with each."""
     if values.keys() == {(None, None)}:
@@ -256,10 +264,6 @@ def _format_signed(differences: Summary) -> str:
     if differences.count > 1:
         return signed_difference(differences)
     return f"{differences.mean:+.3g}" if differences.count else NONE
-
-
-def _line(row: ResultRow) -> tuple[str, str]:
-    return str(row.environment), row.method
 
 
 def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ucfrec.benchmark.tables import of_best_target
+from ucfrec.benchmark.tables import select_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
@@ -225,7 +225,7 @@ def _plan_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of several target returns the best, as the printed tables."""
     tables = grouped(rows, lambda row: (row.conditions["budget"], row.table))
     for (budget, table), table_rows in tables.items():
-        lines = [row.as_line() for row in of_best_target(table_rows)]
+        lines = [row.as_line() for row in select_best_target(table_rows)]
         draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
         yield _Plan("scores", f"{budget}-{table}", draw)
 

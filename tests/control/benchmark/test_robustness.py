@@ -10,7 +10,7 @@ from tests.support.control_files import hopper_like, write_hdf5
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Evaluation, opened
+from ucfrec.benchmark.cells import Budget, Evaluation, open_store
 from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.row import ResultRow
@@ -109,7 +109,7 @@ def begin(
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
             train_control(
-                opened(cell), cell.run, cell.config, screening=cell.screening, shared=stages
+                open_store(cell), cell.run, cell.config, screening=cell.screening, shared=stages
             )
     return runs
 

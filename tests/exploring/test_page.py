@@ -21,8 +21,7 @@ pytest.importorskip("fastapi")
 uvicorn = pytest.importorskip("uvicorn")
 # After the check that they are installed.
 from ucfrec.errors import InputError  # noqa: E402
-from ucfrec.exploring.page import Explorer  # noqa: E402
-from ucfrec.exploring.web import application  # noqa: E402
+from ucfrec.exploring.page import Explorer, application  # noqa: E402
 
 HOSTILE = "<script>alert(1)</script>"
 FEATURES = pa.table(

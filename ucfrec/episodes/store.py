@@ -12,11 +12,10 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.view import EpisodeView
+from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import read_ids
@@ -171,10 +170,11 @@ class EpisodeStore(EpisodeView):
             values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
             definition: what they count; None for what they counted before.
         """
-        column = self._columns.step_column(schema.RETURN_TO_GO)
+        name = schema.RETURN_TO_GO
+        returns = self._columns.step_column(name).take(np.arange(self.record.n_steps))
         episodes, steps = self.all_steps()
-        column[self._columns.starts[self.episode_ids[episodes]] + steps] = values
-        columns = self._columns.with_step_column(schema.RETURN_TO_GO, column, definition)
+        returns[self._columns.starts[self.episode_ids[episodes]] + steps] = values
+        columns = self._columns.replace(name, StepColumn([returns]), (), definition)
         return EpisodeStore(columns, self._selected)
 
     def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
@@ -189,8 +189,10 @@ class EpisodeStore(EpisodeView):
         Args:
             dimensions: to remove, each 0 to O − 1.
         """
-        kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        return EpisodeStore(self._columns.with_observation_dimensions(kept), self._selected)
+        rest = np.setdiff1d(np.arange(self.observation_size), dimensions)
+        column = self._columns.step_column(schema.OBSERVATION).select_dimensions(rest)
+        columns = self._columns.replace(schema.OBSERVATION, column, (len(rest),), None)
+        return EpisodeStore(columns, self._selected)
 
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:

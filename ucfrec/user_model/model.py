@@ -71,11 +71,9 @@ class UserModel:
         """Fit the parts that are not in `folder` yet; read the others.
 
         Args:
-            train: training episodes of a store of items.
-            validation: held-out episodes of the same store.
             simulated: whether sessions are simulated.
-            first: folder of the user model of an earlier state of the store, near whose spreads of
-                effects the search begins and ends.
+            first: folder of the user model of an earlier state of the store of items, near whose
+                spreads of effects the search begins and ends.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
@@ -136,13 +134,8 @@ class UserModel:
     def expect(
         self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in reward units.
-
-        Args:
-            states: (M, S) before the step.
-            users: (M,) rows of the training store's users.
-            items: (M,) int64.
-        """
+        """Expected rewards (M,) of one item (M,) each, in reward units, in states (M, S) of users
+        (M,), rows of the training store."""
         slope, intercept = self.calibration
         scores = self.rewarding.score(states, history, users, items)
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
@@ -241,8 +234,7 @@ class UserSimulator:
         Args:
             store: view of the sessions that are begun; session i is the i-th modulo their number.
             longest: steps after which a session ends in any case.
-            times: how often each session is simulated; N is `times` times `sessions`. Session i
-                draws the same numbers as session i modulo `sessions`.
+            times: N / `sessions`; session i draws what session i modulo `sessions` draws.
         """
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
@@ -269,14 +261,10 @@ class UserSimulator:
         return np.asarray(values, dtype=np.float32)
 
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
-        """Show one item in every session.
-
-        Args:
-            actions: (M,) items.
+        """Show one item (M,) in every session.
 
         Returns:
-            Rewards (M,), and the positions of the sessions that go on, which are the only ones from
-            then on.
+            Rewards (M,), and the positions of the sessions that go on.
         """
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         observations = torch.from_numpy(self.observations())

@@ -50,6 +50,7 @@ _ROWS: Final = 512
 """Rows whose tastes are found at once; more leave the processor's cache."""
 
 Effects = dict[str, Tensor]
+_Map = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -202,11 +203,8 @@ class Design:
         return float(self.weights.sum(dtype=torch.float64))
 
     def penalty(self, name: str, spread: float) -> float:
-        """Precision of the prior of the effect `name`, twice the factor of its squares.
-
-        Under a Gaussian prior of this precision, the effect's contribution to the predictor of a
-        mean row has the standard deviation `spread`.
-        """
+        """Precision of the Gaussian prior of the effect `name` under which it adds a number of the
+        standard deviation `spread` to the predictor of a mean row."""
         return float(self.squares(name).sum()) / self.count / spread**2
 
     def loss(self, predictor: Tensor) -> Tensor:
@@ -226,60 +224,55 @@ class Design:
 def fit_effects(
     design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
 ) -> Effects:
-    """Minimise the summed loss of `design` plus penalties on the effects named in `spreads`.
+    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`.
 
     Args:
         start: effects to start from; missing ones start at 0.
-        spreads: of every effect of the fit; see `Design.penalty`.
         fixed: effects that are part of the predictor, and of the result, as they are.
     """
-    constant = fixed or {}
-    names = ("mean", *spreads)
-    curvature = 0.25 if design.binary else 1.0
+    constant, curvature = fixed or {}, 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
-    units = {name: _units(design, name, curvature, penalty.get(name, 0.0)) for name in names}
-    first = {name: units[name].of(start.get(name, design.zeros(name))) for name in names}
+    first, inverses = Effects(), dict[str, _Map]()
+    for name in ("mean", *spreads):
+        scale, inverses[name] = _scale(design, name, curvature, penalty.get(name, 0.0))
+        first[name] = scale(start.get(name, design.zeros(name)))
     sizes = [value.numel() for value in first.values()]
 
-    def effects_of(numbers: Tensor) -> Effects:
+    def unpack(numbers: Tensor) -> Effects:
         parts = zip(first.items(), torch.split(numbers, sizes), strict=True)
-        return {
-            name: units[name].effect(part.view(first_numbers.shape))
-            for (name, first_numbers), part in parts
-        }
+        return {name: inverses[name](part.view(value.shape)) for (name, value), part in parts}
 
     def objective(numbers: Tensor) -> Tensor:
-        effects = effects_of(numbers)
+        effects = unpack(numbers)
         loss = design.loss(design.predictor(constant | effects)).sum(dtype=torch.float64)
         for name in spreads:
             loss = loss + 0.5 * penalty[name] * effects[name].square().sum(dtype=torch.float64)
         return loss
 
-    start_numbers = torch.cat([part.flatten() for part in first.values()])
-    return constant | effects_of(minimum(objective, start_numbers))
+    numbers = torch.cat([part.flatten() for part in first.values()])
+    return constant | unpack(minimum(objective, numbers))
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
     """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`.
 
-    Its second derivative should be about 1 in all directions, because the first step, and the first
-    step that every line search tries, has the length that this implies.
+    Its second derivative should be about 1 in all directions: that is the first step's length.
     """
 
-    def evaluated(at: Tensor) -> tuple[float, Tensor]:
+    def evaluate(at: Tensor) -> tuple[float, Tensor]:
         at = at.detach().requires_grad_(True)
         value = objective(at)
         (gradient,) = torch.autograd.grad(value, at)
         return value.item(), gradient
 
-    at, (value, gradient) = start, evaluated(start)
+    at, (value, gradient) = start, evaluate(start)
     history: deque[tuple[Tensor, Tensor]] = deque(maxlen=_HISTORY)
     for _ in range(_ITERATIONS):
         direction = -_newton(gradient, history)
         slope, length = float(gradient @ direction), 1.0
         while True:
             following = at + length * direction
-            value_there, gradient_there = evaluated(following)
+            value_there, gradient_there = evaluate(following)
             if value_there <= value + _ARMIJO * length * slope:
                 break
             length /= 2
@@ -309,21 +302,13 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
     return result
 
 
-@dataclass(frozen=True)
-class _Units:
-    """Units of an effect in which the objective is about as curved in all directions."""
-
-    effect: Callable[[Tensor], Tensor]
-    """The effect, from numbers in these units."""
-    of: Callable[[Tensor], Tensor]
-    """Its inverse."""
-
-
-def _units(design: Design, name: str, curvature: float, penalty: float) -> _Units:
+def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
+    """Maps of an effect to units in which the objective is about as curved in all directions, and
+    back."""
     if name in ("state", "exposure"):
         inputs = design.x if name == "state" else design.exposure
         factor, inverse = _factors(curvature * _moments(design, inputs), penalty)
-        return _Units(lambda numbers: inverse @ numbers, lambda effect: factor @ effect)
+        return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):
         x = design.observed if name == "context" else design.x
         # The curvature is about a Kronecker product of two second moments, each with a part of the
@@ -333,12 +318,9 @@ def _units(design: Design, name: str, curvature: float, penalty: float) -> _Unit
         ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
         left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
         right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)
-        return _Units(
-            lambda numbers: left_inverse @ numbers @ right_inverse.T,
-            lambda effect: left @ effect @ right.T,
-        )
+        return lambda x: left @ x @ right.T, lambda x: left_inverse @ x @ right_inverse.T
     unit = (curvature * design.squares(name) + penalty).clamp(min=_SMALLEST).rsqrt()
-    return _Units(lambda numbers: numbers * unit, lambda effect: effect / unit)
+    return lambda x: x / unit, lambda x: x * unit
 
 
 def _moments(design: Design, inputs: Tensor) -> Tensor:
@@ -364,11 +346,7 @@ class Beginning:
 
     @classmethod
     def of(cls, file: Path, design: Design) -> "Beginning | None":
-        """Read what `save_fit` wrote, in the sizes of `design`; None if it is not there.
-
-        Raises:
-            InputError: a file is damaged.
-        """
+        """Read what `save_fit` wrote, in the sizes of `design`; None if it is not there."""
         if not file.exists():
             return None
         effects = Effects()
@@ -385,13 +363,9 @@ class Beginning:
                     rows = old if name == "item" else old[:-1]
                     new[: len(rows)] = rows
                     effects[name] = new
-        spreads = np.array(_SPREADS)
-        numbers = {
-            entry.effect: int(np.abs(spreads - entry.spread).argmin())
-            for entry in entries
-            if entry.kept
-        }
-        return cls(numbers, effects)
+        numbers = np.abs(np.subtract.outer([e.spread for e in entries], _SPREADS)).argmin(1)
+        pairs = zip(entries, numbers.tolist(), strict=True)
+        return cls({entry.effect: number for entry, number in pairs if entry.kept}, effects)
 
 
 class EffectSearch:
@@ -404,11 +378,7 @@ class EffectSearch:
     def __init__(
         self, design: Design, held_out: Design | None, begin: Beginning | None = None
     ) -> None:
-        """Args:
-        design: training rows.
-        held_out: rows that choose; None for a fifth of the training rows.
-        begin: where to begin; None for a search from scratch.
-        """
+        """Held-out rows choose; None for a fifth of the training rows."""
         if held_out is None:
             rows = len(design.items)
             chooses = torch.arange(rows) % 5 == min(4, rows - 1)

@@ -1,18 +1,13 @@
 """Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
-Training users are those whose sessions a decision rule is tried in. For new users, policy and
-reward model learn tastes from the session. In sessions whose rewards are drawn from that reward
-model, a policy is paid for its own guesses: an item that pays once, by luck, counts as liked and
-goes on paying. Training users have fixed tastes, and nothing that acts knows them.
+Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
+knows. Where rewards are drawn from a model that learns tastes from the session, a policy is paid
+for its own guesses: an item that pays once, by luck, counts as liked and goes on paying.
 
 Logs of policies that knew more of their users than the log shows make what they showed look better
-than it is for anybody else. Where the log has all propensities p, and users are new, rows are
-therefore weighted by 1 / (p · items), cut off at 10, as if all items had been shown alike (inverse
-propensity weighting). So that a few rows of large weight do not pass for much knowledge of a user's
-tastes, the weights of each user's rows are scaled to add up to their effective number (Pfeffermann
-et al., 1998, "Weighting for unequal selection probabilities in multilevel models"). Known users are
-calibrated on weighted validation rows instead (`UserCalibration`), and their tastes fitted without
-weights, which there only cost data.
+than it is for anybody else. Where the log has all propensities, and users are new, rows are
+therefore weighted (`weigh_by_propensity`). Known users are calibrated on weighted validation rows
+instead (`UserCalibration`), and their tastes fitted without weights, which there only cost data.
 """
 
 from dataclasses import dataclass
@@ -77,10 +72,9 @@ class TrainingUsersReport:
 
 @dataclass(frozen=True)
 class TrainingUsers:
-    """Training users, and how their tastes were found."""
+    """Rewards of items for training users, and how their tastes were found."""
 
     model: ItemRewardModel
-    """Rewards of items for them."""
     report: TrainingUsersReport
 
 
@@ -112,20 +106,15 @@ def fit_item_reward_model(
 
     Where hardly any validation row is of a user with training rows, the model is for new users. A
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
-    effects of items that contain those of the users who saw them predict best. What a user's
-    effects tell of training rows, the history of the session must tell of a new user. So the
-    effects of users are dropped once those of items are known, but for how much users differ, which
-    is what `UserPosterior` start from, and the other effects are fitted without them.
+    effects of items that contain those of the users who saw them predict best. The effects of users
+    are dropped once those of items are known, but for how much users differ, which is what
+    `UserPosterior` start from, and the other effects are fitted without them.
 
     Args:
-        train: view of a store of items.
-        validation: held-out view of the same store.
+        train: view of a store of items; `validation` is another one.
         seed: of the rows drawn from a view with too many.
         first: folder of the model of an earlier state of the store, near whose spreads the search
             begins and ends; where users are known, on fewer rows.
-
-    Returns:
-        The model, in evaluation mode, and its quality on the validation rows.
 
     Raises:
         InputError: a view has no steps, or all training rewards are equal.
@@ -174,13 +163,8 @@ def fit_item_reward_model(
 def refit_item_reward_model(
     first: Path, store: EpisodeStore, folder: Path, seed: int
 ) -> ItemRewardModel:
-    """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
-
-    Args:
-        first: folder of `fit_item_reward_model`.
-        store: view of the episodes to fit to.
-        seed: of the rows drawn from a view with too many.
-    """
+    """Fit the effects that `fit_item_reward_model` kept in the folder `first`, as strong as there,
+    to other rows of the view `store`."""
     tensors, metadata = load_tensors(first / FITTED)
     report = ItemRewardReport(**metadata)
     model = ItemRewardModel(reward_model_sizes(store))
@@ -214,14 +198,12 @@ def fit_training_users(
 ) -> TrainingUsers:
     """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
-    A fifth of the rows chooses the effects.
+    A fifth of the rows of the sessions of `draw_sessions` chooses the effects.
 
     Args:
         train: view of a store of items whose episodes name their users.
-        seed: of the sessions drawn by `draw_sessions`.
         weighted: whether rows are weighted by propensities, if there are any.
-        first: folder of the fit to an earlier state of the store, near whose spreads the search
-            begins and ends; of known users, on fewer rows.
+        first: see `fit_item_reward_model`.
 
     Raises:
         InputError: all training rewards are equal, or the file is damaged.

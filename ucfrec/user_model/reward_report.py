@@ -60,14 +60,13 @@ class RewardRows:
     def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
         """All steps of a view of a store of items; of more than `limit`, so many drawn by `seed`.
 
-        Of what was shown earlier, the latest `lags` steps are read. Nothing of a step but its item
-        and reward is read, nor anything of later steps.
+        Nothing of a step but its item and reward is read, nor anything of later steps.
         """
         return cls.at(view, *draw_steps(view, limit, seed), lags)
 
     @classmethod
     def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
-        """The given steps (M,) of a view."""
+        """The given steps (M,) of a view, with the latest `lags` items shown before them."""
         states = torch.empty(len(steps), view.state_size)
         for start in range(0, len(steps), _READ_AT_ONCE):
             part = slice(start, start + _READ_AT_ONCE)
@@ -106,9 +105,10 @@ def weigh_by_propensity(
 ) -> Tensor | None:
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
-    Of each user in proportion to 1 / (p · items), cut off at 10. Their sum is the number of the
-    user's steps of equal weight that count as much, (Σ w)² / Σ w² (Kish). None if the log does not
-    have every propensity p.
+    Of each user in proportion to 1 / (p · items), cut off at 10 (inverse propensity weighting). So
+    that a few rows of large weight do not pass for much knowledge of a user, those of a user add up
+    to their effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal
+    selection probabilities in multilevel models"). None if the log does not have every p.
     """
     if schema.PROPENSITY not in view.record.columns:
         return None
@@ -176,11 +176,8 @@ class ItemRewardReport:
     calibration: Calibration
     """Predicted and observed rewards."""
     gauc: _OrNaN
-    """Probability that a liked step scores higher than another of the same user, by impressions.
-
-    What all items share at a step (user and state) is excluded of the scores: it does not rank
-    items, and as the state contains the last reward, it would compare a user's steps by what was
-    liked before them."""
+    """Probability that a liked step scores higher than another of the same user, by impressions;
+    without what all items share at a step (user and state), which does not rank items."""
     gauc_error: _OrNaN
     """Standard error of `gauc`, over users."""
     item_rate_gauc: _OrNaN
@@ -229,8 +226,7 @@ def calibration(predicted: Float64Array, observed: Float64Array) -> Calibration:
 def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
     """Slope and intercept of the scores (M,) that fit the target (M,) best.
 
-    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise. Rows of
-    `weights` (M,) count so many times.
+    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise.
     """
     from sklearn.linear_model import LinearRegression, LogisticRegression
 

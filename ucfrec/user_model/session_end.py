@@ -72,11 +72,8 @@ class LoggedEnds:
 
     @classmethod
     def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
-        """Steps of a view of a store of items, at most `most` of them, drawn at random.
-
-        The last step of a session that is not terminated is excluded: the log may simply have ended
-        there.
-        """
+        """Steps of a view of a store of items, at most `most` of them, drawn at random; without the
+        last one of a session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
         ends = np.cumsum(usable)
         numbers = np.arange(int(ends[-1]))
@@ -121,9 +118,8 @@ def whole_sessions(
 ) -> tuple[EpisodeStore, EpisodeStore]:
     """Sessions to fit models of their ends to, and held-out ones to choose a model by.
 
-    These are training and validation sessions. But where most validation sessions go on from
-    training sessions that the split by time cut, they lack the steps that say when they end: the
-    training sessions of a fifth of the users are held out instead.
+    Where most validation sessions go on from training sessions that the split by time cut, they
+    lack the steps that say when they end: training sessions of a fifth of the users are held out.
     """
     if not (train.has_users and validation.has_users):
         return train, validation
@@ -162,11 +158,9 @@ class SessionEnd:
     """
 
     def __init__(self, likeness: Likeness, tensors: Mapping[str, Tensor]) -> None:
-        """Args:
-        tensors: those of `BoostedTrees`; or the `highest` (F,) inputs that count, so that steps
-            later than logged ones are like the last, `mean` and `scale` (F,) of the inputs,
-            `weights` (F,) and `bias` (), all float64.
-        """
+        """Of tensors of `BoostedTrees`; or of the `highest` (F,) inputs that count, so that steps
+        later than logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights`
+        (F,) and `bias` (), all float64."""
         self.tensors, self._likeness = tensors, likeness
         self._trees = BoostedTrees(**tensors) if "thresholds" in tensors else None
         uses = tensors["weights"][_REWARD] if self._trees is None else tensors["inputs"] == _REWARD
@@ -178,8 +172,7 @@ class SessionEnd:
         """From tensors of a file.
 
         Raises:
-            KeyError: some are missing.
-            ValueError: they are neither trees nor a regression of these inputs.
+            KeyError, ValueError: they are neither trees nor a regression of these inputs.
         """
         if "thresholds" in tensors:
             parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
@@ -253,13 +246,8 @@ class SessionEnd:
     def score_items(
         self, history: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
     ) -> list[Tensor]:
-        """Probabilities (B, C) that sessions end if they show items, for each of some rewards.
-
-        Args:
-            items: (B, C) int64.
-            rewards: R of (B, C) that the items would be given.
-            steps: (B,) number of the step.
-        """
+        """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
+        each of some rewards (B, C) that the items would be given."""
         batch, count = items.shape
         lately = _pad(history.items)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
@@ -351,8 +339,8 @@ class BoostedTrees:
         """Args:
         inputs: (T, S) int64 number of the input that a split looks at.
         thresholds: (T, S) float64.
-        leaves: (T, 2^S) float64 values; bit s of a column's number is set where split s finds an
-            input that is at most its threshold.
+        leaves: (T, 2^S) float64 by numbers whose bit s is set where split s finds an input that is
+            at most its threshold.
         base: () float64, what the trees' sum starts from.
         """
         self._leaves, self._base = leaves, base
@@ -371,12 +359,8 @@ class BoostedTrees:
         return self._sums(self._bits @ self._compare(inputs))
 
     def replace_input(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Log-odds (M,) as from `inputs` with one of them replaced by each of some values (M,).
-
-        Args:
-            inputs: (M, F); fastest as the transpose of columns (F, M).
-            number: of the input that is replaced.
-        """
+        """Log-odds (M,) as from `inputs` (M, F) with one of them replaced by each of some values
+        (M,); fastest if inputs are the transpose of columns (F, M)."""
         first, end = (bisect_left(self._sorted, value) for value in (number, number + 1))
         at_most = self._compare(inputs)
         at_most[first:end] = 0.0
@@ -391,10 +375,7 @@ class BoostedTrees:
         return torch.le(inputs.double().T[self._numbers], self._thresholds).float()
 
     def _sums(self, columns: Tensor) -> Tensor:
-        """The trees' sum (M,) from the numbers of their columns (T, M).
-
-        These are sums of a few powers of two, which are exact in float32.
-        """
+        """The trees' sum (M,) from numbers of leaves (T, M), which float32 has exactly."""
         return self._base + self._leaves.gather(1, columns.long()).sum(0)
 
 

@@ -138,20 +138,20 @@ class Benchmark(LoggedOptions, GridOptions):
                 print(show(suite, tables, self.read_rows(self.suite, tables)))
             return
         request = BenchmarkRequest(
-            budget=self.budget,
             tables=tables,
-            out=self.out,
             results=self.rows_file,
-            workers=self.workers,
-            log_seed=self.log_seed,
-            logs=self.logs,
-            evaluation_seed=self.evaluation_seed,
             environment=self.make_environment(self.env) if self.env else None,
             tasks=self.task,
             methods=self.method,
-            training_seeds=self.training_seeds,
-            again=self.again,
+            **{name: getattr(self, name) for name in _SAME},
         )
         with benchmarking(self.rows_file):
             print(measure(suite, request))
         print(f"\nrows: {self.rows_file}")
+
+
+_SAME = (
+    *("budget", "out", "workers", "log_seed", "logs", "evaluation_seed", "training_seeds"),
+    "again",
+)
+"""Options that are fields of `BenchmarkRequest`."""

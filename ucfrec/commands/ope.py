@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from ucfrec.commands.options import OUTPUT, Table, settings_given
 from ucfrec.commands.shared_options import (
     LogOptions,
-    MemoryOption,
     RuleOptions,
     RunArgument,
     SparkOption,
@@ -49,7 +48,7 @@ class EstimateOptions(Table):
     """Treat each session as one of another user, for logs without user ids (as in obd)"""
 
 
-class Ope(EstimateOptions, RuleOptions, MemoryOption, LogOptions):
+class Ope(EstimateOptions, RuleOptions, LogOptions):
     """`ucfrec ope`."""
 
     described_by = "ucfrec.python_api.recommender:Recommender.ope"
@@ -256,7 +255,7 @@ def _read_target(part: str, trained: "TrainedPolicy") -> float:
     return trained.target_return(value) if quantile else value
 
 
-class Score(RuleOptions, MemoryOption, SparkOption, LogOptions, RunArgument):
+class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
     """`ucfrec score`."""
 
     described_by = "ucfrec.python_api.recommender:Recommender.score"

@@ -26,7 +26,7 @@ class EngineOptions(SparkOption):
     title = "engine"
     described_by = "ucfrec.logs.prepare:PrepareOptions"
 
-    memory_limit: Annotated[str | None, "SIZE"] = None
+    memory_limit: Annotated[str, "SIZE"] = "2GB"
     engine: Literal["duckdb", "spark"] = "duckdb"
 
 

@@ -45,7 +45,10 @@ class Rank(LogOptions, RuleOptions):
         with ExitStack() as stack:
             if logs:
                 files, mapping = self.find_logs(logs, policies[0], [self.json])
-                logged = stack.enter_context(read_logged_sessions(policies[0], files, mapping))
+                reading = read_logged_sessions(
+                    policies[0], files, mapping, memory_limit=self.memory_limit
+                )
+                logged = stack.enter_context(reading)
                 print(format_summary(logged.report), end="\n\n")
             else:
                 logged = held_out_sessions(policies)

@@ -13,8 +13,6 @@ from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT
 from ucfrec.commands.shared_options import (
     AnswerOptions,
     LogOptions,
-    MemoryOption,
-    RequestLimits,
     RuleOptions,
     RunArgument,
     SparkOption,
@@ -53,7 +51,7 @@ class LogAnswerOptions(EngineOptions, AnswerOptions):
     temperature; says the recall (default: exactly)"""
 
 
-class Recommend(LogAnswerOptions, RequestLimits, MemoryOption, LogOptions, RunArgument):
+class Recommend(LogAnswerOptions, LogOptions, RunArgument):
     """`ucfrec recommend`."""
 
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from ucfrec.commands.options import ARGUMENT, POSITIVE, Table, settings_given
-from ucfrec.commands.shared_options import AnswerOptions, RequestLimits
+from ucfrec.commands.shared_options import AnswerOptions
 from ucfrec.errors import InputError, InputNote
 from ucfrec.processes import Interrupted
 
@@ -47,7 +47,7 @@ class ServerOptions(Table):
     timeout: Annotated[float | None, "TIMEOUT"] = None
 
 
-class Serve(ServerOptions, RequestLimits, AnswerOptions):
+class Serve(ServerOptions, AnswerOptions):
     """`ucfrec serve`."""
 
     run: Annotated[Path, ARGUMENT, "RUN"]

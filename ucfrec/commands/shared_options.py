@@ -55,6 +55,9 @@ class LogOptions(Table):
     "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
     partitions: bool = False
     """Read names of folders such as country=DE as columns."""
+    memory_limit: Annotated[str, "SIZE"] = "2GB"
+    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to a
+    scratch folder"""
 
     def find_logs(
         self,
@@ -69,8 +72,8 @@ class LogOptions(Table):
             outputs: files that the command writes.
 
         Raises:
-            InputError: a file is missing, or would be replaced by what is written; or the dataset,
-                a --column or the mapping file is unusable.
+            InputError: a file is missing, or would be replaced by an output; or the dataset, a
+                --column or the mapping file is unusable.
         """
         from ucfrec.logs.expressions import Expression
         from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
@@ -98,16 +101,6 @@ class LogOptions(Table):
             inputs += [trained.folder / name for name in names]
         require_other_files((path for path in outputs if path is not None), inputs)
         return files, mapping
-
-
-class MemoryOption(Table):
-    """The memory of reading logs."""
-
-    title = "reading logs"
-
-    memory_limit: Annotated[str, "SIZE"] = "2GB"
-    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to a
-    scratch folder"""
 
 
 class SparkOption(Table):
@@ -180,9 +173,11 @@ class RuleOptions(Table):
 
 
 class AnswerOptions(RuleOptions):
-    """How requests are answered."""
+    """How requests are answered, and the largest that are."""
 
     title = "answering"
+    described_by = "ucfrec.recommending.requests:Limits"
+    prefix = "max_"
     engine: str
     k: int
     keep_seen: bool
@@ -193,6 +188,10 @@ class AnswerOptions(RuleOptions):
     error)"""
     seed: int = 0
     """Of the draws of a rule with --temperature or --explore."""
+    max_bytes: Annotated[int | None, "N"] = None
+    max_k: Annotated[int | None, "N"] = None
+    max_history: Annotated[int | None, "N"] = None
+    max_candidates: Annotated[int | None, "N"] = None
 
     def make_responder(self, trained: "TrainedPolicy") -> "Responder":
         """What answers requests.
@@ -224,19 +223,6 @@ class AnswerOptions(RuleOptions):
             return
         with closing(ExposureLog(self.exposures, trained)) as log:
             yield log
-
-
-class RequestLimits(Table):
-    """The largest request that is answered."""
-
-    title = "request limits; larger requests are rejected"
-    described_by = "ucfrec.recommending.requests:Limits"
-    prefix = "max_"
-
-    max_bytes: Annotated[int | None, "N"] = None
-    max_k: Annotated[int | None, "N"] = None
-    max_history: Annotated[int | None, "N"] = None
-    max_candidates: Annotated[int | None, "N"] = None
 
 
 class EnvironmentOptions(Table):

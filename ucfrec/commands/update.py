@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, POSITIVE, Table
-from ucfrec.commands.shared_options import LogOptions, MemoryOption, RunArgument, read_duration
+from ucfrec.commands.shared_options import LogOptions, RunArgument, read_duration
 from ucfrec.errors import InputError
 from ucfrec.files.remote import origin
 
@@ -17,7 +17,7 @@ class Exposures(Table):
     """File, folder or quoted glob that serve or recommend --exposures wrote."""
 
 
-class Join(MemoryOption, LogOptions, Exposures):
+class Join(LogOptions, Exposures):
     """`ucfrec join`."""
 
     within: Annotated[str, "TIME"]
@@ -37,7 +37,7 @@ class Join(MemoryOption, LogOptions, Exposures):
         print(f"{joined}\n\n{origin(self.out)}")
 
 
-class Update(MemoryOption, LogOptions, RunArgument):
+class Update(LogOptions, RunArgument):
     """`ucfrec update`."""
 
     described_by = "ucfrec.python_api.recommender:Recommender.update"
@@ -116,7 +116,7 @@ class Update(MemoryOption, LogOptions, RunArgument):
             print(f"next: ucfrec promote {self.out}, if `serve` follows its folder")
 
 
-class Compare(MemoryOption):
+class Compare(Table):
     """`ucfrec compare`."""
 
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
@@ -130,6 +130,8 @@ class Compare(MemoryOption):
     test (default: 5% of the value of A)"""
     json: Annotated[Path | None, "FILE"] = None
     """Also write the numbers as JSON."""
+    memory_limit: Annotated[str, "SIZE"] = "2GB"
+    """Memory of the process while it reads the logs, from 800MB on."""
 
     def execute(self) -> None:
         """Print both arms and their difference."""

@@ -76,11 +76,11 @@ class LogOptions(Table):
                 --column or the mapping file is unusable.
         """
         from ucfrec.logs.expressions import Expression
-        from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
+        from ucfrec.logs.mapping import LogMapping, read_columns, read_mapping
         from ucfrec.plugins import load_plugin
 
         mapping = LogMapping(
-            columns_given(self.column),
+            read_columns(self.column),
             time_format=self.time_format,
             earliest=self.earliest,
             where=self.where and Expression(self.where, "--where"),

@@ -13,9 +13,9 @@ from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RuleConfig
 from ucfrec.choosing.logged import LoggedEvidence
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.verdict import diagnose
 from ucfrec.reporting.model_card import tabulate_user_model
 from ucfrec.reporting.page_results import draw_frontier
 from ucfrec.runs.config import resolve_config

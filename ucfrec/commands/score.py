@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
 
     trained = TrainedPolicy.load(options.run, options.checkpoint)
     if (master := spark_given(options)) is not None:
-        from ucfrec.off_policy.spark import score_with_spark
+        from ucfrec.off_policy.scored import score_with_spark
 
         sessions = score_with_spark(
             trained,

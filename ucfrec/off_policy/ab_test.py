@@ -19,7 +19,7 @@ from ucfrec.logs.engine import engine
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quoted
-from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_mean
+from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95

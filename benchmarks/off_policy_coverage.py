@@ -41,8 +41,8 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import Estimate, estimate
-from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.models import fit_models
 from ucfrec.off_policy.verdict import conclude
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance

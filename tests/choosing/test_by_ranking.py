@@ -18,7 +18,7 @@ from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
-from ucfrec.off_policy.diagnostics import diagnose
+from ucfrec.off_policy.verdict import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.policies.heads import ItemHead

@@ -278,7 +278,7 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
         files, mapping = self.find_logs(self.logs, trained, [self.out])
         rule, limit = self.make_rule(trained), self.memory_limit
         if (master := self.find_spark()) is not None:
-            from ucfrec.off_policy.spark import score_with_spark
+            from ucfrec.off_policy.scored import score_with_spark
 
             sessions = score_with_spark(
                 trained,

@@ -18,7 +18,7 @@ from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
 from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quote_name
-from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_mean
+from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95

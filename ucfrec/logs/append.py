@@ -171,11 +171,8 @@ def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
 def _survey_ids(
     log: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord
 ) -> dict[str, int]:
-    """How many ids are new, and the steps that have them.
-
-    Warns of logs that share no user, or no item, with the store, and notes the new users and items
-    of which no feature table says anything.
-    """
+    """How many ids are new, and the steps that have them. Warns of logs that share no user, or no
+    item, with the store, and of new ones of which no feature table says anything."""
     typed, counts = log.rows.log, {}
     for name, table, file in ID_TABLES:
         old_count = pq.read_metadata(store / file).num_rows
@@ -287,11 +284,8 @@ def _move_train_counts(log: TypedLog, shards: Sequence[_Shard]) -> None:
 def _copy_shard(
     shard: _Shard, target: Path, old: StoreRecord, added: Sequence[str]
 ) -> dict[str, tuple[int, str]]:
-    """Link the files of an old shard, or write what changes; returns known checksums.
-
-    Args:
-        added: step columns that the old store lacks.
-    """
+    """Link the files of an old shard, or write what changes, and step columns `added` that the old
+    store lacks; returns known checksums."""
     target.mkdir()
     checksums, whole = {}, bool(shard.stays.all())
     for file in sorted(shard.folder.glob("*.npy")):

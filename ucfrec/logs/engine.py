@@ -105,10 +105,7 @@ def engine(
 @contextmanager
 def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection for registered tables only: it opens no file and never uses the disk.
-
-    Args:
-        memory_limit: of the engine, such as "256MB"; None for DuckDB's default.
-    """
+    `memory_limit` such as "256MB" is that of the engine; None for DuckDB's default."""
     connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
     try:
         if memory_limit is not None:
@@ -278,14 +275,8 @@ def wrong_type(table: Table, what: str, expression: str, kind: str, remedy: str)
 def explain_errors(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path
 ) -> Iterator[None]:
-    """Turn errors of files, memory and disk that occur in the block into `InputError`.
-
-    Args:
-        folder: named when its disk is full.
-
-    Raises:
-        InputError: the memory limit or disk is exhausted, or a file or value cannot be read.
-    """
+    """Turn errors of files, memory and the disk of `folder` in the block into `InputError`: the
+    limit or disk is exhausted, or a file or value cannot be read."""
     try:
         yield
     except (OSError, SafetensorError, duckdb.Error) as error:

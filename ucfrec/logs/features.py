@@ -60,22 +60,14 @@ def load_features(
     kind: str,
     id_type: str,
 ) -> list[str]:
-    """Read feature tables into DuckDB tables `<kind>_features_0`, …, with columns `id`, `f0`, ….
+    """Read feature tables into DuckDB tables, whose names are returned, with columns `id`, `f0`, ….
 
     The parts of a table are joined by the names of their columns, whatever their order: what a part
-    lacks is missing for its rows. A key is not a feature.
+    lacks is missing for its rows. A key is not a feature. `kind` is "item_id" or "user_id"; rows
+    whose key is no id of the log's DuckDB type are excluded.
 
-    Args:
-        connection: engine that may open the tables' files.
-        kind: "item_id" or "user_id".
-        id_type: DuckDB type of the log's ids; rows whose key is none are excluded.
-
-    Returns:
-        Names of the DuckDB tables, one per feature table.
-
-    Raises:
-        InputError: a file or column cannot be used, two parts have a column of different types, or
-            a table repeats an id.
+    Raises InputError if a file or column cannot be used, two parts have a column of different
+    types, or a table repeats an id.
     """
     names = []
     for number, table in enumerate(tables):
@@ -221,16 +213,8 @@ def require_known_ids(
     kind: str,
     noted: bool,
 ) -> None:
-    """Check that each feature table has a row of an id of the log; note if many ids have none.
-
-    Args:
-        names: of `load_features`, for each of them.
-        kind: "item_id" or "user_id".
-        noted: whether there is a note; see `note_lacking` for a store that grows.
-
-    Raises:
-        InputError: none of the ids of a table occurs in the log.
-    """
+    """Raise InputError if a feature table has no row of an id of the log; if `noted`, warn if many
+    ids have none. `names` are those of `load_features`, `kind` as there."""
     used = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
     for table, name in zip(tables, names, strict=True):
         count = _count(connection, used)
@@ -264,13 +248,10 @@ def note_lacking(
     new: str,
     lost: str,
 ) -> None:
-    """Note the new ids of a store that grows which feature tables say nothing of.
+    """Note the `new` ids (SQL) of a store that grows which feature tables say nothing of.
 
-    Args:
-        names: of `load_features`, for each of the tables.
-        kind: "item_id" or "user_id".
-        new: SQL of the new ids of the log, in the column `kind`.
-        lost: the store, if it was made with such tables; empty otherwise.
+    `names` and `kind` are as of `require_known_ids`; `lost` is the store, if it was made with such
+    tables, or empty.
     """
     count, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
     what = "embeddings" if ids == "item" else "features"
@@ -334,15 +315,7 @@ class EncodedFeatures:
 def encode_ids(
     connection: duckdb.DuckDBPyConnection, names: Mapping[str, Sequence[str]]
 ) -> EncodedFeatures:
-    """Encode the features of all users and items.
-
-    Args:
-        connection: with the tables `users` and `items`.
-        names: id column to the feature tables of `load_features`.
-
-    Raises:
-        InputError: the vectors of a column differ in length.
-    """
+    """Encode the features of all users and items, by id column the tables of `load_features`."""
     features, counts = {}, {}
     for name, table, _ in ID_TABLES:
         features[name] = encode_features(connection, names[name], table, name)
@@ -356,17 +329,12 @@ def encode_ids(
 def encode_features(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
 ) -> "sparse.csr_matrix | None":
-    """Encode feature tables; row i belongs to the id with `number` i in the table `ids`.
+    """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`; None if
+    there are none.
 
     Numbers are standardised and clipped, with 0 for missing ones; categories and tags are one-hot.
-    Means, standard deviations and the kept categories come only from ids that occur in the
-    training split (`train_count` above 0).
-
-    Returns:
-        (n_ids, F) float32; None if no column has a feature.
-
-    Raises:
-        InputError: the vectors of a column differ in length.
+    Means, standard deviations and the kept categories come only from ids that occur in the training
+    split (`train_count` above 0). Raises InputError if the vectors of a column differ in length.
     """
     from scipy import sparse  # takes a moment to import
 
@@ -440,15 +408,10 @@ def _fill(
 def item_tags(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str], n_items: int
 ) -> IntArray:
-    """Number the tags of items, which are the values of all columns of lists.
+    """(n_items, T) numbers of tags, padded with −1, T at most `TAGS_PER_ITEM` and 0 without tags.
 
-    Only the `DISTINCT_TAGS` most frequent ones count. An item without any shares none.
-
-    Args:
-        names: feature tables of `load_features`.
-
-    Returns:
-        (n_items, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without tags.
+    Tags are the values of all columns of lists; only the `DISTINCT_TAGS` most frequent ones count.
+    An item without any shares none.
     """
     cases = [
         f"SELECT number, '{name}.{column}:' || unnest(list_distinct({column})) AS tag "

@@ -2,7 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -94,12 +94,8 @@ def frame_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
-    """`read_histories` of a log in memory, without using the disk.
-
-    Raises:
-        InputError: `frame` is not a data frame or has no rows, a column is missing, repeated or of
-            a wrong type, or no row can be used.
-    """
+    """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
+    too."""
     columns = log_table(frame, HISTORIES)
     with engine_in_memory() as connection:
         connection.register(HISTORIES, columns)
@@ -113,9 +109,8 @@ def frame_histories(
 def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     """Convert a data frame to Arrow, leaving out, with a note, columns that it cannot hold.
 
-    Raises:
-        InputError: `frame` is not a data frame or has no rows, two columns have the same name, or a
-            key column has values of several types, durations or periods.
+    Raises InputError if `frame` is not a data frame or has no rows, two columns have the same name,
+    or a key column has values of several types, durations or periods.
     """
     import pandas as pd
 
@@ -149,12 +144,7 @@ class _UnusableError(Exception):
 
 
 def _to_array(values: "pd.Series[Any]") -> pa.Array:
-    """A column of a data frame.
-
-    Raises:
-        _UnusableError: it has mixed Python objects, durations or periods, whole numbers that Arrow
-            does not hold, or a type that the engine or Parquet lacks.
-    """
+    """A column of a data frame, or _UnusableError."""
     import pandas as pd
 
     if isinstance(values.dtype, pd.PeriodDtype):
@@ -194,11 +184,7 @@ def _list_types(kind: pa.DataType) -> Iterator[pa.DataType]:
 def _read_users(
     tables: LogTables, last: int, duplicates: str, folder: Path | None
 ) -> Iterator[pa.RecordBatch]:
-    """The users of a log, some thousand rows at a time.
-
-    Args:
-        folder: scratch folder; None for memory.
-    """
+    """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
     log = open_log(tables, folder or Path(HISTORIES))
     log.require_items()
     with explain_errors(log.connection, log.tables, folder or Path(HISTORIES)):
@@ -220,40 +206,35 @@ def _gather_histories(
     ends = np.append(first[1:], len(codes))
     recent = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
     offsets = np.append(0, np.cumsum(recent)[ends - 1])
-
-    def lists(name: str, of: Callable[[Array], pa.Array]) -> pa.ListArray:
-        return _lists(offsets, of(rows[name][recent]))
-
     query = (
         f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "
         "ORDER BY code"
     )
     users = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
-    columns: dict[str, pa.Array] = {
-        schema.USER_ID: users.take(to_arrow(codes[first].astype(np.int64) - codes[0]))
-    }
-    columns["item_ids"] = lists(ITEM, lambda codes: items.take(to_arrow(codes)))
-    columns["rewards"] = lists(
-        schema.REWARD, lambda values: _numbers(values.astype(np.float32), pa.float32())
-    )
-    columns["timestamps"] = lists(schema.TIMESTAMP, to_arrow)
-    if log.session_by == schema.SESSION_ID:
-        columns["session_ids"] = lists(SESSION, to_arrow)
     # Codes of items are in the order of their ids.
     owner = np.repeat(np.arange(len(first)), ends - first)
     seen = np.unique(owner * len(items) + rows[ITEM])
     bounds = np.searchsorted(seen, np.arange(len(first) + 1) * len(items))
-    columns["seen"] = _lists(bounds, items.take(to_arrow(seen % len(items))))
+    columns = {
+        schema.USER_ID: users.take(to_arrow(codes[first].astype(np.int64) - codes[0])),
+        "item_ids": _to_lists(offsets, items.take(to_arrow(rows[ITEM][recent]))),
+        "rewards": _to_lists(offsets, _to_floats(rows[schema.REWARD][recent])),
+        "timestamps": _to_lists(offsets, to_arrow(rows[schema.TIMESTAMP][recent])),
+        "seen": _to_lists(bounds, items.take(to_arrow(seen % len(items)))),
+    }
+    if log.session_by == schema.SESSION_ID:
+        columns["session_ids"] = _to_lists(offsets, to_arrow(rows[SESSION][recent]))
     if sorted_rows.observations is not None:
         observations = sorted_rows.observations.of_rows(rows["row"][ends - 1])
         bounds = np.arange(len(first) + 1) * observations.shape[1]
-        columns[schema.OBSERVATION] = _lists(bounds, _numbers(observations.ravel(), pa.float32()))
+        columns[schema.OBSERVATION] = _to_lists(bounds, _to_floats(observations.ravel()))
     return pa.record_batch(columns)
 
 
-def _lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
+def _to_lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
     return pa.ListArray.from_arrays(to_arrow(offsets).cast(pa.int32()), values)
 
 
-def _numbers(values: Array, kind: pa.DataType) -> pa.Array:
-    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+def _to_floats(values: Array) -> pa.Array:
+    buffer = pa.py_buffer(np.ascontiguousarray(values, dtype=np.float32))
+    return pa.Array.from_buffers(pa.float32(), len(values), [None, buffer])

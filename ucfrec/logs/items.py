@@ -4,8 +4,7 @@ A policy that was trained on them goes on with those of a store that has grown, 
 same space: old rows stay where they are.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Final
 
@@ -18,6 +17,7 @@ from ucfrec.episodes.item_table import DISTINCT_TAGS, ITEM_STATES, write_item_ta
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
 from ucfrec.logs.features import EncodedFeatures
+from ucfrec.logs.rows import keep_users_whole
 from ucfrec.logs.sessions import Moments
 from ucfrec.processes import require_blas_memory
 
@@ -33,54 +33,22 @@ BLOCK_STEPS: Final = 2**19
 """Training steps in memory at a time, or more if one user has more."""
 EXPOSURE: Final = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
+_OVERSAMPLES: Final = 10
+_SMALL: Final = 1e-10
+"""Eigenvalues below this share of the largest are rounding errors."""
 _ALIKE: Final = 0.5
 """Share of items that two tags must have in common (Jaccard) to be the same tag."""
 
 
-@dataclass(frozen=True)
-class TrainingSteps:
-    """Training steps in which those of one user follow each other."""
-
-    users: IntArray
-    """(M,) number of the user."""
-    items: IntArray
-    """(M,) number of the item."""
-    rewards: Float64Array
-    """(M,)."""
-
-
-def training_steps(folder: Path) -> Iterator[TrainingSteps]:
-    """The training steps of a store, in batches that end between two users.
-
-    Args:
-        folder: store of a log of items, as `prepare` writes it: in order of the users.
-    """
-    held: list[TrainingSteps] = []
-    for batch in steps_of_shards(folder, range(StoreRecord.read(folder).n_shards)):
-        held.append(batch)
-        if sum(len(batch.users) for batch in held) < BLOCK_STEPS:
-            continue
-        joined = join_steps(held)
-        changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
-        if not len(changes):
-            held = [joined]
-            continue
-        end = int(changes[-1]) + 1
-        yield _part(joined, slice(end))
-        held = [_part(joined, slice(end, None))]
-    if held:
-        yield join_steps(held)
-
-
-def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSteps]:
-    """The training steps of some shards of a store, in batches, in order."""
+def read_training_steps(folder: Path, shards: Iterable[int]) -> Iterator[dict[str, Array]]:
+    """The `user`, `item` and `reward` of training steps of some shards of a store, in order."""
     for number in shards:
         shard = folder / f"shard-{number:05d}"
-        columns = {
-            name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, "reward")
-        }
+        items, rewards = (
+            np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, schema.REWARD)
+        )
         offsets, users, splits = (
-            np.load(shard / f"{name}.npy") for name in (schema.OFFSETS, "user", "split")
+            np.load(shard / f"{name}.npy") for name in (schema.OFFSETS, schema.USER, schema.SPLIT)
         )
         begin = 0
         while begin < len(users):
@@ -89,51 +57,34 @@ def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSte
             lengths = np.diff(offsets[begin : end + 1])
             training = np.repeat(splits[begin:end] == 0, lengths)
             rows = slice(int(offsets[begin]), int(offsets[end]))
-            yield TrainingSteps(
-                np.repeat(users[begin:end], lengths)[training],
-                columns[schema.ITEM][rows][training].astype(np.int64),
-                columns["reward"][rows][training].astype(np.float64),
-            )
+            yield {
+                schema.USER: np.repeat(users[begin:end], lengths)[training],
+                schema.ITEM: items[rows][training].astype(np.int64),
+                schema.REWARD: rewards[rows][training].astype(np.float64),
+            }
             begin = end
 
 
-def join_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
-    """The steps of all batches as one."""
-    return TrainingSteps(
-        np.concatenate([batch.users for batch in batches]),
-        np.concatenate([batch.items for batch in batches]),
-        np.concatenate([batch.rewards for batch in batches]),
-    )
-
-
-def _part(batch: TrainingSteps, rows: slice) -> TrainingSteps:
-    return TrainingSteps(batch.users[rows], batch.items[rows], batch.rewards[rows])
-
-
 def write_item_states(folder: Path, scratch: Path, known: EncodedFeatures, size: int) -> None:
-    """Learn the item embeddings and user features of the store at `folder` and write them there.
-
-    Args:
-        scratch: folder for files that are of no use afterwards.
-        size: most dimensions of an item embedding.
-
-    Raises:
-        InputError: the rewards of the training split are all equal.
+    """Learn the item embeddings (at most `size` dimensions) and user features of the store at
+    `folder` and write them there. Raises InputError if all rewards of the training split are equal.
     """
+    shards = range(StoreRecord.read(folder).n_shards)
     moments, low, highest = Moments(1), np.inf, -np.inf
-    for batch in training_steps(folder):
-        moments.add(batch.rewards)
-        low = min(low, float(batch.rewards.min(initial=np.inf)))
-        highest = max(highest, float(batch.rewards.max(initial=-np.inf)))
+    for batch in read_training_steps(folder, shards):
+        rewards = batch[schema.REWARD]
+        moments.add(rewards)
+        low = min(low, float(rewards.min(initial=np.inf)))
+        highest = max(highest, float(rewards.max(initial=-np.inf)))
     high = min(highest, float(moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])))
     if not low < high:
         raise InputError(
             f"all {moments.count} rewards of the training split equal {low}; choose another reward"
         )
     matrix = Exposure(scratch / "exposure.bin", known.item_counts)
-    for batch in training_steps(folder):
-        liking = np.clip((batch.rewards - low) / (high - low), 0, 1)
-        matrix.add(batch.users, batch.items, EXPOSURE + liking)
+    for batch in keep_users_whole(read_training_steps(folder, shards), schema.USER):
+        liking = np.clip((batch[schema.REWARD] - low) / (high - low), 0, 1)
+        matrix.add(batch[schema.USER], batch[schema.ITEM], EXPOSURE + liking)
     embeddings = item_embeddings(matrix, known.items, size)
     user_vectors = np.zeros((len(known.user_counts), 0), dtype=np.float32)
     if known.users is not None:
@@ -148,10 +99,7 @@ class Exposure:
     """The user × item matrix of exposure and liking, on disk."""
 
     def __init__(self, path: Path, counts: IntArray) -> None:
-        """
-        Args:
-            counts: (n_items,) number of training steps that show each item.
-        """
+        """Of items with (n_items,) numbers of training steps that show each; `path` is scratch."""
         self.counts = counts
         self.trained = np.flatnonzero(counts)
         """Items that are shown: item of each column."""
@@ -160,15 +108,8 @@ class Exposure:
         self._by_item = np.zeros(len(self.trained))
 
     def add(self, users: IntArray, items: IntArray, weights: Float64Array) -> None:
-        """Add steps.
-
-        Args:
-            users: (M,) user of each step; those of one user follow each other, in one call.
-            items: (M,) item shown.
-            weights: (M,) above 0; those of one user and item are added up.
-        """
-        if not len(users):
-            return
+        """Add steps (M,); those of one user follow each other, in one call, and weights (above 0)
+        of one user and item are added up."""
         rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
         shape = (int(rows[-1]) + 1, len(self.trained))
         block = sparse.coo_matrix((weights, (rows, self._column[items])), shape=shape).tocsr()
@@ -198,20 +139,14 @@ class Exposure:
 def item_embeddings(
     exposure: Exposure, features: sparse.csr_matrix | None = None, size: int = 32
 ) -> Float32Array:
-    """Embed items by co-occurrence in users' histories and by their features.
+    """(n_items, D) float32 embeddings by co-occurrence in users' histories and by features.
 
     The co-occurrence part is the truncated SVD of the user × item matrix of exposure and liking,
     scaled to unit rows. It is averaged with the prediction of a ridge regression from the item's
-    features (zero without features), whose weight grows the fewer times the item was shown: an item
-    never shown has the prediction alone. With features, up to half of the dimensions are the
-    features themselves, reduced by SVD. No embedding has a norm above 1.
-
-    Args:
-        features: (n_items, F); None for none.
-        size: largest D.
-
-    Returns:
-        (n_items, D) float32; D is below `size` if there are few users, items or features.
+    features (n_items, F) (zero without), whose weight grows the fewer times the item was shown: an
+    item never shown has the prediction alone. With features, up to half of the dimensions are the
+    features themselves, reduced by SVD. No embedding has a norm above 1. D is at most `size`, and
+    below it if there are few users, items or features.
     """
     trained = exposure.trained
     counts = exposure.counts[trained]
@@ -273,20 +208,11 @@ def _unit_rows(rows: Array) -> Array:
     return rows / np.where(norms > 0, norms, 1)
 
 
-_OVERSAMPLES: Final = 10
-_SMALL: Final = 1e-10
-"""Eigenvalues below this share of the largest are rounding errors."""
-
-
 class SparseRows:
     """A sparse matrix on disk, in blocks of consecutive rows."""
 
     def __init__(self, path: Path, n_columns: int) -> None:
-        """
-        Args:
-            path: of a new file for scratch.
-            n_columns: of the matrix.
-        """
+        """Without rows yet, to be written to a new file."""
         self._file: IO[bytes] = path.open("w+b")
         self._blocks: list[tuple[int, int]] = []
         self.shape = (0, n_columns)
@@ -308,29 +234,18 @@ class SparseRows:
             index = starts.astype(np.int32) if values < 2**31 else starts
             yield sparse.csr_matrix((data, columns, index), shape=(rows, self.shape[1]))
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
 
 def right_singular_vectors(
     matrix: SparseRows, by_column: Float64Array, rank: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Largest singular values and right singular vectors of a matrix whose columns are divided.
+    """Largest singular values (rank,) and right singular vectors (rank, n) of a matrix (m, n) whose
+    columns are divided by `by_column` (n,).
 
     The randomised subspace iteration of Halko, Martinsson and Tropp (2011), with the sizes, numbers
     of iterations and random start of scikit-learn's `randomized_svd`, so that both agree but for
-    rounding (products are in float32) and signs. Only matrices with a row for each column are in
-    memory; scikit-learn would also need some with a row for each row.
-
-    Args:
-        matrix: (m, n).
-        by_column: (n,) what columns are divided by, above 0.
-        rank: number of vectors, at most min(m, n).
-
-    Returns:
-        Singular values (rank,), and vectors (rank, n), each with its largest entry above 0. Values
-        beyond the rank of the matrix are 0, and so are their vectors.
+    rounding (products are in float32) and signs: the largest entry of a vector is above 0. Only
+    matrices with a row for each column are in memory; scikit-learn would also need some with a row
+    for each row. Values beyond the rank of the matrix are 0, and so are their vectors.
     """
     m, n = matrix.shape
     random = np.random.RandomState(0)
@@ -343,7 +258,12 @@ def right_singular_vectors(
     else:
         basis = random.normal(size=(n, width))
     for _ in range(7 if rank < 0.1 * min(m, n) else 4):
-        basis = _there_and_back(matrix, by_column, _orthonormal(basis))
+        try:
+            # Several times faster than a QR decomposition, and exact enough between iterations.
+            basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
+        except np.linalg.LinAlgError:
+            basis, _ = np.linalg.qr(basis)
+        basis = _there_and_back(matrix, by_column, basis)
     basis, _ = np.linalg.qr(basis)
     gram = np.zeros((basis.shape[1], basis.shape[1]))
     back = _there_and_back(matrix, by_column, basis, gram)
@@ -358,16 +278,6 @@ def right_singular_vectors(
         directions = (vectors * _inverse(values)).T @ projected
     signs = np.sign(directions[np.arange(rank), np.abs(directions).argmax(axis=1)])
     return values, directions * np.where(signs == 0, 1, signs)[:, None]
-
-
-def _orthonormal(basis: Float64Array) -> Float64Array:
-    """A basis of the same space that is orthonormal up to rounding errors."""
-    try:
-        # Several times faster than a QR decomposition, and exact enough between iterations.
-        triangle = np.linalg.cholesky(basis.T @ basis)
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.qr(basis)[0])
-    return np.asarray(basis @ np.linalg.inv(triangle).T)
 
 
 def _inverse(values: Float64Array) -> Float64Array:
@@ -407,28 +317,29 @@ def _there_and_back(
 def write_grown_states(
     store: Path, folder: Path, new_shards: Iterable[int], known: EncodedFeatures
 ) -> None:
-    """Write the item states of the store at `folder`, grown from `store`.
+    """Write the item states of the store at `folder`, grown from `store` by `new_shards`.
 
     With feature tables, new items and users have the vectors that a ridge regression of the old
     ones on the features predicts, and old ones keep theirs. Without, new ones begin at the mean,
     and items move towards what their users were shown besides as new training steps outweigh the
     old.
-
-    Args:
-        new_shards: those of the new log's steps.
     """
     from ucfrec.episodes.states import ItemStates  # needs torch
 
-    steps, old = [*steps_of_shards(folder, new_shards)], ItemStates.load(store / ITEM_STATES)
-    step_counts = np.zeros(len(known.item_counts), dtype=np.int64)
-    for batch in steps:
-        step_counts += np.bincount(batch.items, minlength=len(step_counts))
+    batches, old = [*read_training_steps(folder, new_shards)], ItemStates.load(store / ITEM_STATES)
+    users, items, rewards = (
+        np.concatenate([batch[name] for batch in batches])
+        for name in (schema.USER, schema.ITEM, schema.REWARD)
+    )
+    step_counts = np.bincount(items, minlength=len(known.item_counts))
     old_counts = np.maximum(known.item_counts - step_counts, 0)
     vectors = _extend_rows(old.embeddings.numpy(), known.items, old_counts)
     if known.items is None and step_counts.any():
-        new, low = join_steps(steps), old.reward_low
-        liking = np.clip((new.rewards - low) / (old.reward_high - low), 0, 1)
-        vectors = _fold_in(vectors, new, EXPOSURE + liking, old_counts, step_counts)
+        liking = np.clip((rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
+        _, rows = np.unique(users, return_inverse=True)
+        shape = (int(rows.max()) + 1, len(vectors))
+        shown = sparse.csr_matrix((EXPOSURE + liking, (rows, items)), shape=shape)
+        vectors = _fold_in(vectors, shown, old_counts, step_counts)
     features = _extend_rows(old.user_features.numpy(), known.users, known.user_counts)
     write_item_table(
         folder / ITEM_STATES,
@@ -454,22 +365,14 @@ def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: 
 
 
 def _fold_in(
-    vectors: Float64Array,
-    new: TrainingSteps,
-    liking: Float64Array,
-    old_counts: IntArray,
-    step_counts: IntArray,
+    vectors: Float64Array, shown: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
 ) -> Float64Array:
-    """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD).
-
-    A user's vector is the mean of those of the items shown, weighted by liking. What an item has
-    in new steps weighs as much as their number, against the number of old ones.
+    """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD): that
+    of the items (users, n) shown, weighted by liking. New steps of an item weigh as much as their
+    number, against the number of old ones.
     """
-    _, rows = np.unique(new.users, return_inverse=True)
-    shape = (int(rows.max()) + 1, len(vectors))
-    weights = sparse.csr_matrix((liking, (rows, new.items)), shape=shape)
-    of_users = (weights @ vectors) / np.asarray(weights.sum(axis=1))
-    folded = weights.T @ (of_users - of_users.mean(axis=0))
+    of_users = (shown @ vectors) / np.asarray(shown.sum(axis=1))
+    folded = shown.T @ (of_users - of_users.mean(axis=0))
     norms = np.linalg.norm(vectors[old_counts > 0], axis=1)
     lengths = np.linalg.norm(folded, axis=1, keepdims=True)
     folded *= (norms.mean() if len(norms) else 1.0) / np.where(lengths > 0, lengths, 1.0)
@@ -478,12 +381,8 @@ def _fold_in(
 
 
 def _number_tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
-    """(n_items, T) tags by the old numbers; −1 for tags of new items that the store lacks.
-
-    Args:
-        old: (n_old, T).
-        new_tags: (n_items, T') of the new tables, numbered otherwise; T' is 0 without tables.
-    """
+    """(n_items, T) tags by the numbers of `old` (n_old, T); −1 for tags of new items that the store
+    lacks. `new_tags` (n_items, T') are numbered otherwise; T' is 0 without tables."""
     tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
     tags[: len(old)] = old
     if not (old.shape[1] and new_tags.shape[1]):

@@ -67,9 +67,8 @@ class Joined:
     with_feedback: int
     """Rows of the log with feedback."""
     matched: int
-    """Rows of feedback that belong to an exposure."""
     unmatched: int
-    """Rows of feedback that belong to none."""
+    """Rows of feedback that belong to an exposure, and to none."""
     columns: tuple[str, ...]
     """Columns of the feedback that the log has."""
 
@@ -196,11 +195,7 @@ def _make_exposures(
 
 
 def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -> str:
-    """SQL of the columns of exposures besides the keys, and of the rows that they are read from.
-
-    Args:
-        keys: the same table with the columns of the keys only.
-    """
+    """SQL of the columns of exposures besides the `keys` that a table has, and of its rows."""
     values, columns, texts = {schema.ARM: "''"}, [], []
     for key, name in _names_of(table).items():
         if _OTHERS.get(key) == "VARCHAR":
@@ -249,10 +244,12 @@ def _make_feedback(
         present = {
             n: names[key] for n, key in enumerate(map(str.casefold, columns)) if key in names
         }
-        values = [
-            f"{_cast_number(name, whole.columns[name])} AS {_value(n)}"
-            for n, name in present.items()
-        ]
+        values = []
+        for n, name in present.items():
+            column = quote_name(name)
+            if not _holds_feedback(whole.columns[name]):
+                column = f"CAST({column} AS VARCHAR)"  # it holds text of numbers, or nothing
+            values.append(f"CAST({column} AS DOUBLE) AS {_value(n)}")
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
         source = narrow.with_texts(present.values(), requests)
@@ -273,13 +270,8 @@ def _make_feedback(
 def _feedback_columns(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
 ) -> tuple[str, ...]:
-    """Columns of numbers and truth values, each once, with a note on those that are left out.
-
-    Args:
-        keys: names in lower case that are none of feedback, besides those of exposures.
-
-    Raises:
-        InputError: a column has numbers in one file, and something else in another.
+    """Columns of numbers and truth values, each once, with a note on those that are left out: not
+    `keys` (in lower case) nor columns of exposures. A column may not be numbers in one file only.
     """
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
@@ -329,12 +321,6 @@ def _value(n: int) -> str:
     return f"value_{n}"
 
 
-def _cast_number(name: str, kind: str) -> str:
-    """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
-    value = quote_name(name) if _holds_feedback(kind) else f"CAST({quote_name(name)} AS VARCHAR)"
-    return f"CAST({value} AS DOUBLE)"
-
-
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
     absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
@@ -364,7 +350,12 @@ def _write(
             )
         selects.append(f"{sql} AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
-    user = "CAST(user_id AS BIGINT) AS user_id" if _are_users_numbers(connection) else "user_id"
+    ((whole,),) = connection.sql(
+        "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
+        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
+        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
+    ).fetchall()
+    user = "CAST(user_id AS BIGINT) AS user_id" if whole else "user_id"
     query = (
         f"SELECT {user}, * EXCLUDE ({', '.join(internal)}), {', '.join(selects)} FROM exposures "
         f"LEFT JOIN (SELECT m.row AS row, count(*) AS {FEEDBACK}{largest} FROM matches m "
@@ -376,16 +367,6 @@ def _write(
         with pq.ParquetWriter(scratch, batches.schema) as writer:
             for batch in batches:
                 writer.write_batch(batch)
-
-
-def _are_users_numbers(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Whether the feedback's users are numbers, and all exposures' are written as numbers are."""
-    ((whole,),) = connection.sql(
-        "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
-        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
-        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
-    ).fetchall()
-    return bool(whole)
 
 
 def _count(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
@@ -405,6 +386,12 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
         f"coalesce(bool_and(timestamp % {_DAY_MS} = 0), false) FROM feedback"
     ).fetchall()
+    # As a number where no calendar has it.
+    first, last = (
+        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
+        f"CAST({time} AS VARCHAR), '(none)')"
+        for time in ("first", "last")
+    )
     reasons = []
     if requests and not equal:
         reasons.append(
@@ -416,11 +403,17 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         reasons.append(
             "none of its users was shown any of their items, check --column user_id and item_id"
         )
+    shown_at, given_at = (
+        connection.sql(
+            f"SELECT {first} || ' to ' || {last} FROM "
+            f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
+        ).fetchall()[0][0]
+        for rows in ("exposures", "feedback")
+    )
     reasons.append(
-        f"exposures are from {_time_range(connection, 'exposures')} and feedback from "
-        f"{_time_range(connection, 'feedback')} (UTC), where numbers are read as milliseconds: "
-        "seconds need --column timestamp='COLUMN * 1000', microseconds "
-        "--column timestamp='COLUMN / 1000', and later feedback a larger --within"
+        f"exposures are from {shown_at} and feedback from {given_at} (UTC), where "
+        "numbers are read as milliseconds: seconds need --column timestamp='COLUMN * 1000', "
+        "microseconds --column timestamp='COLUMN / 1000', and later feedback a larger --within"
     )
     if midnight:
         reasons.append(
@@ -429,17 +422,3 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         )
     rows = joined.unmatched
     return f"none of the {rows:,} rows of feedback matches an exposure; {'; '.join(reasons)}"
-
-
-def _time_range(connection: duckdb.DuckDBPyConnection, rows: str) -> str:
-    """The first and the last time of a table, in UTC; as a number where no calendar has it."""
-    first, last = (
-        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
-        f"CAST({time} AS VARCHAR), '(none)')"
-        for time in ("first", "last")
-    )
-    ((times,),) = connection.sql(
-        f"SELECT {first} || ' to ' || {last} FROM "
-        f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
-    ).fetchall()
-    return str(times)

@@ -21,6 +21,7 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
+from ucfrec.logs import sessions, summary
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
     encode_ids,
@@ -31,28 +32,6 @@ from ucfrec.logs.features import (
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
-from ucfrec.logs.sessions import (
-    EPISODE_USERS,
-    ID_TABLES,
-    ITEMS_FILE,
-    USERS_FILE,
-    Cut,
-    count_steps,
-    list_text_ids,
-    number_ids,
-    split_bounds,
-    write_episode_users,
-    write_ids,
-    write_steps,
-)
-from ucfrec.logs.summary import (
-    build_report,
-    note_empty_splits,
-    note_losses,
-    note_oddities,
-    require_rows,
-    require_variety,
-)
 from ucfrec.logs.typed import open_log, open_log_tables
 from ucfrec.progress import progress
 from ucfrec.settings import Count, Width, require, settings_table
@@ -177,8 +156,10 @@ def prepare(
             "paths is a frame; give log files, folders or globs here, and frames to Recommender.fit"
         )
     files = log_files(paths)
-    if like is not None and not (like / USERS_FILE).is_file():
-        raise InputError(f"{like} is neither an episode store nor a run: it has no {USERS_FILE}")
+    if like is not None and not (like / sessions.USERS_FILE).is_file():
+        raise InputError(
+            f"{like} is neither an episode store nor a run: it has no {sessions.USERS_FILE}"
+        )
     with atomic_folder(out) as folder:
         spill = options.temp_folder or out.parent
         with (
@@ -187,8 +168,8 @@ def prepare(
         ):
             typed, report = log.rows.log, log.report
             with progress(report["steps"], "write the store", "steps") as bar:
-                writer = write_steps(log.rows, log.cut, folder, bar)
-            ids = write_ids(typed, folder)
+                writer = sessions.write_steps(log.rows, log.cut, folder, bar)
+            ids = sessions.write_ids(typed, folder)
             for name, tables in log.features.items():
                 if tables:
                     ids[f"features of {name}"] = [feature_digest(typed.connection, tables)]
@@ -201,7 +182,7 @@ def prepare(
                 known = encode_ids(typed.connection, log.features)
                 write_item_states(folder, log.scratch, known, options.embedding_size)
             if like is not None:
-                write_episode_users(typed, folder / EPISODE_USERS)
+                sessions.write_episode_users(typed, folder / sessions.EPISODE_USERS)
             record.seal(folder)
     return report
 
@@ -228,7 +209,7 @@ class PreparedLog:
     """A log that is sorted and counted."""
 
     rows: SortedRows
-    cut: Cut
+    cut: sessions.Cut
     features: dict[str, list[str]]
     """Id column to the names of its DuckDB feature tables."""
     report: dict[str, Any]
@@ -256,12 +237,12 @@ def read_log(
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by
     evaluates = store is not None and not grows
-    known_items = store / ITEMS_FILE if store and evaluates and not keep_unknown else None
+    known_items = store / sessions.ITEMS_FILE if store and evaluates and not keep_unknown else None
     tables_of_ids = {} if evaluates else feature_tables(mapping)
     feature_files = [
         file for tables in tables_of_ids.values() for t in tables for file in log_files(t.files)
     ]
-    id_files = [store / file for _, _, file in ID_TABLES] if store else []
+    id_files = [store / file for _, _, file in sessions.ID_TABLES] if store else []
     inputs = (*files, *(file for file in id_files if file.is_file()), *feature_files)
     with (
         scratch_folder(spill, "sorted") as scratch,
@@ -278,32 +259,35 @@ def read_log(
                         opened, known_items, scratch, options.duplicates, options.spark_master
                     )
                 else:
-                    log = open_log(opened, spill, list_text_ids(store))
+                    log = open_log(opened, spill, sessions.list_text_ids(store))
                     by_session = log.session_by == schema.SESSION_ID
                     rows = sort_rows(log, known_items, options.duplicates, scratch, by_session)
                 log = rows.log
-                require_rows(log, rows.count, rows.dropped, store if grows else None)
-                note_losses(rows, reward, mapping.where)
+                summary.require_rows(log, rows.count, rows.dropped, store if grows else None)
+                summary.note_losses(rows, reward, mapping.where)
                 if store is None:
-                    require_variety(rows)
+                    summary.require_variety(rows)
                     note_unread_features(files, mapping)
                 stage.update()
-                bounds = split_bounds(rows, (1.0, 0.0, 0.0) if evaluates else options.split)
+                bounds = sessions.split_bounds(
+                    rows, (1.0, 0.0, 0.0) if evaluates else options.split
+                )
                 gap_ms = round(options.gap_minutes * 60_000)
-                how = log.session_by, gap_ms, options.min_steps, bounds, options.max_session
-                cut = Cut(*how)
-                counts = count_steps(rows, cut)
+                cut = sessions.Cut(
+                    log.session_by, gap_ms, options.min_steps, bounds, options.max_session
+                )
+                counts = sessions.count_steps(rows, cut)
                 stage.update()
                 features = {
                     name: load_features(connection, tables, name, log.id_type(name))
                     for name, tables in tables_of_ids.items()
                     if name in log.columns
                 }
-                number_ids(log, features, store, grows)
-                report = {"reward": reward, **build_report(rows, cut, counts)}
-                note_oddities(rows, report, mapping)
+                sessions.number_ids(log, features, store, grows)
+                report = {"reward": reward, **summary.build_report(rows, cut, counts)}
+                summary.note_oddities(rows, report, mapping)
                 if store is None and len(options.split) == 2:
-                    note_empty_splits(rows, report)
+                    summary.note_empty_splits(rows, report)
                 stage.update()
                 for name, names in features.items():
                     tables = tables_of_ids[name]
@@ -311,23 +295,13 @@ def read_log(
                 report |= {
                     "duplicates": options.duplicates,
                     "dataset": options.dataset,
-                    "mapping": {name: str(text) for name, text in mapping.columns.items()},
-                    **_remember(mapping),
+                    **mapping.remember(),
                     "min_steps": options.min_steps,
                     "max_session": options.max_session,
                     "features": [name for name, names in features.items() if names],
                 }
                 stage.update()
         yield PreparedLog(rows, cut, features, report, scratch)
-
-
-def _remember(mapping: LogMapping) -> dict[str, Any]:
-    """What the store remembers of the mapping beside its columns, for later logs."""
-    names = ("time_format", "earliest", "where")
-    memory: dict[str, Any] = {
-        name: str(getattr(mapping, name)) for name in names if getattr(mapping, name) is not None
-    }
-    return memory | ({"partitions": True} if mapping.partitions else {})
 
 
 def feature_tables(mapping: LogMapping) -> dict[str, tuple[FeatureTable, ...]]:

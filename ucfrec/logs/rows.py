@@ -37,8 +37,6 @@ CODES: Final = {
     schema.SESSION_ID: ("session_codes", SESSION),
 }
 """Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
-_NO_SESSION: Final = 2**31 - 1
-"""Number of rows without a session, where sessions are formed otherwise."""
 FAULTY: Final = "faulty"
 """View of all rows, as of `mark_faults`."""
 FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
@@ -59,7 +57,6 @@ TIE: Final = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) %
 the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
 two items are as often in one order as in the other."""
 DAY_MS: Final = 86_400_000
-"""One day in ms."""
 REASONS: Final = {
     "left_out": "does not fulfil --where",
     "null_key": "user, item or action, time or session is missing",
@@ -100,8 +97,7 @@ class RowVectors:
     def of_rows(self, rows: IntArray) -> Float32Array:
         """(M, O) observations of the rows at the positions (M,), from 1."""
         if self._file is None:
-            values = np.frombuffer(self._memory, np.float32).reshape(self._shape)
-            return np.asarray(values[rows - 1])
+            return np.frombuffer(self._memory, np.float32).reshape(self._shape)[rows - 1]
         # Mapped anew each time: mapped pages count as the memory of a process that must keep to a
         # limit.
         mapped: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
@@ -161,23 +157,20 @@ class SortedRows:
     dropped: dict[str, int]
     """Number of dropped rows by reason."""
     read: int
-    """Number of rows."""
+    """Number of rows; those below are of usable ones: no duplicates, with a finite reward."""
     count: int = 0
-    """Number of usable rows: no duplicates, with a finite reward."""
     conflicts: int = 0
     """Number of duplicates with another reward than the row that counts."""
     tied: int = 0
-    """Number of usable rows that share their user and time."""
+    """Number of rows that share their user and time."""
     unsorted: int = 0
-    """Number of usable rows that are in the files before the row that precedes them in time."""
+    """Number of rows that are in the files before the row that precedes them in time."""
     first_ms: int = np.iinfo(np.int64).max
-    """Time of the earliest usable row."""
     last_ms: int = 0
-    """Time of the latest usable row."""
+    """Times of the earliest and the latest row."""
     lowest: float = np.inf
-    """Lowest reward."""
     highest: float = -np.inf
-    """Highest reward."""
+    """Rewards."""
     large: int = 0
     """Number of rewards that are too large to train with."""
 
@@ -218,7 +211,15 @@ class SortedRows:
         self.highest = max(self.highest, float(rewards.max()))
         self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
         if by_session:
-            order = _order_by_session(batch)
+            users, sessions = batch[USER], batch[SESSION]
+            # Sessions are in the order of their first times.
+            grouped = np.lexsort((sessions, users))
+            same = _equal_before(users[grouped]) & _equal_before(sessions[grouped])
+            starts = np.flatnonzero(np.append(True, ~same))
+            began = np.empty(len(users), dtype=np.int64)
+            lengths = np.diff(np.append(starts, len(users)))
+            began[grouped] = np.repeat(times[grouped][starts], lengths)
+            order = np.lexsort((sessions, began, users))
             batch = {name: values[order] for name, values in batch.items()}
         self.file.append(batch)
 
@@ -245,31 +246,29 @@ def _equal_before(values: Array) -> BoolArray:
     return np.asarray(equal if equal.ndim == 1 else equal.all(axis=1))
 
 
-def _order_by_session(batch: dict[str, Array]) -> IntArray:
-    """(M,) order by user, first time of the session, session and time of rows in order of time."""
-    users, sessions, times = (batch[name] for name in (USER, SESSION, schema.TIMESTAMP))
-    grouped = np.lexsort((sessions, users))
-    starts = np.flatnonzero(
-        np.append(True, ~(_equal_before(users[grouped]) & _equal_before(sessions[grouped])))
-    )
-    began = np.empty(len(users), dtype=np.int64)
-    began[grouped] = np.repeat(times[grouped][starts], np.diff(np.append(starts, len(users))))
-    return np.lexsort((sessions, began, users))
-
-
-def _read_whole_users(batches: Iterable[dict[str, Array]]) -> Iterator[dict[str, Array]]:
-    """The same rows in batches that end between two users."""
+def keep_users_whole(batches: Iterable[dict[str, Array]], user: str) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two users, who are in the column `user`."""
     pending: dict[str, Array] = {}
     for batch in batches:
         if pending:
-            ends = np.flatnonzero(~_equal_before(pending[USER]))
+            ends = np.flatnonzero(~_equal_before(pending[user]))
             end = int(ends[-1]) + 1 if len(ends) else 0
             if end:
                 yield {name: values[:end] for name, values in pending.items()}
             batch = {name: np.concatenate([pending[name][end:], batch[name]]) for name in batch}
         pending = batch
-    if pending and len(pending[USER]):
+    if pending and len(pending[user]):
         yield pending
+
+
+def _to_columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
+    columns = {}
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        size = log.vector_size.get(name)
+        columns[name] = (
+            to_numpy(column) if size is None else to_numpy(column.flatten()).reshape(-1, size)
+        )
+    return columns
 
 
 def sort_rows(
@@ -281,14 +280,10 @@ def sort_rows(
 ) -> SortedRows:
     """Sort the rows of a log with DuckDB.
 
-    Args:
-        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        duplicates: key of `DUPLICATES`.
-        folder: scratch folder; None for a log in memory.
-        by_session: whether the rows of a session follow each other.
-
-    Raises:
-        InputError: a reward is too large to train with.
+    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
+    `duplicates` is a key of `DUPLICATES`, `folder` for scratch (None for a log in memory). With
+    `by_session`, the rows of a session follow each other. Raises InputError if a reward is too
+    large to train with.
     """
     connection = log.connection
     connection.execute(f"CREATE VIEW {FAULTY} AS {mark_faults(log, ROWS, known_items)}")
@@ -350,11 +345,8 @@ def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
 
 
 def order_rows(log: TypedLog, rows: str) -> str:
-    """SQL of the rows without a fault in order of user, time, the hash of `TIE` and choice.
-
-    Args:
-        rows: relation as of `mark_faults`; beside it are the tables of `code_tables`.
-    """
+    """SQL of the rows without a fault in order of user, time, the hash of `TIE` and choice, from a
+    relation as of `mark_faults`, beside which are the tables of `code_tables`."""
     tables = code_tables(log)
     joins = [
         f"{'LEFT' if name == schema.SESSION_ID else ''} JOIN {table} USING ({name})"
@@ -370,7 +362,7 @@ def order_rows(log: TypedLog, rows: str) -> str:
         "row": "row",
     }
     if schema.SESSION_ID in tables:
-        columns[SESSION] = f"coalesce({columns[SESSION]}, {_NO_SESSION})"
+        columns[SESSION] = f"coalesce({columns[SESSION]}, {2**31 - 1})"
     columns |= {name: name for name in (schema.ACTION, schema.IS_RANDOM) if name in log.columns}
     if schema.PROPENSITY in log.columns:
         columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
@@ -392,16 +384,10 @@ def check_sorted(
     folder: Path | None,
     by_session: bool,
 ) -> SortedRows:
-    """Check the sorted rows of a log.
+    """Check the sorted rows of a log, with numbers of all rows by `fault`.
 
-    Args:
-        fault_counts: number of rows of the log by `fault`.
-        observations: as of `RowVectors`; read only of a log with observations.
-        batches: as of `order_rows`, read after the observations.
-        folder: scratch folder; None for a log in memory.
-
-    Raises:
-        InputError: a reward is too large to train with.
+    `observations` are as of `RowVectors` and read only of a log that has them, `batches` as of
+    `order_rows` and read after these. Raises InputError if a reward is too large to train with.
     """
     vectors = None
     if schema.OBSERVATION in log.columns:
@@ -414,8 +400,8 @@ def check_sorted(
         {reason: fault_counts.get(number, 0) for number, reason in enumerate(REASONS, 1)},
         sum(fault_counts.values()),
     )
-    for batch in _read_whole_users(_columns(batch, log) for batch in batches):
-        rows.add(batch, duplicates, by_session)
+    for columns in keep_users_whole((_to_columns(batch, log) for batch in batches), USER):
+        rows.add(columns, duplicates, by_session)
     if rows.large:
         raise InputError(
             f"{log.tables[0].files[0]}: {rows.large:,} of {rows.count:,} rewards are beyond "
@@ -423,17 +409,6 @@ def check_sorted(
             "to train with in float32; divide them in the reward expression"
         )
     return rows
-
-
-def _columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
-    columns = {}
-    for name in batch.schema.names:
-        column = batch.column(name)
-        if name in log.vector_size:
-            columns[name] = to_numpy(column.flatten()).reshape(-1, log.vector_size[name])
-        else:
-            columns[name] = to_numpy(column)
-    return columns
 
 
 def choose_rows(
@@ -445,10 +420,9 @@ def choose_rows(
 
     Args:
         rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
-            (position in the log) and perhaps those that break ties. `user` holds identifiers but
-            for `user_id`.
+            (position in the log) and perhaps those of `order_duplicates`.
         duplicates: key of `DUPLICATES`.
-        user_id: the only user.
+        user_id: the only user, if `user` does not hold identifiers.
     """
     users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
@@ -476,11 +450,8 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
     is the first.
 
-    Args:
-        rows: (N,) `reward`, `row` (position in the log) and those of `observation`, `propensity`,
-            `session` and `is_random` that the log has, which decide between rows that are equal to
-            the rule, so that the order of rows and files does not matter.
-        duplicates: key of `DUPLICATES`.
+    Columns besides `reward` and `row` decide between rows that are equal to the rule, so that the
+    order of rows and files does not matter.
     """
     rewards = rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
@@ -493,10 +464,7 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
 
 
 def hash_ids(ids: Sequence[object]) -> IntArray:
-    """A number (N,) below 2**28 of the text of each identifier, so that 7 and '7' have one.
-
-    It is that of `HASH`.
-    """
+    """(N,) `HASH` of the text of each identifier, below 2**28, so that 7 and '7' have one."""
     # Text of JSON may hold half a character.
     texts = (str(identifier).encode("utf-8", "surrogatepass") for identifier in ids)
     digests = (hashlib.md5(text, usedforsecurity=False).hexdigest() for text in texts)

@@ -68,7 +68,6 @@ class Episodes:
     rows: dict[str, Array]
     """(M,) or (M, size) columns of `SortedRows.file`."""
     lengths: IntArray
-    """(E,) steps."""
     users: IntArray
     """(E,) `USER`."""
     splits: IntArray
@@ -186,9 +185,8 @@ class StepCounts:
     """Counts and statistics of the steps in episodes."""
 
     item_steps: IntArray
-    """(items,) number of steps that show each item, by code."""
     item_train_steps: IntArray
-    """(items,) number of those in the training split."""
+    """(items,) number of steps, and of training steps, that show each item, by code."""
     steps: int = 0
     first_ms: int = np.iinfo(np.int64).max
     last_ms: int = 0
@@ -203,10 +201,9 @@ class StepCounts:
     """Rows of episodes that are dropped as too long."""
     unknown_propensities: int = 0
     not_above_0: int = 0
-    """Propensities of 0 or less."""
-    lowest_propensity: float = 0.0
     above_1: int = 0
-    """Propensities above 1."""
+    """Numbers of propensities."""
+    lowest_propensity: float = 0.0
     highest_propensity: float = 0.0
 
     def add(self, episodes: Episodes) -> None:
@@ -255,8 +252,7 @@ class StepCounts:
 def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
     """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
 
-    Raises:
-        InputError: no episode is left, none is in the training split, or a propensity is none.
+    Raises InputError if no episode is left, none is in the training split, or a propensity is none.
     """
     log, connection = rows.log, rows.log.connection
     has_items = log.key == schema.ITEM_ID
@@ -299,13 +295,12 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
             f"CREATE TABLE {USED_ITEMS} AS SELECT {schema.ITEM_ID}, code, steps, train_count "
             "FROM item_codes JOIN used USING (code)"
         )
-    _require_training(rows, cut, counts.steps)
-    _require_propensities(log, counts)
+    _require_usable(rows, cut, counts)
     return counts
 
 
-def _require_training(rows: SortedRows, cut: Cut, steps: int) -> None:
-    if not steps:
+def _require_usable(rows: SortedRows, cut: Cut, counts: StepCounts) -> None:
+    if not counts.steps:
         raise InputError(
             f"no session is left: none of the {rows.count} clean rows is in an episode of "
             f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
@@ -316,10 +311,7 @@ def _require_training(rows: SortedRows, cut: Cut, steps: int) -> None:
             f"no row is in the training split, before {ends:%Y-%m-%d %H:%M:%S} UTC: all are of "
             "that time or later; log finer times, or choose a later split"
         )
-
-
-def _require_propensities(log: TypedLog, counts: StepCounts) -> None:
-    name = schema.PROPENSITY
+    log, name = rows.log, schema.PROPENSITY
     if counts.not_above_0:
         lowest = f"{counts.lowest_propensity:.6g}"
         raise InputError(
@@ -339,14 +331,11 @@ def _require_propensities(log: TypedLog, counts: StepCounts) -> None:
 def number_ids(
     log: TypedLog, features: Mapping[str, Sequence[str]], store: Path | None, grows: bool
 ) -> None:
-    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`.
+    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`; after
+    `count_steps`.
 
-    Args:
-        log: with the tables of `count_steps`.
-        features: id column to feature tables whose column `id` lists more users or items.
-        store: one whose numbers are reused; None for none.
-        grows: whether other ids follow those of the store, in sorted order, and `train_count` is
-            added up; if not, they have no number.
+    Ids are those of the steps and of feature tables (by id column). Those of a `store` have its
+    numbers, and others none; if it `grows`, they follow and counts are added up.
     """
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -411,10 +400,8 @@ def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
 
 def write_episode_users(log: TypedLog, file: Path) -> None:
     """Write the user of every episode, in the order of the store."""
-    query = (
-        f"SELECT {schema.USER_ID} FROM {EPISODES} JOIN user_codes ON code = {USER} ORDER BY episode"
-    )
-    _copy(log, query, file)
+    source = f"{EPISODES} JOIN user_codes ON code = {USER}"
+    _copy(log, f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode", file)
 
 
 def _copy(log: TypedLog, query: str, file: Path) -> None:
@@ -433,13 +420,10 @@ def write_steps(
     first_shard: int = 0,
     fill: Mapping[str, float] = MappingProxyType({}),
 ) -> StoreWriter:
-    """Write all steps to the store at `folder`, after `number_ids`.
+    """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
 
-    Users and items that the store does not know have the number −1.
-
-    Args:
-        fill: the step columns of the store, with what steps without a value have; others are left
-            out. Empty for those of the log.
+    `fill` has the step columns of the store, with what steps without a value have; others are left
+    out. Empty for those of the log.
     """
     log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
     users = _read_numbers(log, "users", schema.USER_ID)

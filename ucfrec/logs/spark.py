@@ -104,20 +104,10 @@ def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Itera
 def sort_with_spark(
     tables: LogTables, known_items: Path | None, scratch: Path, duplicates: str, master: str
 ) -> SortedRows:
-    """Sort every row of a log with Spark, and load the sorted rows and the numbers of its ids.
+    """`sort_rows` with Spark, which loads the sorted rows and the numbers of ids.
 
-    Args:
-        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        scratch: scratch folder, which every worker sees.
-        duplicates: key of `ucfrec.logs.rows.DUPLICATES`.
-        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
-
-    Returns:
-        What `ucfrec.logs.rows.sort_rows` returns.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, an observation is missing or not
-            finite, or Spark is missing or fails.
+    Every worker sees the folder `scratch`; `master` is Spark's, e.g. "local[*]" or
+    "spark://host:7077". Raises InputError also if Spark is missing or fails.
     """
     with spark_session(master) as spark, explain_spark():
         log, rows = _type_rows(spark, tables, known_items, scratch)
@@ -221,18 +211,11 @@ class UserLog:
 
 
 def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[int]:
-    """Give each part of the users of a log to a worker. Warns of the rows that are left out.
+    """Give each part of the users of a log to a worker, for `work`; returns the counts of the parts
+    that have a usable row, users in sorted order. Warns of the rows that are left out.
 
-    Args:
-        folder: parent of a scratch folder, which every worker sees.
-        master: as of `sort_with_spark`.
-        work: runs on the workers.
-
-    Returns:
-        The counts of the parts that have a usable row, users in sorted order.
-
-    Raises:
-        InputError: the log cannot be used, no row is left, or Spark is missing or fails.
+    Every worker sees the parent `folder` of a scratch folder. Raises InputError if the log cannot
+    be used, no row is left, or Spark is missing or fails.
     """
     # Workers have a working folder of their own.
     files = [file.absolute() for file in log_files(source.paths)]
@@ -295,10 +278,7 @@ def _work_on_part(
 @contextmanager
 def spark_session(master: str) -> Iterator[Any]:
     """A session of Spark of its own; its cluster connection is kept if the program had one before.
-
-    Raises:
-        InputError: pyspark or Java is missing, or the master does not answer.
-    """
+    Raises InputError if pyspark or Java is missing, or the master does not answer."""
     try:
         from pyspark.errors import PySparkException
         from pyspark.sql import SparkSession
@@ -333,11 +313,7 @@ def spark_session(master: str) -> Iterator[Any]:
 
 @contextmanager
 def explain_spark() -> Iterator[None]:
-    """Turn errors of Spark that occur in the block into `InputError`.
-
-    Raises:
-        InputError: a worker refused the log, or Spark failed.
-    """
+    """Turn errors of Spark that occur in the block, and refusals of workers, into `InputError`."""
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 

@@ -132,15 +132,10 @@ def _explain_returns(returns: Moments) -> float | None:
 def _measure_distributions(
     rows: SortedRows, cut: Cut, counts: StepCounts
 ) -> dict[str, Distribution]:
-    """Distributions over the steps, as JSON values.
-
-    Returns:
-        `session_lengths`: episodes by length in steps (each piece of a session that a split cuts
-        counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last
-        bin include the values beyond them. `item_popularity` (logs with items only): items by the
-        number of steps that show them, in bins of doubling width; items that only the feature
-        tables list have 0.
-    """
+    """`session_lengths`: episodes by length in steps (each piece of a session that a split cuts
+    counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last bin
+    include the values beyond them. `item_popularity` (logs with items only): items by the number of
+    steps that show them, in bins of doubling width; items that only feature tables list have 0."""
     connection = rows.log.connection
     result = {"session_lengths": _bin_counts(connection, f"SELECT steps FROM {EPISODES}")}
     if len(counts.values) <= FEW_VALUES:
@@ -275,14 +270,8 @@ class NoRowsError(InputError):
 def require_rows(
     log: TypedLog, count: int, dropped: Mapping[str, int], grown: Path | None = None
 ) -> None:
-    """Check that a row is left.
-
-    Args:
-        grown: a store that the log is added to, whose end is the earliest time; None for none.
-
-    Raises:
-        NoRowsError: none is.
-    """
+    """Raise NoRowsError if no row is left, of a log that is perhaps added to a store, `grown`,
+    whose end is the earliest time."""
     if count:
         return
     n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
@@ -302,11 +291,7 @@ def require_rows(
 
 
 def require_variety(rows: SortedRows) -> None:
-    """Check that the usable rows do not all have the same reward.
-
-    Raises:
-        InputError: all rewards are equal.
-    """
+    """Raise InputError if all usable rows have the same reward."""
     if rows.lowest == rows.highest:
         raise InputError(
             f"{rows.log.name}: all {rows.count} rewards equal {rows.lowest:g}, so there is "
@@ -320,12 +305,8 @@ def note_dropped(
     n_read: int,
     fine: Collection[str] = ("duplicate", "left_out"),
 ) -> None:
-    """Warn of the rows that are left out, with their numbers and reasons; silent if none is.
-
-    Args:
-        name: of the data, for the message; empty for none.
-        fine: reasons that need no warning of their own.
-    """
+    """Warn of the rows that are left out, with their numbers and reasons, unless all are `fine`;
+    `name` is that of the data, or empty."""
     counts = {reason: n for reason, n in dropped.items() if n}
     if not counts.keys() - {*fine}:
         return
@@ -336,13 +317,8 @@ def note_dropped(
 
 
 def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: str) -> None:
-    """Warn where nearly all users or items of a log are unknown, as if written in another way.
-
-    Args:
-        name: of the log, for the message.
-        column: `user_id` or `item_id`.
-        known_ids: whose ids are known, after "those".
-    """
+    """Warn where nearly all of many users or items of a log are not among those of, say, a store
+    (`known_ids`), as if written in another way."""
     if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
         return
     ids = column.removesuffix("_id") + "s"
@@ -355,11 +331,8 @@ def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: st
 
 
 def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None:
-    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions.
-
-    Args:
-        where: condition of the rows that are wanted at all.
-    """
+    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions
+    (`where`)."""
     log = rows.log
     if where is not None and rows.dropped["left_out"]:
         note_undefined(log.connection, log.tables, where)

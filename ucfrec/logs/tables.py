@@ -102,7 +102,15 @@ class Table:
             column, kind = quote_name(name), kinds[name]
             if name in self.raw and kind != "VARCHAR":
                 column = f"CAST({column} AS {kind})"
-            values.append(f"{_value_of(column, kind)} AS {quote_name(name)}")
+            if kind in ("FLOAT", "DOUBLE"):
+                # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would
+                # exclude `isnan` here, as the extremes that a Parquet file states show no NaN.
+                column = f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
+            elif kind == NOTHING:
+                column = "NULL"
+            elif (wider := _wider_type(kind)) != kind:
+                column = f"CAST({column} AS {wider})"
+            values.append(f"{column} AS {quote_name(name)}")
         values += [f"{quote_name(name)} AS {quote_name(raw_name(name))}" for name in self.raw]
         values += [
             f"{_folder_value(name, folders[name])} AS {quote_name(name)}"
@@ -144,26 +152,12 @@ def _folder_value(name: str, kind: str = "VARCHAR") -> str:
 
 
 def _wider_type(kind: str) -> str:
-    """The DuckDB type that expressions compute with, given that of a column.
-
-    DuckDB multiplies two columns of 8 bits in 8 bits, and takes unsigned numbers from each other
-    without a sign: where that overflows, a reward would be undefined.
-    """
+    """The DuckDB type that expressions compute with: DuckDB multiplies columns of 8 bits in 8 bits,
+    and subtracts unsigned numbers without a sign; where that overflows, a reward would be
+    undefined."""
     if kind == "UBIGINT":
         return "HUGEINT"
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
-
-
-def _value_of(column: str, kind: str) -> str:
-    """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
-    if kind in ("FLOAT", "DOUBLE"):
-        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would exclude
-        # `isnan` here, because the extremes that a Parquet file states show no NaN.
-        return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
-    if kind == NOTHING:
-        return "NULL"
-    wider = _wider_type(kind)
-    return column if wider == kind else f"CAST({column} AS {wider})"
 
 
 def glob_pattern(file: Path) -> str:
@@ -215,17 +209,11 @@ def open_tables(
 ) -> list[Table]:
     """Read the columns of every file and group consecutive files with equal columns.
 
-    Files without rows are excluded, if others have some.
+    Files without rows are excluded, if others have some. With `partitions`, names of folders such
+    as `date=2026-08-01` give columns.
 
-    Args:
-        partitions: read columns from the names of folders, such as `date=2026-08-01`.
-
-    Returns:
-        Tables in the order of `files`.
-
-    Raises:
-        InputError: a file is truncated or not of the kind that its suffix says, no file has a row,
-            or a file has another value in a column than its folder says.
+    Raises InputError if a file is truncated or not of the kind that its suffix says, no file has a
+    row, or a file has another value in a column than its folder says.
     """
     tables: list[Table] = []
     for file in files:
@@ -244,7 +232,14 @@ def open_tables(
         raise InputError(
             f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"
         )
-    return _type_partitions(tables)
+    # Columns of folders are whole numbers, if the names of all folders are.
+    whole = re.compile(rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}")
+    values = [pair for table in tables for file in table.files for pair in _folder_values(file)]
+    words = {name for name, value in values if not whole.fullmatch(value)}
+    for n, table in enumerate(tables):
+        kinds = ((name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions)
+        tables[n] = replace(table, partitions=tuple(kinds))
+    return tables
 
 
 def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tuple[str, str], ...]:
@@ -274,18 +269,6 @@ def _folder_values(file: Path) -> list[tuple[str, str]]:
     """Names and values of the folders of a file that are called NAME=VALUE."""
     pairs = [part.partition("=") for part in file.parts[:-1] if "=" in part.strip("=")]
     return [(name, value) for name, _, value in pairs]
-
-
-def _type_partitions(tables: list[Table]) -> list[Table]:
-    """Make columns of folders whole numbers, if the names of all folders are."""
-    whole = re.compile(rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}")
-    values = [pair for table in tables for file in table.files for pair in _folder_values(file)]
-    words = {name for name, value in values if not whole.fullmatch(value)}
-    types = [
-        [(name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions]
-        for table in tables
-    ]
-    return [replace(t, partitions=tuple(p)) for t, p in zip(tables, types, strict=True)]
 
 
 def _columns(
@@ -325,7 +308,11 @@ def _columns(
         _require_header(file, names)
     if not first_row:
         return None
-    _require_distinct(file, names)
+    # DuckDB calls the second of two columns `x` `x_1`.
+    folded = {name.casefold() for name in names}
+    second = [n for n in names if n.endswith("_1") and n[:-2].casefold() in folded]
+    for name in set(second).difference(_written_names(file) if second else ()):
+        raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
     return columns if is_parquet else _types_of_all_rows(connection, file, columns)
 
 
@@ -366,14 +353,6 @@ def _written_names(file: Path) -> list[str]:
         return list(pq.read_schema(file).names)
     with _open_text(file) as lines:
         return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
-
-
-def _require_distinct(file: Path, columns: Sequence[str]) -> None:
-    """Refuse a file with two columns of one name; DuckDB calls the second of `x` `x_1`."""
-    folded = {name.casefold() for name in columns}
-    second = [n for n in columns if n.endswith("_1") and n[:-2].casefold() in folded]
-    for name in set(second).difference(_written_names(file) if second else ()):
-        raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
 
 
 def _types_of_all_rows(

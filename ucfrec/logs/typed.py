@@ -73,11 +73,7 @@ def open_log_tables(
     reward: str,
     session_by: str | None,
 ) -> LogTables:
-    """Open the files of a log, and settle which of the remembered columns they have.
-
-    Raises:
-        InputError: a file cannot be read, or lacks a column that it must have.
-    """
+    """Open the files of a log, and settle which of the remembered columns they have."""
     tables = tuple(open_tables(connection, files, mapping.partitions))
     mapping, reward = settle_mapping(connection, tables, mapping, reward)
     return LogTables(connection, tables, mapping, reward, session_by)
@@ -144,25 +140,17 @@ class TypedLog:
         return row
 
     def require_items(self) -> None:
-        """Check that its actions are items.
-
-        Raises:
-            InputError: they are vectors.
-        """
+        """Raise InputError if its actions are vectors."""
         if self.key != schema.ITEM_ID:
             raise InputError(f"{self.name}: its actions are vectors; map item_id instead")
 
 
 def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
-    """Resolve the columns and the reward of a log.
+    """Resolve the columns and the reward of a log; `as_text` are ids that are text even if all of
+    them are integers.
 
-    Optional columns that only some of the files have are excluded, with an `InputNote`.
-
-    Args:
-        as_text: id columns that are text even if all of them are integers.
-
-    Raises:
-        InputError: a column is missing or of an unsupported type, or an expression cannot be used.
+    Optional columns that only some of the files have are excluded, with an `InputNote`. Raises
+    InputError if a column is missing or of an unsupported type, or an expression cannot be used.
     """
     columns = _list_present(log)
     _note_partial(log.tables, {*columns, *log.mapping.columns})
@@ -172,33 +160,21 @@ def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
             _unify_ids(log.connection, selects, name, name in as_text)
     return TypedColumns(
         columns,
-        tuple(", ".join(f"{s} AS {name}" for name, (s, _) in x.values.items()) for x in selects),
-        tuple(select.table for select in selects),
+        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+        tuple(table for table, _ in selects),
         log.session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
     )
 
 
 def number_rows(selects: Iterable[tuple[str, str]]) -> str:
-    """SQL of typed rows with `row`, their position from 1.
-
-    Args:
-        selects: for each table, values as of `TypedColumns.selects` and the SQL of the table.
-    """
+    """SQL of typed rows with `row`, their position from 1; for each table, values as of
+    `TypedColumns.selects` and the SQL of the table."""
     union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in selects)
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
 def open_log(log: LogTables, folder: Path, as_text: Collection[str] = ()) -> TypedLog:
-    """Create `read` from the tables of a log.
-
-    Args:
-        folder: named when its disk is full.
-        as_text: as of `type_columns`.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, or an observation is missing or
-            not finite.
-    """
+    """Create `read` from the tables of a log; see `type_columns` and `describe_log`."""
     typed = type_columns(log, as_text)
     with explain_errors(log.connection, log.tables, folder):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
@@ -212,13 +188,8 @@ def open_log(log: LogTables, folder: Path, as_text: Collection[str] = ()) -> Typ
 
 
 def survey_vectors(columns: Collection[str], rows: str) -> str:
-    """SQL of the sizes of `action` and `observation` in some rows, the number `n` of rows with
-    them, and how many of these have no finite observation.
-
-    Args:
-        columns: those of a log; a vector that it lacks has no size.
-        rows: a relation.
-    """
+    """SQL of the sizes of `action` and `observation` in rows of a log with some columns, the number
+    `n` of rows with these, and how many of them have no finite observation."""
     sizes = (f"CAST({f'len({v})' if v in columns else 'NULL'} AS BIGINT) AS {v}" for v in _VECTORS)
     bad = f"count_if({not_finite(schema.OBSERVATION)})" if schema.OBSERVATION in columns else "0"
     aggregates = f"count(*) AS n, CAST({bad} AS BIGINT) AS bad"
@@ -228,13 +199,11 @@ def survey_vectors(columns: Collection[str], rows: str) -> str:
 def describe_log(
     log: LogTables, typed: TypedColumns, survey: Sequence[tuple[int | None, ...]]
 ) -> TypedLog:
-    """The log of typed columns, whose rows its connection has.
+    """The log of typed columns, whose rows its connection has; `survey` as of `survey_vectors`,
+    empty without vectors.
 
-    Args:
-        survey: rows as of `survey_vectors`; none of a log without vectors.
-
-    Raises:
-        InputError: a column has vectors of unequal or no size, or an observation is not finite.
+    Raises InputError if a column has vectors of unequal or no size, or an observation is not
+    finite.
     """
     sizes: dict[str, int] = {}
     for name in (name for name in _VECTORS if name in typed.names):
@@ -288,11 +257,7 @@ def _list_present(log: LogTables) -> tuple[str, ...]:
 
 
 def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
-    """Warn of optional columns that some files have and others do not.
-
-    Args:
-        excluded: columns that every file has, and those that the mapping names.
-    """
+    """Warn of optional columns, but those excluded, that only some files have."""
     count = sum(len(table.files) for table in tables)
     for name in [name for name in OPTIONAL_COLUMNS if name not in excluded]:
         having = [t for t in tables if name in {column.casefold() for column in t.columns}]
@@ -306,17 +271,12 @@ def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
             )
 
 
-@dataclass(frozen=True)
-class _Select:
-    """The typed columns of one table."""
-
-    table: Table
-    """With the columns that are read."""
-    values: dict[str, tuple[str, str]]
-    """Log column to its (SQL, DuckDB type)."""
+_Values = dict[str, tuple[str, str]]
+"""Log column to its (SQL, DuckDB type)."""
 
 
-def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> _Select:
+def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Table, _Values]:
+    """A table with the columns that are read, and the typed values of these."""
     connection, mapping = log.connection, log.mapping
     texts = {name: mapping.columns.get(name) or name for name in columns}
     bound = {
@@ -351,7 +311,7 @@ def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> _Select:
         name: _cast_value(connection, narrow, name, texts[name], value, mapping.time_format)
         for name, value in bound.items()
     }
-    return _Select(narrow, {**values, **extra})
+    return narrow, {**values, **extra}
 
 
 def _bind_reward(
@@ -427,29 +387,34 @@ def _cast_value(
 
 
 def _unify_ids(
-    connection: duckdb.DuckDBPyConnection, selects: list[_Select], name: str, as_text: bool
+    connection: duckdb.DuckDBPyConnection,
+    selects: list[tuple[Table, _Values]],
+    name: str,
+    as_text: bool,
 ) -> None:
     """Cast ids to BIGINT if every file has integers that fit, else or with `as_text` to text.
 
-    Text of a CSV file is an integer only if it is written as the integer is: 007, 7.0 and 1e1 are
-    not. Ids that are written as 7 and as 7.0 are two ids, with a note.
+    Text of a CSV file is an integer only if written as the integer is: 007, 7.0 and 1e1 are not.
+    Ids that are written as 7 and as 7.0 are two ids, with a note.
     """
     whole, some_whole, with_decimals = True, False, None
-    for select in selects:
-        sql, kind = select.values[name]
-        csv_type = _csv_type(select.table, sql)
+    for table, values in selects:
+        sql, kind = values[name]
+        # The type that DuckDB inferred for a column of a CSV file, whose text is read.
+        raw = (column for column in table.raw if quote_name(raw_name(column)) == sql)
+        csv_type = next((dict(table.types)[column] for column in raw), None)
         all_integers = is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT")
         if csv_type is not None:
-            with explain_errors(connection, (select.table,), select.table.files[0].parent):
+            with explain_errors(connection, (table,), table.files[0].parent):
                 ((any_integer, all_integers),) = connection.sql(
                     f"SELECT coalesce(bool_or({_IS_INTEGER}), false), "
                     f"coalesce(bool_and({_IS_INTEGER}), true) "
-                    f"FROM (SELECT {sql} AS x FROM {select.table.sql}) WHERE x IS NOT NULL"
+                    f"FROM (SELECT {sql} AS x FROM {table.sql}) WHERE x IS NOT NULL"
                 ).fetchall()
             some_whole |= is_integer(csv_type) or (csv_type == "DOUBLE" and any_integer)
         some_whole |= is_integer(kind)
         if (csv_type or kind) == "DOUBLE":
-            with_decimals = with_decimals or select.table
+            with_decimals = with_decimals or table
         whole &= kind == NOTHING or all_integers
     whole &= not as_text
     if not whole and some_whole and with_decimals is not None:
@@ -459,34 +424,25 @@ def _unify_ids(
             InputNote,
             stacklevel=5,
         )
-    for select in selects:
-        sql, _ = select.values[name]
+    for _, values in selects:
+        sql, _ = values[name]
         # Text without a character is missing, as in a CSV file.
         typed = f"CAST({sql} AS BIGINT)" if whole else f"nullif(CAST({sql} AS VARCHAR), '')"
-        select.values[name] = (typed, "")
-
-
-def _csv_type(table: Table, sql: str) -> str | None:
-    """The type that DuckDB inferred for a column whose text is read; None for other columns."""
-    kinds = dict(table.types)
-    return next((kinds[name] for name in table.raw if quote_name(raw_name(name)) == sql), None)
+        values[name] = (typed, "")
 
 
 class _Survey(NamedTuple):
-    """Of the text in a column of one file."""
+    """Of the text in a column of one file: how many are what, and the largest parts of dates."""
 
     filled: int
     numbers: int
     iso: int
     """Times that begin with the year."""
     dated: int
-    """Times that begin with the day or the month."""
+    """Times that begin with the day or the month; the next three are of these."""
     first: int | None
-    """Largest of their first numbers."""
     second: int | None
-    """Largest of their second numbers."""
     example: str | None
-    """One of them."""
     strange: str | None
     """Text that is none of these."""
 
@@ -500,13 +456,9 @@ def cast_text_time(
 ) -> str:
     """SQL of the milliseconds since 1970 (UTC) that a column of text means, NULL where it is none.
 
-    Args:
-        column: name or expression of the column, for messages.
-        time_format: of `strptime`, in which all times are written; None for numbers, ISO 8601, and
-            dates whose order of day and month every file settles. Times without a zone are UTC.
-
-    Raises:
-        InputError: none of the text is a time, or the order of day and month is not settled.
+    `time_format` is that of `strptime`, in which all times are written; None for numbers, ISO 8601,
+    and dates whose order of day and month every file settles. Times without a zone are UTC. Raises
+    InputError if none of the text is a time, or the order is not settled.
     """
     if time_format is not None:
         return (

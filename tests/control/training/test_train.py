@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ucfrec.acting.uniform import Memoryless
 
 from tests.support.control_files import MADE, TINY, control, refused, set_options, write_made
 from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.acting.rollout import rollout
+from ucfrec.arrays import Float32Array
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -137,18 +139,12 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     env = make_env("Hopper-v5", 2, [0.0])
     seen = []
 
-    class Still:
-        def begin(self, rows: object) -> None:
-            pass
-
-        def act(self, observations: object, live: object) -> tuple[object, None]:
+    class Still(Memoryless):
+        def act(self, observations: object, live: object) -> tuple[Float32Array, None]:
             seen.append(np.array(observations))
             return np.zeros((2, 3), dtype=np.float32), None
 
-        def observe(self, actions: object, rewards: object) -> None:
-            pass
-
-    rollout(env, Still(), 4, seed=0)  # type: ignore[arg-type]
+    rollout(env, Still(), 4, seed=0)
     assert {observation.shape for observation in seen} == {(2, 12)}
     assert all((observation[:, 11] == 0).all() for observation in seen)
 

@@ -12,8 +12,7 @@ import pytest
 from tests.support.result_rows import read_configurations
 from ucfrec.benchmark.grid import Measurement, chosen, run_grid
 from ucfrec.errors import InputError
-from ucfrec.results.row import ResultRow, RowKey
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, RowKey, read_rows
 
 Cell = tuple[str, int]
 """A folder for marks, and a number."""

@@ -15,7 +15,7 @@ from ucfrec.benchmark.tables import (
     over_seeds,
     score_table,
 )
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:

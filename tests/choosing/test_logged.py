@@ -17,7 +17,7 @@ from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.reporting.model_card import tabulate_user_model
-from ucfrec.reporting.page_results import draw_frontier
+from ucfrec.reporting.results import draw_frontier
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord, read_candidates
 from ucfrec.runs.run import train_run

@@ -19,8 +19,7 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.evaluation.environment import Environment
 from ucfrec.plugins import load_plugin
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TINY = [

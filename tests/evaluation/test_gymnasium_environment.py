@@ -19,7 +19,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment, item_table
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 from ucfrec.schema import USER_IDS
 
 MODULE = "tests.support.gymnasium_environments"

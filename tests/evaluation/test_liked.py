@@ -16,7 +16,7 @@ from ucfrec.evaluation.liked import LikedByRange, LikedExpression
 from ucfrec.evaluation.ranking import MEASURES
 from ucfrec.files.atomic import write_sealed_json
 from ucfrec.logs.expressions import Expression
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 
 SETTINGS = ["train.steps=20", "train.validate_every=10", "policy.dim=8", "policy.context=4"]
 SETTINGS += ["rule.choose=false", "augment.copies=0"]

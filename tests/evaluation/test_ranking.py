@@ -37,7 +37,7 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import read_logged_sessions
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 
 N_ITEMS, K = 12, 3
 

@@ -9,7 +9,7 @@ import pytest
 from tests.support.logs import store_of
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 
 PEERS = ("bpr", "gsasrec", "boosted")
 

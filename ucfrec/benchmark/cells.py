@@ -9,7 +9,7 @@ from ucfrec.benchmark.grid import Measurement
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow, RowKey, Scalar
+from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.shared_stages import OWN, SharedStages

@@ -9,7 +9,7 @@ from typing import Any
 from ucfrec.benchmark.cells import Budget, Cell, Evaluation, Method, Task
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import config_hash
-from ucfrec.results.row import Scalar
+from ucfrec.results.rows import Scalar
 from ucfrec.runs.shared_stages import SharedStages
 
 Presets = Mapping[str, Mapping[str, Any]]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ucfrec.benchmark.tables import DISTRACTOR_RATES, select_checkpoint
-from ucfrec.reporting.plot_style import LIGHT, OURS, PLAIN, save, styled
-from ucfrec.results.row import ResultRow
+from ucfrec.reporting.charts import LIGHT, OURS, PLAIN, save, styled
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.benchmark.grid import Measurement, run_grid
 from ucfrec.errors import InputError
 from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 
 Rows = Sequence[ResultRow]
 

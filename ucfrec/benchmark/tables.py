@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)

@@ -14,7 +14,7 @@ from ucfrec.commands.grid_options import (
 )
 from ucfrec.commands.options import env_options, environment_given, option
 from ucfrec.plugins import load_plugin
-from ucfrec.results.rows_file import benchmarking
+from ucfrec.results.rows import benchmarking
 
 if TYPE_CHECKING:
     from ucfrec.benchmark.suite import Benchmark

@@ -14,7 +14,7 @@ from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress, progress
 
 if TYPE_CHECKING:
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
@@ -166,7 +166,7 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
     from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
     from ucfrec.reporting.page import write_report
-    from ucfrec.results.rows_file import write_results
+    from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
         _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.exploring.page import Explorer
     from ucfrec.exploring.web import application
     from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
-    from ucfrec.reporting.samples import read_features
+    from ucfrec.reporting.training import read_features
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     features = None if options.items is None else read_features(options.items)

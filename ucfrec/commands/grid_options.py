@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.commands.options import option
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import benchmarking, latest, read_rows
+from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 
 if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Choice
     from ucfrec.off_policy.verdict import Verdict
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 _TABLE: Final = "ucfrec.off_policy.evaluate:EstimateOptions"
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec.off_policy.evaluate import EstimateOptions
     from ucfrec.off_policy.selection import choose, names_of
     from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
-    from ucfrec.results.rows_file import write_results
+    from ucfrec.results.rows import write_results
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     runs = runs_given(options)

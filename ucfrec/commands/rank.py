@@ -17,7 +17,7 @@ from ucfrec.commands.options import (
 from ucfrec.errors import InputError
 
 if TYPE_CHECKING:
-    from ucfrec.results.table import Ranking
+    from ucfrec.results.rows import Ranking
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -132,7 +132,7 @@ def _read_candidates(options: argparse.Namespace, trained: "TrainedPolicy") -> "
     """The ids in the file of candidates that the run knows; all ids if it knows none."""
     if options.candidates is None:
         return None
-    from ucfrec.reporting.samples import read_features
+    from ucfrec.reporting.training import read_features
 
     table = read_features(options.candidates, text_ids=True)
     ids: Array = table.column(schema.ITEM_ID).drop_null().unique().to_numpy(zero_copy_only=False)

@@ -41,7 +41,7 @@ def _verify(path: Path) -> int:
     from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord, read_training
 
     if path.is_file():
-        from ucfrec.results.rows_file import read_rows
+        from ucfrec.results.rows import read_rows
 
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
         return 0

@@ -20,7 +20,7 @@ from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "evaluate"

@@ -36,8 +36,7 @@ from ucfrec.off_policy.pages import as_pages, number_pages
 from ucfrec.off_policy.score import LoggedSessions, score_steps, seen_too_often, share_seen
 from ucfrec.off_policy.verdict import Verdict, conclude, list_cautions
 from ucfrec.provenance import config_hash, provenance, shorten_paths
-from ucfrec.results.row import ResultRow, Scalar
-from ucfrec.results.table import ResultTable
+from ucfrec.results.rows import ResultRow, ResultTable, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 

@@ -55,7 +55,7 @@ from ucfrec.recommending.similar import similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
-from ucfrec.results.table import Evaluation, Ranking, ResultTable
+from ucfrec.results.rows import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened

@@ -18,7 +18,7 @@ from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen
 from ucfrec.off_policy.scored import evaluate_scored
 from ucfrec.provenance import shorten_paths
 from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking
-from ucfrec.results.table import Evaluation, Ranking
+from ucfrec.results.rows import Evaluation, Ranking
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 Candidate = tuple[TrainedPolicy, DecisionRule]

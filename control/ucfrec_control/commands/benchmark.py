@@ -7,7 +7,7 @@ from ucfrec.benchmark.cells import Cell
 from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
 from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from ucfrec.benchmark.tables import over_seeds
 from ucfrec.commands.grid_options import results_given, rows_explained
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.plan import robustness_cells

@@ -8,7 +8,7 @@ from ucfrec.benchmark.cells import Cell, measured_by, opened
 from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.files.locks import claim
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING, train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy

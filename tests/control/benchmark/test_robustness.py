@@ -14,8 +14,7 @@ from ucfrec.benchmark.cells import Budget, Evaluation, opened
 from ucfrec.counterfactual.measured_reward import MeasurementConfig
 from ucfrec.counterfactual.screening import ScreeningConfig, screen
 from ucfrec.reporting.tables import NONE
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import training_views

@@ -17,7 +17,7 @@ from safetensors.numpy import load_file
 from ucfrec import Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.plugins import load_plugin
 from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.runs.trained_policy import TrainedPolicy

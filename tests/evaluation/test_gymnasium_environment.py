@@ -17,8 +17,8 @@ from ucfrec.acting.uniform import Uniform
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment, item_table
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.results.rows import read_results
 from ucfrec.schema import USER_IDS
 

@@ -8,7 +8,7 @@ from typing import Any
 from ucfrec.benchmark.grid import Measurement
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING

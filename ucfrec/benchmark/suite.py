@@ -8,7 +8,7 @@ from typing import Protocol
 from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.benchmark.grid import Measurement, run_grid
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.results.rows import ResultRow
 
 Rows = Sequence[ResultRow]

@@ -163,8 +163,8 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
         of `ENVIRONMENTS`.
     """
     from ucfrec.evaluation.collect import collect_store
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.reporting.page import write_report
     from ucfrec.results.rows import write_results
 
@@ -218,8 +218,8 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_policy
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
     from ucfrec.runs.shared_stages import SharedStages

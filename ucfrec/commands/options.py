@@ -19,7 +19,7 @@ from ucfrec.files.remote import Input, Output, uri_or_path
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.evaluation.environment import Environment
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.responder import Responder
@@ -454,7 +454,7 @@ def logs_given(
 
 def environment_given(options: argparse.Namespace) -> "Environment":
     """The environment that `env_options` name."""
-    from ucfrec.evaluation.environment import Environment
+    from ucfrec.evaluation.simulator import Environment
 
     observe = tuple(key for key in options.observe.split(",") if key)
     features = options.item_features

@@ -10,11 +10,12 @@ from ucfrec.arrays import Array
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.liked import Liked, LikedByRange
 from ucfrec.evaluation.ranking import (
     MEASURES,
     Compared,
     Later,
+    Liked,
+    LikedByRange,
     Period,
     Ranker,
     compare,

@@ -213,7 +213,7 @@ def make_report(
 ) -> OffPolicyReport:
     """Estimate from logged steps, judge the estimates, and make their result rows.
 
-    `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the mean
+    `R_cum` is the mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean
     reward of a step; a row may have no interval.
 
     Args:

@@ -24,8 +24,8 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.ranking_table import require_one_catalogue
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher

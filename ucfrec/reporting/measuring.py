@@ -6,12 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.liked import LikedExpression
-from ucfrec.evaluation.ranking import Later
+from ucfrec.evaluation.ranking import Later, LikedExpression
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.evaluation.ranking_table import ranking_rows
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.expressions import Expression
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy
 from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen

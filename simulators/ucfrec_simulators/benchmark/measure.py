@@ -5,8 +5,8 @@ from typing import Any, Final
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.benchmark.cells import Cell, measured_by, opened
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.locks import claim
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord

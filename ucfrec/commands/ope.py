@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Choice
     from ucfrec.off_policy.verdict import Verdict
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -74,7 +74,7 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         from ucfrec.off_policy import evaluate
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
-        from ucfrec.results.rows_file import write_results
+        from ucfrec.results.rows import write_results
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)

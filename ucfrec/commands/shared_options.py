@@ -13,7 +13,7 @@ from ucfrec.files.atomic import require_other_files
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.evaluation.environment import Environment
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.responder import Responder
@@ -242,7 +242,7 @@ class EnvironmentOptions(Table):
 
     def make_environment(self, name: str) -> "Environment":
         """The environment of that name with these parts."""
-        from ucfrec.evaluation.environment import Environment
+        from ucfrec.evaluation.simulator import Environment
 
         observe = tuple(key for key in self.observe.split(",") if key)
         return Environment(name, self.env_folder, observe=observe, item_features=self.item_features)

@@ -23,8 +23,7 @@ from ucfrec.benchmark.cells import Budget, Evaluation, open_store
 from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import training_views

@@ -15,7 +15,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import append_rows
 from ucfrec_control.benchmark.robustness import drops
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.figures.figures import HIGHS, LOWS, NEEDS, make_figures

@@ -21,7 +21,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
-from ucfrec.results.rows_file import read_results, read_rows
+from ucfrec.results.rows import read_results, read_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES

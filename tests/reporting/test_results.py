@@ -1,11 +1,54 @@
-"""The verdict claims what intervals allow, and no more."""
+"""The forest plot draws what each verdict is of, and whether it stands."""
 
 from typing import Any
 
 from tests.support.report_page import estimate, row
-from ucfrec.reporting.page_results import Estimates, Results
-from ucfrec.reporting.verdict import NO_RESULTS, verdict
-from ucfrec.results.row import ResultRow
+from ucfrec.off_policy.estimators import LOGGED
+from ucfrec.reporting.results import (
+    NO_RESULTS,
+    Estimates,
+    Results,
+    conclude,
+    draw_forest,
+    find_quoted,
+)
+from ucfrec.results.rows import ResultRow
+
+
+def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
+    """The forest of policies a, b, … with the logged return and the rows of each."""
+    estimates = [
+        Estimates(name, estimate(LOGGED, logged), rows, ())
+        for name, (logged, rows) in zip("ab", policies, strict=False)
+    ]
+    return draw_forest(Results({}, estimates))
+
+
+def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
+    good = [
+        estimate("IPS", 3.0),
+        estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True}),
+    ]
+    bad = [estimate("DR", 9.0, details={"verdict_of": "DR", "reliable": False})]
+    first, second, _ = forest_of((2.0, good), (2.0, bad)).summary.split(". ")
+    assert first == "a: DR: 4, 95% interval 3.5 to 5.5, the estimate stands"
+    assert second == "b: DR: 9, 95% interval 8.5 to 10.5, do not rely on it"
+
+
+def test_without_an_interval_there_is_no_line() -> None:
+    models = [estimate("DM", 1.0, interval=None), estimate("FQE", 2.0, interval=None)]
+    assert forest_of((2.0, models)) is None
+    assert forest_of() is None
+    snips = estimate("SNIPS", 1.0, details={"verdict_of": "SNIPS"})
+    assert find_quoted([*models, snips]) == snips
+
+
+def test_logs_that_differ_have_no_common_reference() -> None:
+    rows = [estimate("DR", 4.0, details={"verdict_of": "DR"})]
+    alike, different = forest_of((2.0, rows), (2.0, rows)), forest_of((2.0, rows), (3.0, rows))
+    assert alike.summary.endswith("For comparison, logged sessions: 2")
+    assert "logged sessions" not in different.summary
+    assert different.summary.count("do not rely on it") == 2
 
 
 def earned(policy: str, value: float, **more: Any) -> ResultRow:
@@ -13,12 +56,12 @@ def earned(policy: str, value: float, **more: Any) -> ResultRow:
 
 
 def of_environment(*rows: ResultRow) -> str:
-    (said,) = verdict(Results({"a": rows}, ()))
+    (said,) = conclude(Results({"a": rows}, ()))
     return said
 
 
 def test_without_results_nothing_is_said_of_returns() -> None:
-    assert verdict(Results({}, ())) == [NO_RESULTS]
+    assert conclude(Results({}, ())) == [NO_RESULTS]
     assert "the returns of these policies are unknown" in NO_RESULTS
 
 
@@ -65,7 +108,7 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
 
 def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
     rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
-    (said,) = verdict(Results({}, [Estimates("ucf", None, rows, ())]))
+    (said,) = conclude(Results({}, [Estimates("ucf", None, rows, ())]))
     assert said == "For ucf: higher."
-    (said,) = verdict(Results({}, [Estimates("ucf", None, rows[:1], ())]))
+    (said,) = conclude(Results({}, [Estimates("ucf", None, rows[:1], ())]))
     assert "no verdict" in said

@@ -1,4 +1,8 @@
-"""Results of `ucfrec evaluate` and `ucfrec ope` in the report, and rules by their evidence."""
+"""Results of `ucfrec evaluate` and `ucfrec ope` in the report: conclusions, charts and tables.
+
+Conclusions call two results different only if their 95% intervals do not overlap, which is stricter
+than a test of the difference at 5%.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,8 +15,8 @@ from ucfrec.evaluation.diversity import COLUMNS
 from ucfrec.off_policy.estimators import LOGGED, SUITE
 from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, format_value
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import ResultRow, read_results
+from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import Candidate, RunRecord
 
 _METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
@@ -101,9 +105,7 @@ def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     pictures = []
     for environment, rows in results.environments.items():
         names, lines = _name_rows(rows), [evaluation_line(row) for row in rows]
-        columns = [
-            c for c in (*_METRICS, *_SEEDS) if any(line.get(c) is not None for line in lines)
-        ]
+        columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
         body = [
             (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
             for name, row, line in zip(names, rows, lines, strict=True)
@@ -250,3 +252,119 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
     chart = line_chart(title, "effective users of the log", curves)
     head = ["value in the search", "effective users", "off-policy interval"]
     return chart, Table(title, "rule", head, body)
+
+
+NO_RESULTS = (
+    "No results are given, so the returns of these policies are unknown. A validation loss "
+    "measures how well logged choices are predicted, not the return. Evaluate the policies in a "
+    "simulator (ucfrec evaluate --json) or from logs (ucfrec ope --json), and give the rows with "
+    "--results."
+)
+
+
+@dataclass(frozen=True)
+class _Return:
+    """Return of one policy in one environment, over all its rows."""
+
+    policy: str
+    trained: bool
+    trainings: int
+    """Number of distinct training seeds."""
+    value: float
+    """Mean R_cum over rows."""
+    low: float
+    """Lowest end of the rows' 95% intervals."""
+    high: float
+    """Highest end of the rows' 95% intervals."""
+
+    def above(self, reference: "_Return") -> bool:
+        """Whether all intervals are above all intervals of `reference`."""
+        return self.low > reference.high
+
+    def __str__(self) -> str:
+        return f"{self.policy} ({format_value(self.value)})"
+
+
+def conclude(results: Results) -> list[str]:
+    """One paragraph per environment, then one per policy with estimates from logs."""
+    conclusions = [_conclude(name, rows) for name, rows in results.environments.items()]
+    return conclusions + [_quote(estimates) for estimates in results.estimates] or [NO_RESULTS]
+
+
+def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
+    """One summary per policy and checkpoint, in order of first appearance."""
+    groups = grouped(rows, lambda row: (row.method, row.checkpoint))
+    policies = [policy for policy, _ in groups]
+    return [
+        _Return(
+            policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}",
+            any(row.training_seed is not None for row in group),
+            len({row.training_seed for row in group}),
+            sum(row.value for row in group) / len(group),
+            min(row.interval[0] for row in group if row.interval),
+            max(row.interval[1] for row in group if row.interval),
+        )
+        for (policy, checkpoint), group in groups.items()
+    ]
+
+
+def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
+    returns = _collect_returns(rows)
+    trained = sorted((policy for policy in returns if policy.trained), key=lambda p: -p.value)
+    references = [policy for policy in returns if not policy.trained]
+    if not trained:
+        return f"In {environment}, only built-in policies were evaluated: {_join(references)}."
+    best, *lower = trained
+    ends = f"{format_value(best.low)} to {format_value(best.high)}"
+    value = f"{format_value(best.value)} (95% interval {ends})"
+    if best.trainings > 1:
+        value = f"{format_value(best.value)} in the mean of {best.trainings} trainings "
+        value += f"(their 95% intervals span {ends})"
+    if lower:
+        text = (
+            f"In {environment}, {best.policy} has the highest return of {len(trained)} trained "
+            f"policies: {value} per episode."
+        )
+        if close := [policy for policy in lower if not best.above(policy)]:
+            text += f" Its interval overlaps that of {_join(close)}:"
+            text += " which of them has the higher return is open."
+        else:
+            text += f" Its interval lies above those of the others, the next being {lower[0]}."
+    else:
+        text = f"In {environment}, {best.policy} has a return of {value} per episode."
+    text += _compare(best, references)
+    if max(policy.trainings for policy in trained) < 2:
+        once = "Each policy was" if lower else "It was"
+        text += f" {once} trained once; the spread over training seeds is unknown."
+    return text
+
+
+def _compare(best: _Return, references: Sequence[_Return]) -> str:
+    """Compare the best trained policy with the built-in policies."""
+    if not references:
+        return " No built-in policy (random, logging or best) was evaluated to compare it with."
+    below = [policy for policy in references if best.above(policy)]
+    above = [policy for policy in references if policy.above(best)]
+    unclear = [policy for policy in references if policy not in (*above, *below)]
+    parts = [f"higher than that of {_join(below)}"] if below else []
+    parts += [f"lower than that of {_join(above)}"] if above else []
+    text = f" Its return is {', and '.join(parts)}." if parts else ""
+    if unclear:
+        text += f" Whether it is higher or lower than that of {_join(unclear)} is open: intervals "
+        text += "overlap."
+    return text
+
+
+def _quote(estimates: Estimates) -> str:
+    """What `ucfrec ope` concluded of a policy, as its rows say."""
+    rows = [*estimates.rows, *([estimates.logged] if estimates.logged else [])]
+    verdicts = (row.details["verdict"] for row in rows if row.details.get("verdict"))
+    if (quoted := next(verdicts, None)) is None:
+        return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
+    return f"For {estimates.name}: {quoted}."
+
+
+def _join(policies: Sequence[_Return]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    *names, last = map(str, policies)
+    return f"{', '.join(names)} and {last}" if names else last

@@ -98,7 +98,7 @@ def modules_imported(package: str) -> dict[str, set[str]]:
 
 
 def room(module: str) -> str:
-    """`ucfrec.logs.kept` lies in `logs`; the package itself is `__init__`."""
+    """`ucfrec.logs.rows` lies in `logs`; the package itself is `__init__`."""
     return ([*module.split("."), "__init__"])[1]
 
 

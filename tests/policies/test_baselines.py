@@ -21,7 +21,7 @@ from ucfrec.policies.baselines import (
     count_decayed,
     shrink_rates,
 )
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -15,8 +15,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.liked import Liked
-from ucfrec.evaluation.ranking import Ranker, Steps
+from ucfrec.evaluation.ranking import Liked, Ranker, Steps
 from ucfrec.policies.baselines import (
     ItemKNNConfig,
     ItemKNNPolicy,

@@ -33,7 +33,7 @@ def users_of(
     model.binary.fill_(True)
     model.likeness.start_from(store.item_states)
     model.item.copy_(torch.as_tensor(effects))
-    logged = LoggedEnds.of(store, 10, 10_000, 0)
+    logged = LoggedEnds.of(store, model.likeness, 10, 10_000, 0)
     logged.ended[:] = np.random.default_rng(0).random(len(logged.ended)) < ends
     tags = MainTags.of(store.item_states)
     end, of_end = SessionEnd.fit(model.likeness, logged, logged, 0)

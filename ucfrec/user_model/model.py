@@ -91,7 +91,7 @@ class UserModel:
                 runs = [LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS) for view in views]
                 fatigue = fit_fatigue(runs[0], runs[1])
             logged, held_out = (
-                LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed)
+                LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)

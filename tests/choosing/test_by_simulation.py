@@ -20,7 +20,7 @@ from ucfrec.choosing.by_simulation import (
     choose_by_simulation,
     find_neighbours,
 )
-from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
+from ucfrec.choosing.choice import Evidence, Problem, RuleChoice, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -169,6 +169,14 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.level([low, high]) == [high]
     search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
+    # Of these, the simplest: the higher temperature, whatever comes first.
+    assert search.best([low, high]) == search.best([high, low]) == high
+    # Or the one that the log says most of: the likelihood, then the hits.
+    likely = replace(low, evidence=Evidence(0.1, 0.2))
+    unlikely = replace(high, evidence=Evidence(0.3, 0.1))
+    assert search.most_evident([unlikely, likely]) == likely
+    hitting = replace(high, evidence=Evidence(0.3, 0.2))
+    assert search.most_evident([likely, hitting]) == hitting
 
 
 def test_rules_far_behind_are_not_simulated_in_all_sessions(

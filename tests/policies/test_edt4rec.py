@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, VECTORS, both_heads, build, changed_at, random_windows
+from tests.policies.test_ucf import (
+    CATALOG,
+    VECTORS,
+    both_heads,
+    build,
+    changed_at,
+    random_windows,
+    trained,
+)
 from tests.support.episodes import lengths_of, random_episodes, some_states, write_store
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -66,23 +74,12 @@ def test_switching_the_distinguishing_part_off_changes_loss_and_gradient(
     )
 
 
-def trained(policy: SequencePolicy, windows: Windows, steps: int = 150) -> SequencePolicy:
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
-    policy.train()
-    for step in range(steps):
-        torch.manual_seed(step)
-        optimizer.zero_grad()
-        policy.loss(windows)[0].backward()
-        optimizer.step()
-    return policy.eval()
-
-
 @both_heads
 def test_the_reward_estimator_learns_the_reward_of_the_action_taken(sizes: dict[str, int]) -> None:
     policy, windows = build("cdt4rec", sizes, dropout=0.0), random_windows(sizes)
     assert isinstance(policy, CDT4RecPolicy)
     first = policy.loss(windows)[1]["reward_loss"]
-    trained(policy, windows)
+    trained(policy, windows, 150)
     assert policy.loss(windows)[1]["reward_loss"] < 0.1 * first
     hidden = policy.transform(policy.normalize(windows))
     estimate = policy.estimate_rewards(hidden, windows.mask)

@@ -108,7 +108,8 @@ def shown_of(history: list[tuple[int, float]], reach: int) -> Shown:
 def run_by_hand(history: list[tuple[int, float]]) -> int:
     """Length of the run of one main tag that ends with the last step."""
     tags = np.array([int(TAGS.tags[item]) for item, _ in history])
-    return on_end(tags, np.array([reward >= 1.2 for _, reward in history]) & (tags >= 0))
+    likes = np.array([reward >= 1.2 for _, reward in history], dtype=bool)
+    return on_end(tags, likes & (tags >= 0))
 
 
 @given(steps)

@@ -208,13 +208,6 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     assert not list(folder.iterdir())
 
 
-def test_a_memory_limit_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"memory_limit 'much' is not a size; write e\.g\. 2GB"):  # noqa: SIM117
-        with engine([], tmp_path, "much"):
-            pass
-    assert not list(tmp_path.iterdir())
-
-
 def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     """Names and types of columns come from files, and into SQL."""
     rows = 40

@@ -366,10 +366,6 @@ def test_what_is_no_text_is_refused(
     for command, to in (("recommend", "--out"), ("score", "--out"), ("ope", "--json")):
         assert main([command, str(tmp_path / "run"), log, to, str(tmp_path / "x")]) == 2
         assert "run.json" in capsys.readouterr().err
-    for line in ("reward = 3", "[columns]\nuser_id = 3", "[columns]\nuser_id = ['a']"):
-        (tmp_path / "m.toml").write_text(line)
-        with pytest.raises(InputError, match=r"m.toml: .* is not text"):
-            main(["--debug", "prepare", log, "--mapping", str(tmp_path / "m.toml"), "--validate"])
 
 
 def test_listed_functions_only_compute(connection: duckdb.DuckDBPyConnection) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputNote
 from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
@@ -69,25 +69,6 @@ def test_the_index_of_a_frame_is_no_feature(tmp_path: Path) -> None:
         prepare([tmp_path / "log.parquet"], given, tmp_path / name, OPTIONS)
         states.append((tmp_path / name / "item_states.safetensors").read_bytes())
     assert states[0] == states[1]
-
-
-@pytest.mark.parametrize(
-    ("ids", "keys", "message"),
-    [
-        ([1, 2, 12], [21, 22, 23, 24], r"item_id of the log, which are 1, 2, 12, …, and key is 21"),
-        ([1, 2, 12], ["i1", "i2", "i12"], r"key is never such an id; let the key be"),
-        ([1, 2, 12], [1.4, 2.4, 11.6], r"key is never such an id"),
-        ([2**53, 2**53 + 2], [2.0**53, 2.0**53 + 2], r"key is never such an id"),
-        (["a1", "a2", "a12"], [1, 2, 12], r"which are 'a1', 'a12', 'a2', …, and key is '1', '12'"),
-        (["1", "2", "12"], ["01", "02", "012"], r"key is '01', '012', '02', …"),
-    ],
-)
-def test_features_of_nothing_in_the_log_are_refused(
-    tmp_path: Path, ids: list[object], keys: list[object], message: str
-) -> None:
-    mapping = mapping_of(tmp_path, ids, keys)
-    with pytest.raises(InputError, match=rf"features\.parquet: no row belongs to .*{message}"):
-        validate([tmp_path / "log.parquet"], mapping, OPTIONS)
 
 
 def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:

@@ -165,11 +165,6 @@ def test_columns_of_lists_are_told_apart(separate: bool) -> None:
     assert shared(tags, 3, 2) == 0
 
 
-def test_items_without_tags_or_a_row_share_none() -> None:
-    tags = tags_of([["a"], []], items=4)
-    np.testing.assert_array_equal(tags, [[0], [-1], [-1], [-1]])
-
-
 def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
     many = [f"tag {n:02}" for n in range(TAGS_PER_ITEM + 9)]
     lists: Lists = [[*many], many[9:], [*many[9:], "own"], ["own"]]
@@ -189,11 +184,6 @@ def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
     tags = tags_of([*lists, None])
     assert int(tags.max()) == DISTINCT_TAGS - 1
     assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS
-
-
-def test_tags_do_not_depend_on_the_order_of_lists() -> None:
-    lists: Lists = [["b", "a", "b"], ["c", "a"], ["c"]]
-    np.testing.assert_array_equal(tags_of(lists), tags_of([["a", "b"], ["a", "c"], ["c"]]))
 
 
 def test_a_catalogue_of_empty_lists_has_no_tags() -> None:

@@ -9,16 +9,13 @@ import torch
 from scipy import sparse
 from sklearn.utils.extmath import randomized_svd
 
-from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.append import append_logs
-from ucfrec.logs.features import EncodedFeatures
 from ucfrec.logs.items import (
     Exposure,
     SparseRows,
     item_embeddings,
     right_singular_vectors,
-    write_item_states,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -158,21 +155,6 @@ def test_few_users_or_items_give_few_dimensions(tmp_path: Path) -> None:
     one_item = Exposure(tmp_path / "one_item", np.array([4]))
     one_item.add(np.arange(4), zero, np.ones(4))
     assert item_embeddings(one_item).shape == (1, 1)
-
-
-def test_states_can_be_written_without_features(tmp_path: Path) -> None:
-    store = learn(tmp_path / "a", make_log(), features=False)
-    items, users = (
-        pd.read_parquet(store.path / f"{name}.parquet").train_count.to_numpy()
-        for name in ("items", "users")
-    )
-    known = EncodedFeatures(None, None, items, users, np.zeros((30, 0), dtype=np.int64))
-    write_item_states(store.path, tmp_path, known, 4)
-    found = ItemStates.load(store.path / "item_states.safetensors")
-    assert found.embeddings.shape == (30, 4)
-    assert found.embeddings[:27].norm(dim=1).min() > 0.1
-    assert found.user_features.shape == (90, 0)
-    assert found.tags.shape[1] == 0
 
 
 def on_disk(path: Path, matrix: sparse.csr_matrix) -> SparseRows:

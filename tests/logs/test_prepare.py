@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 
 from tests.support.equal_times import tie_key
 from tests.support.logs import START, write
-from ucfrec import progress, schema
+from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError, InputNote
@@ -233,17 +233,6 @@ def test_repeated_rows_that_agree_are_no_conflict(tmp_path: Path) -> None:
     report = validate([write(pd.concat([log, again]), tmp_path / "log.parquet")], LogMapping())
     assert report["dropped"]["duplicate"] == 20
     assert report["conflicting_duplicates"] == 3
-
-
-def test_a_long_preparation_prints_lines_where_there_is_no_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(progress, "FIRST_LINE", 0)
-    monkeypatch.setattr(progress, "NEXT_LINE", 0)
-    prepared(tmp_path, make_log())
-    printed = capsys.readouterr().err.splitlines()
-    assert any(line.startswith("check the logs:  25% 1/4") for line in printed)
-    assert any(line.startswith("write the store: 100%") for line in printed)
 
 
 @pytest.mark.parametrize("rows", [2, 30])

@@ -302,8 +302,7 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("suffix", "kind"),
-    [(".parquet", "object"), (".parquet", "string"), (".csv", "object")],
+    ("suffix", "kind"), [(".parquet", "object"), (".parquet", "string"), (".csv", "object")]
 )
 @pytest.mark.parametrize(
     "name", ["propensity", "session_id", "is_random", "observation", "feedback"]

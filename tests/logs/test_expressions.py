@@ -21,7 +21,7 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
-from ucfrec.logs.engine import bind, engine, engine_in_memory
+from ucfrec.logs.engine import bind, engine
 from ucfrec.logs.expressions import COPYING, FUNCTIONS, TYPES, NotScalarError, columns_of
 from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -459,7 +459,7 @@ def nested(depth: int, template: str) -> str:
     ],
 )
 def test_text_cannot_grow_without_bound(text: str) -> None:
-    with engine_in_memory() as connection, pytest.raises(NotScalarError, match=r"text"):
+    with engine((), None) as connection, pytest.raises(NotScalarError, match=r"text"):
         columns_of(connection, text)
 
 
@@ -476,7 +476,7 @@ def test_text_cannot_grow_without_bound(text: str) -> None:
     ],
 )
 def test_what_shops_write_is_not_taken_for_growth(text: str) -> None:
-    with engine_in_memory() as connection:
+    with engine((), None) as connection:
         assert "a" in columns_of(connection, text)
 
 

@@ -16,7 +16,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.engine import engine, engine_in_memory, explain_errors, settle_mapping, to_arrow
+from ucfrec.logs.engine import engine, explain_errors, settle_mapping, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
@@ -97,7 +97,7 @@ def frame_histories(
     """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
     too."""
     columns = log_table(frame, HISTORIES)
-    with engine_in_memory() as connection:
+    with engine((), None) as connection:
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))

@@ -164,10 +164,7 @@ def item_embeddings(
 
 
 def predict_from_features(
-    features: sparse.csr_matrix,
-    trained: IntArray,
-    cooccurrence: Float64Array,
-    counts: IntArray,
+    features: sparse.csr_matrix, trained: IntArray, cooccurrence: Float64Array, counts: IntArray
 ) -> Float64Array:
     """(n_items, size) co-occurrence part predicted from features, by ridge regression."""
     axes = _axes(features[trained], CONTENT_RANK)

@@ -212,12 +212,12 @@ def require_known_ids(
 ) -> None:
     """Raise InputError if a feature table has no row of an id of the log; if `noted`, warn if many
     ids have none. `names` are those of `load_features`, `kind` as there."""
-    used = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
+    used_ids = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
     for table, name in zip(tables, names, strict=True):
-        if not _count(connection, f"{used} SEMI JOIN {name} ON id = {kind}"):
+        if not _count(connection, f"{used_ids} SEMI JOIN {name} ON id = {kind}"):
             ids, log_ids = (
                 connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
-                for column, rows in (("id", name), (kind, used))
+                for column, rows in (("id", name), (kind, used_ids))
             )
             keys = f"is {_list_values(ids)}" if ids else "is never such an id"
             raise InputError(
@@ -226,7 +226,9 @@ def require_known_ids(
                 "expression that gives the same ids, or leave the file out"
             )
     if noted:
-        note_lacking(connection, tables, names, kind, used, f"{kind}s of the log", _MANY_LACKING)
+        note_lacking(
+            connection, tables, names, kind, used_ids, f"{kind}s of the log", _MANY_LACKING
+        )
 
 
 def note_lacking(

@@ -24,7 +24,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import FrameTable
 from ucfrec.results.statistics import group_auc, resampled_ratios
@@ -89,7 +89,7 @@ class LikedExpression:
         source = Path(_ROWS)
         types = tuple((name, "DOUBLE") for name in self._names.values())
         table = FrameTable((source,), types)
-        with engine_in_memory() as connection, explain_errors(connection, (table,), source):
+        with engine((), None) as connection, explain_errors(connection, (table,), source):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
             sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":

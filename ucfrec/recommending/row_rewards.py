@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.tables import is_number
@@ -59,7 +59,7 @@ class RowRewards:
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
         if self._connection is None:
-            self._connection = self._stack.enter_context(engine_in_memory(_MEMORY))
+            self._connection = self._stack.enter_context(engine((), None, _MEMORY))
         connection = self._connection
         names = {name.casefold() for row in rows for name in row}
         columns = {}

@@ -14,7 +14,7 @@ from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.choosing.logged import SHOWN
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.policies.heads import ItemHead

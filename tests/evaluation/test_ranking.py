@@ -18,7 +18,7 @@ from tests.support.logs import store_of
 from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
 from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation import ranking
 from ucfrec.evaluation.ranking import (

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ucfrec.episodes.sessions import Sessions
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy, interleave
 from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy

@@ -15,10 +15,9 @@ from torch.nn import functional as F
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
-from ucfrec.episodes.exposure import Exposed, Likeness, Shown
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.user_model.fatigue import MainTags

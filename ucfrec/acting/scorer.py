@@ -17,10 +17,9 @@ from ucfrec.acting.item_product import ItemProduct, Part
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.user_model.reward import ItemRewardModel

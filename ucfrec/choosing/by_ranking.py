@@ -19,7 +19,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice
 from ucfrec.choosing.logged import SHOWN, LoggedScores
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000

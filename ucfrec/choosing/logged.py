@@ -11,9 +11,9 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.item_counts import liked_rewards
-from ucfrec.episodes.sessions import Sessions, seen_before
+from ucfrec.episodes.states import liked_rewards
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.progress import progress
 from ucfrec.results.statistics import effective_number
 

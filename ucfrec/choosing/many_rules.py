@@ -11,9 +11,8 @@ from torch import Tensor
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.progress import progress
 from ucfrec.schema import USER_IDS
 from ucfrec.user_model.simulator import UserSimulator

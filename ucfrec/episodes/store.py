@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
 
+LONG: Final = 100
+"""Times the median from which on a session is hardly a person's."""
 _STATISTICS_STEPS = 100_000
 _FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
 _PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
@@ -155,6 +157,15 @@ class EpisodeStore(EpisodeView):
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
         in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
         return self.select(np.flatnonzero(in_split))
+
+    def without_long_sessions(self) -> "EpisodeStore":
+        """The view without sessions of more than `LONG` times the median number of steps.
+
+        One session of thousands of steps would otherwise set the largest target return, be a good
+        part of the rows that the user model is fitted to, and let simulated sessions go on as long.
+        """
+        usual = self.lengths <= LONG * np.median(self.lengths) if len(self) else np.array([True])
+        return self if usual.all() else self.select(np.flatnonzero(usual))
 
     @cached_property
     def whole(self) -> "EpisodeStore":

@@ -8,8 +8,7 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_counts import LIKED, least_liked, liked_rewards
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.binding import bind, explained

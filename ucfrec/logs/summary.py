@@ -9,7 +9,7 @@ from typing import Any, Final
 import duckdb
 
 from ucfrec import schema
-from ucfrec.episodes.long_sessions import LONG
+from ucfrec.episodes.store import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.binding import bind

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.episodes.item_counts import least_liked
+from ucfrec.episodes.states import least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
@@ -57,7 +57,7 @@ class BPRPolicy(SequencePolicy):
         return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
 
     def _liked(self, windows: Windows) -> Tensor:
-        """(B, K) 1 at liked steps, as of `ucfrec.episodes.item_counts`, otherwise 0."""
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
         least = least_liked(self.reward_low, self.reward_high)
         return ((windows.rewards >= least) & windows.mask).float()
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.progress import Progress

@@ -9,8 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from ucfrec.arrays import Float64Array
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory

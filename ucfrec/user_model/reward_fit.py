@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ucfrec.episodes.item_counts import least_liked
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights

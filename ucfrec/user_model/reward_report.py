@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 

@@ -8,8 +8,8 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions
 from ucfrec.user_model.model import UserModel
 
 _GROUPS: Final = 32

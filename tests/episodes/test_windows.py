@@ -6,10 +6,9 @@ import torch
 
 from tests.support.episodes import N_ITEMS, some_states
 from ucfrec import schema
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 
 USERS = 3
 

@@ -39,9 +39,8 @@ from ucfrec.counterfactual.reward_model_fit import (
     sample_steps,
     sample_transitions,
 )
-from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Transitions
+from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.processes import random_state_kept

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.states import liked_rewards
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import Windows
 from ucfrec.evaluation.liked import Liked
 from ucfrec.evaluation.session_metrics import resampled_ratios

@@ -24,8 +24,8 @@ from ucfrec.counterfactual.augmentation import (
 )
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.episodes.augmented import AUGMENTED, AugmentedEpisodes
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.liked import LikedByRange
 from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps

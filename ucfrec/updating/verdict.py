@@ -7,9 +7,8 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.states import liked_rewards
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.off_policy.diagnostics import check_mean_weight
 from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_intervals
 from ucfrec.off_policy.score import score_steps

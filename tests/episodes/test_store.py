@@ -44,12 +44,6 @@ from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 
-LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
-
-
-SHARDS = (2**24, 6, 1)
-
-
 lengths_of_episodes = st.lists(st.integers(1, 8), min_size=1, max_size=6)
 
 

@@ -31,12 +31,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 
-LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
-
-
-SHARDS = (2**24, 6, 1)
-
-
 lengths_of_episodes = st.lists(st.integers(1, 8), min_size=1, max_size=6)
 
 

@@ -211,12 +211,8 @@ def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
         items, shown = rows.items[part].unsqueeze(1), rows.shown.at(part).latest(model.lags)
-        likeness, liked = model.likeness, model.liked(shown.rewards)
-        columns = [
-            likeness.to_items(likeness.profile(earlier, torch.ones_like(earlier).float()), items)
-            for earlier in shown.items.unsqueeze(1).unbind(2)
-        ]
-        repeated, alike = (shown.items == items).float(), torch.stack(columns, 1)
+        liked, alike = model.liked(shown.rewards), model.likeness.between(shown.items, items)
+        repeated = (shown.items == items).float()
         parts.append(torch.cat([repeated, alike, repeated * liked, alike * liked], 1))
     return torch.cat(parts)
 

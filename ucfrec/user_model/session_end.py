@@ -246,8 +246,8 @@ class SessionEnd:
             steps: (B,) number of the step.
         """
         batch, count = items.shape
-        lately = F.pad(shown.items[:, :_LAGS], (0, max(0, _LAGS - shown.items.shape[1])), value=-1)
-        profiles = self.likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
+        lately = _pad_to_lags(shown.items).reshape(-1, 1)
+        profiles = self.likeness.profile(lately, torch.ones(lately.shape))
         alike = self.likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
         repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
         number = steps.unsqueeze(1)
@@ -295,10 +295,9 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     return {"highest": highest, "mean": mean, "scale": scale, **fitted}
 
 
-def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:
-    """(M, F) of the item that was shown `lag` steps before the last one, as `Likeness.profile`."""
-    items = shown.items[:, lag : lag + 1]
-    return likeness.profile(items, torch.ones(items.shape))
+def _pad_to_lags(items: Tensor) -> Tensor:
+    """The latest items of (M, L) shown, (M, 10); −1 where there are fewer."""
+    return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
 
 def _gain(losses: Tensor, columns: Tensor) -> tuple[float, float]:
@@ -312,9 +311,9 @@ def _gain(losses: Tensor, columns: Tensor) -> tuple[float, float]:
 def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:
     """(M, F) inputs of logged steps."""
     shown, items = logged.shown, logged.items.unsqueeze(1)
-    alike = [likeness.to_items(_profile(likeness, shown, lag), items) for lag in range(_LAGS)]
+    alike = likeness.between(_pad_to_lags(shown.items), items)
     rewards, steps = torch.from_numpy(logged.rewards), torch.from_numpy(logged.steps)
-    return torch.stack(_columns(torch.stack(alike, 1), shown.items == items, rewards, steps), -1)
+    return torch.stack(_columns(alike, shown.items == items, rewards, steps), -1)
 
 
 def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> list[Tensor]:

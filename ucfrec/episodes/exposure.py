@@ -124,7 +124,7 @@ class Likeness(nn.Module):
         """Likeness (M, N) of items shown (M, N), int64, −1 for none, to one item each, (M, 1)."""
         ones = torch.ones(items.shape)
         return torch.stack(
-            [self.to_items(self.profile(one, ones), items) for one in shown.split(1, 1)], 1
+            [self.to_items(self.profile(one, ones), items) for one in torch.split(shown, 1, 1)], 1
         )
 
     def to_candidates(self, profile: Tensor, items: Tensor) -> Tensor:

@@ -21,8 +21,8 @@ from ucfrec.counterfactual.augmentation import augment_episodes
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect_store
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
 from ucfrec.runs.config import resolve_config

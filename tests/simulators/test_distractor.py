@@ -20,8 +20,8 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import reward_bit
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import train_screened

@@ -272,5 +272,5 @@ def read_transitions(
         return replace(transitions, actions=view.action_vectors(other))
     rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
     items = rows.items if other is None else other
-    fixed = item_rewards.fixed_part(rows.shown, rows.users, items)
+    fixed = item_rewards.score_without_state(rows.history, rows.users, items)
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))

@@ -120,13 +120,6 @@ class Likeness(nn.Module):
             return (profile * self.directions[items[:, 0]]).sum(1)
         return self.to_candidates(profile, items)[:, 0]
 
-    def between(self, shown: Tensor, items: Tensor) -> Tensor:
-        """Likeness (M, N) of items shown (M, N), int64, −1 for none, to one item each, (M, 1)."""
-        ones = torch.ones(items.shape)
-        return torch.stack(
-            [self.to_items(self.profile(one, ones), items) for one in torch.split(shown, 1, 1)], 1
-        )
-
     def to_candidates(self, profile: Tensor, items: Tensor) -> Tensor:
         """Likeness (M, C) to profiles (M, F) of items (M, C); to (M, L, F) it is (M, L, C)."""
         if profile.dim() == 2:

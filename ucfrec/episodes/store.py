@@ -18,15 +18,16 @@ from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
-from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
+from ucfrec.episodes.writer import StoreWriter, require_finite, require_steps
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import read_ids
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
+__all__ = ["ITEM_STATES", "EpisodeStore"]
 
 LONG: Final = 100
 """Times the median from which on a session is hardly a person's."""
@@ -80,8 +81,15 @@ class EpisodeStore(EpisodeView):
             InputError: `path` exists already, an episode has no steps, columns differ in length, or
                 rewards are not finite.
         """
-        values = _with_split(episodes, lengths)
-        write_arrays(path, steps, lengths, values, reward, source or {}, shard_steps)
+        lengths = require_steps(path, lengths)
+        first = np.zeros(int(np.sum(lengths)), dtype=bool)
+        first[np.cumsum(lengths) - lengths] = True
+        columns = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+        repeated = {name: np.repeat(values, lengths) for name, values in columns.items()}
+        with atomic_folder(path) as scratch:
+            writer = StoreWriter(scratch, shard_steps)
+            writer.append(steps, first, repeated)
+            writer.finish(reward=reward, source=source or {})
         return cls.open(path)
 
     @classmethod
@@ -95,26 +103,64 @@ class EpisodeStore(EpisodeView):
         """Make a store in memory, without files.
 
         Args:
-            steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
-            lengths: (E,) number of steps of each episode, at least 1, with sum N.
-            episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
-                are in the training split.
+            steps, lengths, episodes: as of `write`.
             item_states: builds states from items; required if actions are items.
 
         Raises:
-            InputError: an episode has no steps, columns differ in length, or rewards are not
-                finite.
+            InputError: as `write`.
         """
         lengths = require_steps("a store in memory", lengths)
         require_finite(steps[schema.REWARD])
-        values = _with_split(episodes, lengths)
-        return cls(Columns.from_arrays(steps, lengths, values, item_states))
+        columns = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+        return cls(Columns.from_arrays(steps, lengths, columns, item_states))
 
     # For notebooks.
 
     def to_frame(self) -> "pd.DataFrame":
-        """One row per step, with the identifiers of the logs; see `store_frame`."""
-        return store_frame(self)
+        """One row per step, session by session: `user_id`, `session_id` (the number of the session
+        in the store; one for all episodes of a session that a split boundary cuts), `item_id` or
+        `action`, the other columns of the log that the store has, and `split`.
+
+        Raises:
+            InputError: a file of the store is damaged.
+        """
+        import pandas as pd  # most stores are never shown
+
+        episodes, steps = self.all_steps()
+        columns: dict[str, Any] = {}
+        if self.has_users:
+            users = self.episode_values(schema.USER)[episodes]
+            columns[schema.USER_ID] = self._read_ids(schema.USER_ID, users)
+        columns[schema.SESSION_ID] = self._number_sessions()[episodes]
+        if self.has_items:
+            items = self.step_values(schema.ITEM, episodes, steps)
+            columns[schema.ITEM_ID] = self._read_ids(schema.ITEM_ID, items)
+        for name in (*_PLAIN, *_LISTS):
+            if name in self.record.columns:
+                values = self.step_values(name, episodes, steps)
+                columns[name] = list(values) if name in _LISTS else values
+        splits = self.episode_values(schema.SPLIT)[episodes]
+        columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
+        return pd.DataFrame(columns)
+
+    def _number_sessions(self) -> IntArray:
+        """(E,) number of each episode's session, which is that of its first episode."""
+        numbers = self.episode_ids
+        has_ends = self.has_episode_values(schema.TERMINATED)
+        if not (self.has_users and has_ends) or len(self) < 2:
+            return numbers
+        users, splits, ended = (
+            self.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
+        )
+        goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
+        goes_on &= np.diff(numbers) == 1
+        first = np.concatenate([[True], ~goes_on])
+        return np.asarray(numbers[first][np.cumsum(first) - 1])
+
+    def _read_ids(self, column: str, numbers: IntArray) -> Array:
+        """Identifiers of the logs; the numbers themselves in a store without their table."""
+        path = self.path / _FILES[column]
+        return read_ids(path, column)[numbers] if path.exists() else numbers
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """Histogram of the episodes' returns on matplotlib axes."""
@@ -141,11 +187,7 @@ class EpisodeStore(EpisodeView):
     # Views.
 
     def select(self, episodes: IntArray) -> "EpisodeStore":
-        """A view of the episodes at the given positions of this view, in the given order.
-
-        Args:
-            episodes: positions, 0 to E − 1, of any number.
-        """
+        """A view of the episodes at the given positions of this view, in the given order."""
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
@@ -199,11 +241,7 @@ class EpisodeStore(EpisodeView):
         return self.with_returns_to_go(definition.of_logs(rewards, offsets), definition)
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
-        """A view of the same episodes without some dimensions of the observations.
-
-        Args:
-            dimensions: to remove, each 0 to O − 1.
-        """
+        """A view of the same episodes without some dimensions of the observations, 0 to O − 1."""
         rest = np.setdiff1d(np.arange(self.observation_size), dimensions)
         column = self._columns.step_column(schema.OBSERVATION).select_dimensions(rest)
         columns = self._columns.replace(schema.OBSERVATION, column, (len(rest),), None)
@@ -226,61 +264,6 @@ class EpisodeStore(EpisodeView):
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0)
         return mean.float(), variance.sqrt().float()
-
-
-def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:
-    return {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
-
-
-def store_frame(store: EpisodeStore) -> "pd.DataFrame":
-    """One row per step, session by session: `user_id`, `session_id` (the number of the session in
-    the store; one for all episodes of a session that a split boundary cuts), `item_id` or `action`,
-    the other columns of the log that the store has, and `split`.
-
-    Raises:
-        InputError: a file of the store is damaged.
-    """
-    import pandas as pd  # most stores are never shown
-
-    episodes, steps = store.all_steps()
-    columns: dict[str, Any] = {}
-    if store.has_users:
-        users = store.episode_values(schema.USER)[episodes]
-        columns[schema.USER_ID] = _named(store, schema.USER_ID, users)
-    columns[schema.SESSION_ID] = _sessions(store)[episodes]
-    if store.has_items:
-        items = store.step_values(schema.ITEM, episodes, steps)
-        columns[schema.ITEM_ID] = _named(store, schema.ITEM_ID, items)
-    for name in _PLAIN:
-        if name in store.record.columns:
-            columns[name] = store.step_values(name, episodes, steps)
-    for name in _LISTS:
-        if name in store.record.columns:
-            columns[name] = list(store.step_values(name, episodes, steps))
-    splits = store.episode_values(schema.SPLIT)[episodes]
-    columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
-    return pd.DataFrame(columns)
-
-
-def _sessions(store: EpisodeStore) -> IntArray:
-    """(E,) number of each episode's session, which is that of its first episode."""
-    numbers = store.episode_ids
-    has_ends = store._columns.has_episode_column(schema.TERMINATED)
-    if not (store.has_users and has_ends) or len(store) < 2:
-        return numbers
-    users, splits, ended = (
-        store.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
-    )
-    goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
-    goes_on &= np.diff(numbers) == 1
-    first = np.concatenate([[True], ~goes_on])
-    return np.asarray(numbers[first][np.cumsum(first) - 1])
-
-
-def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:
-    """Identifiers of the logs; the numbers themselves in a store without their table."""
-    path = store.path / _FILES[column]
-    return read_ids(path, column)[numbers] if path.exists() else numbers
 
 
 # Two stores.

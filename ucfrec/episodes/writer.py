@@ -79,23 +79,23 @@ class StoreWriter:
             return
         if self._n_steps == 0 and not first[0]:
             raise ValueError("the first step of a store must begin an episode")
-        starts, begin = np.flatnonzero(first), 0
-        while True:
+        starts, begin, end = np.flatnonzero(first), 0, 0
+        while begin < len(first):
             full = begin + self._shard_steps - self._steps_in_shard
-            next_start = int(np.searchsorted(starts, full))
-            if next_start == len(starts):
-                break
-            cut = int(starts[next_start])
-            self._append(*_rows(steps, first, episodes, slice(begin, cut)))
-            self._close_shard()
-            begin = cut
-        self._append(*_rows(steps, first, episodes, slice(begin, None)))
+            later = starts[np.searchsorted(starts, full) :]
+            end = int(later[0]) if len(later) else len(first)
+            rows = slice(begin, end)
+            self._append(
+                {name: values[rows] for name, values in steps.items()},
+                first[rows],
+                {name: values[rows] for name, values in episodes.items()},
+            )
+            if len(later):
+                self._close_shard()
+            begin = end
 
     def _append(
-        self,
-        steps: Mapping[str, Array],
-        first: BoolArray,
-        episodes: Mapping[str, Array],
+        self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
     ) -> None:
         starts = np.flatnonzero(first)
         for name, values in steps.items():
@@ -187,42 +187,19 @@ class StoreWriter:
         return record.seal(self._folder)
 
 
-def write_arrays(
-    path: Path,
-    steps: Mapping[str, Array],
-    lengths: IntArray,
-    episodes: Mapping[str, Array],
-    reward: str,
-    source: Mapping[str, Any],
-    shard_steps: int,
-) -> None:
-    """See `EpisodeStore.write`."""
-    lengths = require_steps(path, lengths)
-    first = np.zeros(int(np.sum(lengths)), dtype=bool)
-    first[np.cumsum(lengths) - lengths] = True
-    with atomic_folder(path) as scratch:
-        writer = StoreWriter(scratch, shard_steps)
-        writer.append(steps, first, {k: np.repeat(v, lengths) for k, v in episodes.items()})
-        writer.finish(reward=reward, source=source)
-
-
 def reward_bit(
     store: "EpisodeStore", flip: float = 0.0, seed: int = 0, early: bool = False
 ) -> Float32Array:
-    """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4).
+    """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4),
+    (n_steps,) float32, 0 or 1, in the order of `all_steps`.
 
     A reward is high if it exceeds the median of all rewards; if the median equals the largest
     reward (more than half of all steps are clicks), a reward is high if it equals the median. The
     paper's deterministic distractor has `flip` 0, the stochastic one 0.15.
 
     Args:
-        store: a store or a view of it.
-        flip: probability that a bit is inverted, in [0, 1].
         early: shift the bit one step ahead, d_t = I{r_{t+1} is high}; the last step of an episode,
             which has no next reward, uses its own reward.
-
-    Returns:
-        (n_steps,) float32, 0 or 1, in the order of `all_steps`.
 
     Raises:
         InputError: `flip` is not a probability, or all rewards are equal.
@@ -288,13 +265,7 @@ def logged_observations(store: "EpisodeStore") -> Float32Array:
 
 
 def require_steps(path: Path | str, lengths: Array) -> IntArray:
-    """Check that every episode has at least one step.
-
-    Args:
-        lengths: (E,) number of steps of each episode.
-
-    Returns:
-        `lengths` as an array.
+    """The numbers of steps (E,) of episodes as an array.
 
     Raises:
         InputError: an episode has no steps.
@@ -325,16 +296,6 @@ def require_finite(rewards: Array) -> None:
             f"{large} of {len(stored)} rewards are beyond ±{schema.LARGEST_REWARD:g}, too large to "
             "train with in float32; divide them"
         )
-
-
-def _rows(
-    steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array], rows: slice
-) -> tuple[dict[str, Array], BoolArray, dict[str, Array]]:
-    return (
-        {name: values[rows] for name, values in steps.items()},
-        first[rows],
-        {name: values[rows] for name, values in episodes.items()},
-    )
 
 
 class _NpyFile:

@@ -12,7 +12,7 @@ from ucfrec.acting import item_index
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.item_index import ItemIndex
 from ucfrec.commands.cli import main
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.runs.trained_policy import TrainedPolicy
 

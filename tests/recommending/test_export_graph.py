@@ -20,7 +20,7 @@ from tests.support.served import (
     responder,
     trained_run,
 )
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.export_graph import measure_magnitude, require_close
 from ucfrec.recommending.responder import ONNXRUNTIME, Responder

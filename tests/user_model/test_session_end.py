@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.session_end import (
     BoostedTrees,
     LoggedEnds,

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec.acting.scorer import Scorer
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 
 _FEWEST: Final = 1_000

@@ -18,10 +18,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import LIKED, least_liked, liked_rewards
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.logs.engine import bind, engine, explain_errors

@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import Liked, Ranker, Steps
 from ucfrec.policies.baselines import (

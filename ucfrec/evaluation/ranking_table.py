@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import Array
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import (

@@ -12,7 +12,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.long_sessions import LONG
+from ucfrec.episodes.store import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind

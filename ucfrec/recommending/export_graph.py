@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, one_line
 
 GRAPH: Final = "model.onnx"

@@ -25,7 +25,7 @@ from typing_extensions import TypedDict
 
 from ucfrec import schema
 from ucfrec.arrays import Array
-from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.recommending.histories import Histories

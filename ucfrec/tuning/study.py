@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker

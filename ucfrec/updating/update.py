@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.files.locks import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs

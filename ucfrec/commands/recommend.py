@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> None:
     files, mapping = logs_given(options, trained)
     rule, index = rule_given(options, trained), None
     if options.approximate:
-        from ucfrec.acting.item_index import ItemIndex
+        from ucfrec.recommending.recommend import ItemIndex
 
         index = ItemIndex(trained.item_scorer(rule), trained.name)
     with progress(None, "recommend", "users") as bar:

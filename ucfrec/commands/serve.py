@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import uvicorn
 
     from ucfrec.recommending.responder import Responder
-    from ucfrec.recommending.workers import Parent
+    from ucfrec.recommending.server import Parent
 _STOPPED: Final = "ucfrec serve: stopped"
 _LIMITS: Final = "ucfrec.recommending.web:ServerLimits"
 
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
         InputError: the run cannot be used or has no checksums, a file of it was changed, the extra
             `serve` is not installed, or the address cannot be listened on.
     """
-    from ucfrec.recommending.workers import MOST, Workers
+    from ucfrec.recommending.server import MOST, Workers
 
     if not 1 <= options.workers <= MOST:
         raise InputError(f"--workers is {options.workers}; give a number from 1 to {MOST}")
@@ -113,7 +113,7 @@ def _serve(
     """
     import torch
 
-    from ucfrec.recommending.served import Served, parse_split
+    from ucfrec.recommending.responder import Served, parse_split
     from ucfrec.recommending.server import server_config
     from ucfrec.recommending.web import ServerLimits, application
     from ucfrec.runs.record import RUN, verified

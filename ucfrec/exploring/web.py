@@ -5,9 +5,9 @@ from importlib.resources import files
 from typing import Final
 
 from fastapi import FastAPI, Request, Response
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from ucfrec.exploring.page import Explorer
-from ucfrec.recommending.server import AllowedHosts
 
 _HEADERS: Final = {
     "Content-Security-Policy": (
@@ -26,8 +26,7 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
         allowed_hosts: values of the header `Host` that are answered.
     """
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
-    remedy = "open the address that `ucfrec explore` printed"
-    app.add_middleware(AllowedHosts, allowed=allowed_hosts, remedy=remedy)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files("ucfrec.exploring").joinpath("explore.js").read_text(encoding="utf-8")
 
     def html(text: str) -> Response:

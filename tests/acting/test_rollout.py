@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from ucfrec.acting.rollout import Episodes, Step, Uniform, rollout
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
+from ucfrec.evaluation.evaluate import session_metrics
+from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.schema import FORBIDDEN
 
 

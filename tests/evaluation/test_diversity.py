@@ -29,8 +29,8 @@ from ucfrec.evaluation.diversity import (
     tag_jaccard,
     variety_columns,
 )
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views

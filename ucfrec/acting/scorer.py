@@ -368,16 +368,16 @@ class Scorer:
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
         span, steps = model.reward_high - model.reward_low, query.sessions.steps
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
-        rewards = model.expected(odds)
+        rewards = model.expect(odds)
         scores = scores + weight * rewards
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
         some, recent = rewards.gather(1, best), recent.latest(model.lags)
         if end.uses_rewards and self._outcomes is not None:
             outcomes = [torch.full_like(some, reward) for reward in self._outcomes]
-            low, high = end.of_items(recent, best, outcomes, steps)
+            low, high = end.score_items(recent, best, outcomes, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
-            (ends,) = end.of_items(recent, best, [some], steps)
+            (ends,) = end.score_items(recent, best, [some], steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)
@@ -578,7 +578,7 @@ class _ItemProduct:
             else:
                 yield self._tags.to_candidates(profile, items) > 0
         if rule.tag_run:
-            tired = self._main_tags.tired(recent, rule.tag_run).unsqueeze(1)
+            tired = self._main_tags.find_tired(recent, rule.tag_run).unsqueeze(1)
             main = self._main_tags.tags
             yield ((main if items is None else main[items]) == tired) & (tired >= 0)
 

@@ -18,8 +18,8 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
-from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
+from ucfrec.logs.rows import choose_rows
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -99,7 +99,7 @@ class Histories:
         if not (np.abs(rewards) <= schema.LARGEST_REWARD).all():
             return None
         table |= {schema.REWARD: rewards, "row": np.arange(len(frame))}
-        order = kept_in_order(table, duplicates)
+        order = choose_rows(table, duplicates)
         table = {name: values[order] for name, values in table.items()}
         users, items = table["user"], table[schema.ITEM]
         same_user = users[1:] == users[:-1]

@@ -32,11 +32,10 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import bind, explained
-from ucfrec.logs.engine import engine_in_memory
+from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
-from ucfrec.logs.kept import DAY_MS, kept_in_order
+from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.logs.tables import is_number
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.later_logs import reward_of
@@ -287,7 +286,7 @@ class RowRewards:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
             try:
-                with explained(connection, (table,), source):
+                with explain_errors(connection, (table,), source):
                     sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
                     query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
                     values = [row[0] for row in connection.sql(query).fetchall()]
@@ -380,7 +379,7 @@ class HistoryReader:
             if {*map(len, observed)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
-        order = kept_in_order(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
+        order = choose_rows(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
         observations = self._read_observation(rows, order[-1:])
         seen = pd.unique(items)
         return Histories(

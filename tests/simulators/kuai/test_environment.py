@@ -22,9 +22,8 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import _item_numbers
-from ucfrec.evaluation.simulator import Simulator
+from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import repeat_action

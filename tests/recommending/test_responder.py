@@ -380,17 +380,19 @@ def test_a_damaged_pointer_file_is_told_of_once_and_followed_again(
     whole = pointer.read_bytes()
     with closing(Served(make, folder, None)) as served:
         served.follow(0.01)
-        pointer.unlink()
         if damage == "folder":
+            pointer.unlink()
             pointer.mkdir()
-        else:
-            pointer.write_text(damage)
+        else:  # whole at once, as the thread may look at any moment
+            (folder / "damaged").write_text(damage)
+            (folder / "damaged").replace(pointer)
         time.sleep(0.3)
         assert served.described()["refused"]["name"] == POINTER
         answers_of(served)
         if damage == "folder":
             pointer.rmdir()
-        pointer.write_bytes(whole)
+        (folder / "whole").write_bytes(whole)
+        (folder / "whole").replace(pointer)
         promote(folder / "other", force=True)
         deadline = time.monotonic() + 60
         while served.described()["name"] != "other" and time.monotonic() < deadline:

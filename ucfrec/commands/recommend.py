@@ -117,7 +117,7 @@ class Recommend(LogAnswerOptions, LogOptions, RunArgument):
             print(f"{origin(self.out)}: {rows:,} rows")
             return
         if self.approximate:
-            from ucfrec.acting.item_index import ItemIndex
+            from ucfrec.recommending.recommend import ItemIndex
 
             index = ItemIndex(trained.item_scorer(rule), trained.name)
         with progress(None, "recommend", "users") as bar:

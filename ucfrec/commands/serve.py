@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import uvicorn
 
     from ucfrec.recommending.responder import Responder
-    from ucfrec.recommending.workers import Parent
+    from ucfrec.recommending.server import Parent
 _STOPPED: Final = "ucfrec serve: stopped"
 _OWN_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 
@@ -69,7 +69,7 @@ class Serve(ServerOptions, AnswerOptions):
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.workers import MOST, Workers
+        from ucfrec.recommending.server import MOST, Workers
 
         if not 1 <= self.workers <= MOST:
             raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
@@ -100,7 +100,7 @@ class Serve(ServerOptions, AnswerOptions):
         """
         import torch
 
-        from ucfrec.recommending.served import Served, parse_split
+        from ucfrec.recommending.responder import Served, parse_split
         from ucfrec.recommending.server import server_config
         from ucfrec.recommending.web import ServerLimits, application
         from ucfrec.runs.record import RUN, verified

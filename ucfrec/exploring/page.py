@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 from fastapi import FastAPI, Request, Response
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -21,7 +22,6 @@ from ucfrec.files.record import CARD
 from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
-from ucfrec.recommending.server import AllowedHosts
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
 from ucfrec.reporting.results import find_quoted, read_evidence
@@ -281,8 +281,7 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
         allowed_hosts: values of the header `Host` that are answered.
     """
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
-    remedy = "open the address that `ucfrec explore` printed"
-    app.add_middleware(AllowedHosts, allowed=allowed_hosts, remedy=remedy)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
 
     def html(text: str) -> Response:

@@ -50,8 +50,7 @@ from ucfrec.python_api.given_data import (
 )
 from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
-from ucfrec.recommending.recommend import recommend
-from ucfrec.recommending.similar import similar_items
+from ucfrec.recommending.recommend import recommend, similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report

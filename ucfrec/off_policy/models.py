@@ -222,8 +222,7 @@ def fit_behavior(
         states: reads what was known before each step.
         item: (N,) logged items; −1, unknown, gets probability 1 and is fitted on nowhere.
         group: (N,) their groups, from 0.
-        session: (N,) number of each step's session, from 0.
-        user: (S,) of each session; None where each is of another user.
+        session: (N,) as of `LoggedSteps`, as is `user`.
     """
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
@@ -403,13 +402,13 @@ def fit_models(
     that saw it, nor by one that saw another session of its user.
 
     Args:
-        reward: (N,).
-        session: (N,) number of each step's session, from 0, never falling; steps in order.
-        user: (S,) whose session each is; None where each is of another user.
-        discount: γ of Q.
+        reward: (N,) as of `LoggedSteps`, as are `session`, `user` and `discount`.
 
     Returns:
-        What the models say of the N steps, and how good they are; an `InputError` with one user.
+        What the models say of the N steps, and how good they are.
+
+    Raises:
+        InputError: there is one user.
     """
     sessions = np.arange(int(session[-1]) + 1)
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]

@@ -42,7 +42,7 @@ class Standing:
     probability_best: float
     """Share of resamples in which no other candidate has a larger value."""
     rank: int
-    """From 1, by value."""
+    """From 1."""
 
 
 @dataclass(frozen=True)
@@ -110,19 +110,15 @@ def select(
     # What the first of each resample is worth there, beyond its worth in the whole sample.
     luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
     first = int(np.argmax(value))
-    corrected = float(value[first] - max(luck, 0.0))
-    return Selection(tuple(standings), corrected, _find_regret(terms, first, seed, user))
-
-
-def _find_regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
-    """Upper end of how much better than the first any other may be."""
-    lead = np.delete(terms, first, axis=1) - terms[:, [first]]
-    if not lead.shape[1]:
-        return 0.0
-    resamples = resample(lead, np.ones_like(lead), user, seed)
-    upper = resamples.value + _critical(-_studentise(resamples)) * resamples.error
-    # Candidates that never differ are neither better nor worse.
-    return float(upper[resamples.spreads].max(initial=0.0))
+    corrected, regret = float(value[first] - max(luck, 0.0)), 0.0
+    if len(names) > 1:
+        # Upper end of how much better than the first any other may be.
+        lead = np.delete(terms, first, axis=1) - terms[:, [first]]
+        leads = resample(lead, np.ones_like(lead), user, seed)
+        upper = leads.value + _critical(-_studentise(leads)) * leads.error
+        # Candidates that never differ are neither better nor worse.
+        regret = float(upper[leads.spreads].max(initial=0.0))
+    return Selection(tuple(standings), corrected, regret)
 
 
 def _studentise(resamples: Resamples) -> Float64Array:
@@ -149,9 +145,9 @@ class Choice:
     @property
     def headline(self) -> str:
         """Which candidate to take, or that the logs do not show it."""
-        if self.selection is None:
-            return "The logs allow no conclusion on any of the candidates"
-        return self.selection.headline
+        if self.selection is not None:
+            return self.selection.headline
+        return "The logs allow no conclusion on any of the candidates"
 
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
@@ -203,13 +199,9 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
 
 
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
-    """Names that say what differs among the candidates, e.g. "target return 5, greedy".
-
-    Candidates that differ have different names: numbers have the digits that distinguish them.
-
-    Args:
-        candidates: of each, what it is made of, e.g. run, target return and rule.
-    """
+    """Names that say what differs among candidates, of what each is made of, e.g. "target return 5,
+    greedy". Candidates that differ have different names: numbers have the digits that distinguish
+    them."""
     differing = [
         key for key in candidates[0] if len({str(parts[key]) for parts in candidates}) > 1
     ] or list(candidates[0])[:1]

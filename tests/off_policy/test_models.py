@@ -37,8 +37,7 @@ def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
 
 def inputs_of(steps: int, seed: int) -> StepInputs:
     generator = torch.Generator().manual_seed(seed)
-    parts = [torch.randn(steps, size, generator=generator) for size in (20, 4, 4, 2)]
-    return StepInputs(parts[0], 15, *parts[1:])
+    return StepInputs(*(torch.randn(steps, size, generator=generator) for size in (15, 5, 4, 4, 2)))
 
 
 def test_a_file_gives_back_what_was_written(
@@ -72,12 +71,11 @@ def test_context_is_the_state_the_return_left_and_the_window(
             steps = np.arange(step)
             values = logged.store.step_values("reward", np.full(step, episode), steps)
             earned[row] = float(values.sum())
-        left = seen[-1].context[:, seen[-1].state_size]
+        left = seen[-1].window[:, 0]
         torch.testing.assert_close(left, target - earned, atol=1e-4, rtol=1e-4)
-    size = seen[0].state_size
-    torch.testing.assert_close(seen[0].context[:, :size], seen[1].context[:, :size])
-    assert seen[0].context.shape[1] == size + 1 + trained.policy.config.dim
-    assert not torch.allclose(seen[0].context[:, size + 1 :], seen[1].context[:, size + 1 :])
+    torch.testing.assert_close(seen[0].states, seen[1].states)
+    assert seen[0].window.shape[1] == 1 + trained.policy.config.dim
+    assert not torch.allclose(seen[0].window[:, 1:], seen[1].window[:, 1:])
 
 
 def test_features_are_those_that_the_scores_are_made_from(

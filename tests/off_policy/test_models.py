@@ -11,7 +11,6 @@ import torch
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
-from ucfrec.logs import LogMapping
 from ucfrec.off_policy import LoggedSteps, estimate
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.off_policy.models import (
@@ -25,14 +24,8 @@ from ucfrec.off_policy.models import (
     group_items,
     make_inputs,
 )
-from ucfrec.off_policy.score import LoggedSessions, read_logged_sessions, score_steps
+from ucfrec.off_policy.score import LoggedSessions, score_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-
-@pytest.fixture
-def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
-        yield logged
 
 
 def inputs_of(steps: int, seed: int) -> StepInputs:

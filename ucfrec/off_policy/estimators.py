@@ -16,7 +16,7 @@ whole session, E_n the mean over sessions.
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
-| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.pages` |
+| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.logged_steps` |
 | SNIIPS | the same with ρ_it over its mean at position t | |
 
 Estimators that shrink large weights take a little bias for much less variance. Each is

@@ -43,8 +43,7 @@ from ucfrec.off_policy.verdict import (
     list_cautions,
 )
 from ucfrec.provenance import config_hash, provenance, shorten_paths
-from ucfrec.results.row import ResultRow, Scalar
-from ucfrec.results.table import ResultTable
+from ucfrec.results.rows import ResultRow, ResultTable, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 
@@ -57,7 +56,7 @@ class EstimateOptions:
     """Discount factor γ of the estimated returns."""
     pages: bool = False
     """Estimate the return of a page: sessions of one step, of one user within 10 ms, are the
-    positions of a page (`ucfrec.off_policy.pages`)."""
+    positions of a page (`ucfrec.off_policy.logged_steps`)."""
     users_known: bool = True
     """Whether the logs' users are persons, whose sessions are resampled together; if not, each
     session is taken to be of another user."""
@@ -273,7 +272,7 @@ def make_report(
 ) -> OffPolicyReport:
     """Estimate from logged steps, judge the estimates, and make their result rows.
 
-    `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the mean
+    `R_cum` is the mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean
     reward of a step; a row may have no interval.
     """
     steps, per_step = evidence.steps, evidence.per_step

@@ -23,7 +23,7 @@ from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.parquet import part_name, require_regular, write_frames
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark_users import GivenLog, by_users
+from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.off_policy.estimators import StepSums, normalise_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, Evidence, OffPolicyReport, make_report
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -256,11 +256,11 @@ def score_with_spark(
     require_items(trained)
     columns, options = training_options(trained, mapping)
     assert options.reward is not None
-    log = GivenLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
+    log = UserLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
         run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
         score_part = partial(_score_part, run, folder.absolute(), memory_limit, rule, filter_seen)
-        sessions = by_users(log, folder.parent, master, score_part)
+        sessions = map_users(log, folder.parent, master, score_part)
         number_sessions(folder, sessions)
     return sum(sessions)
 
@@ -276,7 +276,7 @@ def _score_part(
     mapping: LogMapping,
 ) -> int:
     """Write the file of a part, with sessions numbered from 0; returns their number. A worker calls
-    it (`ucfrec.logs.spark_users.Work`)."""
+    it (`ucfrec.logs.spark.Work`)."""
     trained = run.load()
     _, options = training_options(trained, mapping, memory_limit)
     options = replace(options, reward=schema.REWARD)

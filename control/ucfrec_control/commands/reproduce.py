@@ -1,11 +1,11 @@
 """`ucfrec-control reproduce`: one table or figure of the paper; resumes."""
 
-import argparse
+from typing import Annotated
 
 from ucfrec.benchmark.cells import Cell
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
-from ucfrec.results.rows_file import latest, read_rows
+from ucfrec.results.rows import latest, read_rows
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.reproduce import (
@@ -15,66 +15,49 @@ from ucfrec_control.benchmark.reproduce import (
     rows_of_part,
 )
 from ucfrec_control.commands.benchmark import print_scores
-from ucfrec_control.commands.options import (
-    BUDGETS,
-    context_option,
-    control_grid_options,
-    data_given,
-    data_option,
-    narrow_budget,
-)
+from ucfrec_control.commands.options import ControlGridOptions
 from ucfrec_control.commands.robustness import print_robustness
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `reproduce`."""
-    parser.add_argument("part", choices=list(PARTS), help="table or figure of the paper")
-    data_option(parser)
-    parser.add_argument("--budget", default="small", choices=list(BUDGETS))
-    parser.add_argument(
-        "--seeds",
-        dest="training_seeds",
-        type=int,
-        help="number of training seeds (default: set by --budget)",
-    )
-    context_option(parser)
-    control_grid_options(parser, budget=False)
-    parser.set_defaults(tasks=[], evaluation_seed=None)
+class Reproduce(ControlGridOptions):
+    """`ucfrec-control reproduce`."""
 
+    part: Annotated[str, ARGUMENT, Names(lambda: tuple(PARTS), closed=True)]
+    """Table or figure of the paper."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control reproduce`."""
-    # matplotlib takes half a second to import
-    from ucfrec_control.figures.figures import make_figures, make_row_figures
+    def execute(self) -> None:
+        """Run `ucfrec-control reproduce`."""
+        # matplotlib takes half a second to import
+        from ucfrec_control.figures.figures import make_figures, make_row_figures
 
-    part, results = PARTS[options.part], results_given(options)
-    if options.show_only and part.of_runs:
-        raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
-    robust = part.table == ROBUSTNESS
-    budget = narrow_budget(budget_of_part(part, options.budget), options)
-    cells: list[Cell] = []
-    if options.show_only:
-        rows = rows_of_part(part, latest(read_rows(results)), options.budget)
-        if not rows:
-            raise InputError(
-                f"{results} has no rows of {options.part} with budget {options.budget}; name a "
-                "file that has them with --results"
-            )
-    else:
-        cells += cells_of_part(part, data_given(options), options.out, budget)
-        how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
-        rows = rows_of(options, "", (), lambda: cells, how, f"reproduce {options.part}")
-    pictures = options.out / options.part
-    with rows_explained(options):
-        if robust:
-            print_robustness(rows)
+        part, results = PARTS[self.part], self.rows_file
+        if self.show_only and part.of_runs:
+            raise InputError(f"{self.part} is drawn from its runs; leave --show-only out")
+        robust = part.table == ROBUSTNESS
+        budget = self.narrow_budget(budget_of_part(part, self.budget))
+        cells: list[Cell] = []
+        if self.show_only:
+            rows = rows_of_part(part, latest(read_rows(results)), self.budget)
+            if not rows:
+                raise InputError(
+                    f"{results} has no rows of {self.part} with budget {self.budget}; name a "
+                    "file that has them with --results"
+                )
         else:
-            print_scores(rows, part.table)
-        if part.of_runs:
-            files, _ = make_figures(
-                [cell.run for cell in cells if cell.run is not None], [], pictures
-            )
-        else:
-            files = make_row_figures(rows, pictures)
-    print("\n".join(["", *map(str, files)]))
-    print(f"\nrows: {results}")
+            cells += cells_of_part(part, self.require_data(), self.out, budget)
+            how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
+            rows = self.make_rows("", (), lambda: cells, how, f"reproduce {self.part}")
+        pictures = self.out / self.part
+        with self.explain_rows():
+            if robust:
+                print_robustness(rows)
+            else:
+                print_scores(rows, part.table)
+            if part.of_runs:
+                files, _ = make_figures(
+                    [cell.run for cell in cells if cell.run is not None], [], pictures
+                )
+            else:
+                files = make_row_figures(rows, pictures)
+        print("\n".join(["", *map(str, files)]))
+        print(f"\nrows: {results}")

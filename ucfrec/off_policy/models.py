@@ -12,7 +12,6 @@ from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.off_policy.score import ScoredSteps
 from ucfrec.processes import require_blas_memory
@@ -191,10 +190,6 @@ class BehaviorModel:
     calibration_error: float
     """Mean absolute difference between what is predicted and what occurs, over groups and tenths
     of the predicted probability, weighted by their steps."""
-    temperature: float
-    """Scores are divided by it."""
-    share: float
-    """How much of the group's share in the logs is mixed in."""
 
     def __str__(self) -> str:
         return (
@@ -263,8 +258,6 @@ def fit_behavior(
         log_loss=float(-np.log(of_group[in_catalogue]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
         calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
-        temperature=calibration[0],
-        share=calibration[1],
     )
 
 
@@ -393,23 +386,18 @@ def fit_models(
     user: IntArray | None = None,
     discount: float = 1.0,
 ) -> tuple[Modelled, ModelReport]:
-    """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
-    that saw it, nor by one that saw another session of its user.
+    """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
+    by a model that saw it, nor by one that saw another session of its user.
 
     Args:
         reward: (N,) as of `LoggedSteps`, as are `session`, `user` and `discount`.
 
     Returns:
         What the models say of the N steps, and how good they are.
-
-    Raises:
-        InputError: there is one user.
     """
     sessions = np.arange(int(session[-1]) + 1)
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]
     users = int(group.max()) + 1
-    if users < 2:
-        raise InputError("a model needs sessions of users other than the one it predicts")
     fold_of = np.random.default_rng(seed).permutation(users) % min(_RETURN_FOLDS, users)
     folds = fold_of[group][session]
     last = np.diff(session, append=len(sessions)) > 0

@@ -182,7 +182,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
 
 
 def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> WeightTest:
-    """One test that weights (N,) of users (N,) have mean 1: within three standard errors."""
+    """Test that weights (N,) of users (N,) have mean 1, within three standard errors."""
     mean, error = cluster_mean(weights, user)
     return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.score import LoggedSessions
-    from ucfrec.off_policy.selection import Choice
+    from ucfrec.off_policy.selection import Selection
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -208,12 +208,12 @@ def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object
     return format_rows(lines, columns)
 
 
-def _describe_choice(choice: "Choice") -> str:
+def _describe_choice(choice: "Selection") -> str:
     """The candidates in order, and which comes first."""
     from ucfrec.reporting.tables import text_table
 
     lines = []
-    if choice.selection is not None:
+    if choice.standings:
         rows = [
             (
                 standing.name,
@@ -221,7 +221,7 @@ def _describe_choice(choice: "Choice") -> str:
                 f"{standing.probability_best:.2f}",
                 str(standing.rank),
             )
-            for standing in choice.selection.standings
+            for standing in choice.standings
         ]
         lines.append("\nvalue per session, with a 95% band that holds all of them at once:")
         lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))

@@ -2,8 +2,8 @@
 policy."""
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -22,7 +22,6 @@ from ucfrec.files.remote import origin
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.off_policy.selection import Choice
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.row import ResultRow
@@ -71,6 +70,7 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
 
     def execute(self) -> None:
         """Print the estimates and the verdict of every candidate."""
+        from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy import evaluate
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
@@ -91,70 +91,49 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         # On the test split, the weights that have not learned from it.
         policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
+        parts = ("run", "target return", "temperature")
         names = names_of(
             [
-                {
-                    "run": str(policy.folder),
-                    "target return": rule.target,
-                    "temperature": rule.temperature,
-                }
-                for policy, rules in candidates
+                dict(zip(parts, (str(p.folder), rule.target, rule.temperature), strict=True))
+                for p, rules in candidates
                 for rule in rules
             ]
         )
         reports: dict[str, OffPolicyReport] = {}
         for policy, rules in candidates:
-            with self._read_logs(logs, policy) as logged:
+            reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+            with nullcontext() if self.scored else reading as logged:
+                if logged is not None and logs:
+                    print(format_summary(logged.report))
+                elif logged is not None:
+                    store = logged.store
+                    sizes = f"{store.n_episodes:,} sessions, {store.n_steps:,} steps"
+                    print(f"test split of {store.path}: {sizes}")
                 for rule in rules:
                     name = names[len(reports)]
                     if len(names) > 1:
                         print(f"\n{name}:")
                     reports[name] = estimate_return(
                         (policy, rule),
-                        logged,
+                        [Path(log) for log in logs] if logged is None else logged,
                         logs or [TEST_SPLIT],
                         options=options,
                         seed=self.seed,
                         checkpoint=self.checkpoint,
                     )
                     print(_describe(reports[name]))
-        choice = choose(reports, self.seed) if len(reports) > 1 else None
-        if choice is not None:
+        columns: dict[str, dict[str, object]] = {name: {"candidate": name} for name in reports}
+        if len(reports) > 1:
+            choice = choose(reports, self.seed)
             print(_describe_choice(choice))
+            columns = {name: {"candidate": name, **choice.columns(name)} for name in reports}
         if self.json is not None:
             rows = [
-                row.extended(
-                    {"candidate": name, **({} if choice is None else choice.columns(name))}
-                )
+                row.extended(columns[name])
                 for name, report in reports.items()
                 for row in (*report.rows, *report.step_rows)
             ]
             write_results(self.json, rows)
-
-    @contextmanager
-    def _read_logs(
-        self, logs: list[str], trained: "TrainedPolicy"
-    ) -> "Iterator[LoggedSessions | Sequence[Path]]":
-        """What the policy is evaluated on: the logs, or else the test split of its store."""
-        from ucfrec.logs.summary import format_summary
-        from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
-
-        if self.scored:
-            yield [Path(log) for log in logs]
-        elif logs:
-            files, mapping = self.find_logs(logs, trained, [self.json])
-            limit = self.memory_limit
-            with read_logged_sessions(trained, files, mapping, True, limit) as logged:
-                print(format_summary(logged.report))
-                yield logged
-        else:
-            logged = held_out_sessions([trained])
-            store = logged.store
-            print(
-                f"test split of {store.path}: {store.n_episodes:,} sessions, "
-                f"{store.n_steps:,} steps"
-            )
-            yield logged
 
     def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":
         """The different rules to evaluate: the run's own with the parts that the options name.
@@ -167,13 +146,13 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         targets, temperatures = [base.target], [base.temperature]
         if self.targets is not None:
             targets = [_read_target(part.strip(), trained) for part in self.targets.split(",")]
-        if self.temperatures is not None:
-            try:
+        try:
+            if self.temperatures is not None:
                 temperatures = [float(part) for part in self.temperatures.split(",")]
-            except ValueError:
-                raise InputError(
-                    f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
-                ) from None
+        except ValueError:
+            raise InputError(
+                f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
+            ) from None
         rules = [
             replace(base, target=target, temperature=temperature)
             for target in targets
@@ -271,15 +250,15 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
         """Write the policy's probability of every logged choice as Parquet."""
         from ucfrec.files.parquet import write_frames
         from ucfrec.logs.summary import format_report
-        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, read_logged_sessions, score
+        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         trained = TrainedPolicy.load(self.run, self.checkpoint)
-        files, mapping = self.find_logs(self.logs, trained, [self.out])
-        rule, limit = self.make_rule(trained), self.memory_limit
+        rule = self.make_rule(trained)
         if (master := self.find_spark()) is not None:
             from ucfrec.off_policy.spark import score_with_spark
 
+            files, mapping = self.find_logs(self.logs, trained, [self.out])
             sessions = score_with_spark(
                 trained,
                 files,
@@ -289,11 +268,11 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
                 checkpoint=self.checkpoint,
                 rule=rule,
                 filter_seen=self.filter_seen,
-                memory_limit=limit,
+                memory_limit=self.memory_limit,
             )
             print(f"{origin(self.out)}: {sessions:,} sessions")
             return
-        with read_logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
+        with self.read_sessions([trained], self.logs, self.out) as logged:
             print(format_report(logged.report))
             frames = score(trained, logged, rule, self.filter_seen)
             unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}

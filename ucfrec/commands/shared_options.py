@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.environment import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -101,6 +102,26 @@ class LogOptions(Table):
             inputs += [trained.folder / name for name in names]
         require_other_files((path for path in outputs if path is not None), inputs)
         return files, mapping
+
+    @contextmanager
+    def read_sessions(
+        self,
+        policies: "Sequence[TrainedPolicy]",
+        logs: Sequence[str],
+        output: Path | None,
+        keep_unknown: bool = False,
+    ) -> "Iterator[LoggedSessions]":
+        """Sessions of logs, read as the first policy was trained; those of the test split of the
+        policies' store if no logs are named."""
+        from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
+
+        if not logs:
+            yield held_out_sessions(policies)
+            return
+        files, mapping = self.find_logs(logs, policies[0], [output])
+        limit = self.memory_limit
+        with read_logged_sessions(policies[0], files, mapping, keep_unknown, limit) as logged:
+            yield logged
 
 
 class SparkOption(Table):

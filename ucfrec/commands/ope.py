@@ -78,10 +78,10 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
-        given = settings_given(self, evaluate.EstimateOptions)
+        settings = settings_given(self, evaluate.EstimateOptions)
         if self.lift is not None:
-            given["wanted_lift"] = self.lift
-        options = evaluate.EstimateOptions(users_known=not self.anonymous, **given)
+            settings["wanted_lift"] = self.lift
+        options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
         if self.scored and not logs:
             raise InputError("--scored needs what ucfrec score wrote; name it after the run")
         if self.scored and self.filter_seen:

@@ -199,9 +199,9 @@ def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     for cls in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
         if not isinstance(cls, ast.ClassDef):
             continue
-        for line, after in zip_longest(cls.body, cls.body[1:]):
+        for line, next_line in zip_longest(cls.body, cls.body[1:]):
             if isinstance(line, ast.AnnAssign):
-                text = ast.literal_eval(after.value) if isinstance(after, ast.Expr) else ""
+                text = ast.literal_eval(next_line.value) if isinstance(next_line, ast.Expr) else ""
                 default = "" if line.value is None else ast.unparse(line.value)
                 default = "" if default in ("None", "False") else default.strip("'")
                 texts[f"{cls.name}.{ast.unparse(line.target)}"] = " ".join(text.split()), default

@@ -352,17 +352,14 @@ class Recommender:
             seed: of the bootstrap over users and of the random baseline.
         """
         beside = require_list("others", others, "a Recommender", Recommender)
-        trained, *rest = (policy._load_for(logs) for policy in (self, *beside))
-        require_one_catalogue([trained, *rest])
-        candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
-        with (
-            read_logs(trained, logs, mapping, keep_unknown=False) as logged,
-            use_words_of_python(),
-        ):
+        policies = [policy._load_for(logs) for policy in (self, *beside)]
+        require_one_catalogue(policies)
+        rules = [rule or policies[0].rule, *(policy.rule for policy in policies[1:])]
+        with read_logs(policies[0], logs, mapping, keep_unknown=False) as logged:
             return rank_policies(
-                candidates,
+                list(zip(policies, rules, strict=True)),
                 logged,
-                _named(logs),
+                _name_logs(logs),
                 k=k,
                 filter_seen=filter_seen,
                 liked=liked,
@@ -395,7 +392,7 @@ class Recommender:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
-                [_named(logs)],
+                [_name_logs(logs)],
                 options=options,
                 seed=seed,
                 checkpoint="best",
@@ -482,8 +479,8 @@ class Recommender:
         """
         window = None if window_days is None else round(window_days * DAY_MS)
         options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
-        given = open_files(self.trained, logs, mapping)
-        with given as (files, columns, frame), use_words_of_python(frame):
+        opened = open_files(self.trained, logs, mapping)
+        with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)
         write_card(Path(out))
         return self.load(out)
@@ -519,19 +516,17 @@ class Recommender:
             The file.
         """
         what = "what evaluate or ope returned, or files of it"
-        kinds = (Evaluation, OffPolicyReport, Path, str)
-        listed = [results] if isinstance(results, ResultTable) else results
-        given: list[ResultTable | Path | str] = require_list("results", listed, what, *kinds)
-        with tempfile.TemporaryDirectory() as scratch:
+        tables = [results] if isinstance(results, ResultTable) else results
+        tables = require_list("results", tables, what, Evaluation, OffPolicyReport, Path, str)
+        with tempfile.TemporaryDirectory() as scratch, use_words_of_python():
             files = []
-            for number, result in enumerate(given):
+            for number, result in enumerate(tables):
                 if isinstance(result, ResultTable):
                     files.append(Path(scratch) / f"{number}.json")
                     result.save(files[-1])
                 else:
                     files.append(Path(result))
-            with use_words_of_python():
-                write_report(Path(file), [self.run], files, None if items is None else Path(items))
+            write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
     @_checked
@@ -549,7 +544,7 @@ class Recommender:
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
-        policy.settings = _changed(config)
+        policy.settings = _list_changes(config)
         return policy
 
 
@@ -557,7 +552,7 @@ UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
-def _changed(config: Config) -> dict[str, Any]:
+def _list_changes(config: Config) -> dict[str, Any]:
     """The settings `table.field` of a configuration that are not the defaults of its policy."""
     defaults = asdict(resolve_config(config.policy_name))
     return {
@@ -568,12 +563,12 @@ def _changed(config: Config) -> dict[str, Any]:
     }
 
 
-def _named(logs: Logs | None) -> str:
+def _name_logs(logs: Logs | None) -> str:
     """What a model card calls the logs that a measurement is on."""
     if logs is None:
         return TEST_SPLIT
     if isinstance(logs, pd.DataFrame):
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
-    listed = [files] if isinstance(files, (str, Path)) else files
-    return ", ".join(shorten_paths(str(file)) for file in listed)
+    paths = [files] if isinstance(files, (str, Path)) else files
+    return ", ".join(shorten_paths(str(path)) for path in paths)

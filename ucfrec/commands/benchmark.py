@@ -52,9 +52,6 @@ class GridOptions(Table):
 
         Args:
             tables: tables of the suite; empty for all.
-
-        Raises:
-            InputError: the file has no such row, or a line of it is not a result row.
         """
         rows = [row for row in latest(read_rows(self.rows_file)) if row.suite == suite]
         if rows := [row for row in rows if not tables or row.table in tables]:

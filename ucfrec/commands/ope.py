@@ -136,12 +136,7 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
             write_results(self.json, rows)
 
     def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":
-        """The different rules to evaluate: the run's own with the parts that the options name.
-
-        Raises:
-            InputError: one of --targets is neither a number nor a quantile, or a temperature is no
-                number.
-        """
+        """The different rules to evaluate: the run's own with the parts that the options name."""
         base = self.make_rule(trained)
         targets, temperatures = [base.target], [base.temperature]
         if self.targets is not None:

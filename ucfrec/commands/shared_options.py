@@ -71,10 +71,6 @@ class LogOptions(Table):
         Args:
             trained: policy that the logs are for, which remembers the dataset of its training logs.
             outputs: files that the command writes.
-
-        Raises:
-            InputError: a file is missing, or would be replaced by an output; or the dataset, a
-                --column or the mapping file is unusable.
         """
         from ucfrec.logs.expressions import Expression
         from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
@@ -135,11 +131,7 @@ class SparkOption(Table):
     every worker sees them (default: local[*], this machine)"""
 
     def find_spark(self) -> str | None:
-        """Spark's master, if it is the engine; otherwise None.
-
-        Raises:
-            InputError: there is a master, but another engine.
-        """
+        """Spark's master, if it is the engine; otherwise None."""
         if self.engine == "spark":
             return self.spark_master or "local[*]"
         if self.spark_master:
@@ -178,11 +170,7 @@ class RuleOptions(Table):
     tag_run: Annotated[int | None, "N"] = None
 
     def make_rule(self, trained: "TrainedPolicy") -> "DecisionRule":
-        """The run's decision rule with the parts that the command line names.
-
-        Raises:
-            InputError: a value is out of range.
-        """
+        """The run's decision rule with the parts that the command line names."""
         from ucfrec.acting.decision import DecisionRule
 
         parts = settings_given(self, DecisionRule)
@@ -215,11 +203,7 @@ class AnswerOptions(RuleOptions):
     max_candidates: Annotated[int | None, "N"] = None
 
     def make_responder(self, trained: "TrainedPolicy") -> "Responder":
-        """What answers requests.
-
-        Raises:
-            InputError: a value is out of range, or the policy's actions are vectors.
-        """
+        """What answers requests."""
         from ucfrec.recommending.requests import Limits
         from ucfrec.recommending.responder import Responder
 
@@ -270,11 +254,7 @@ class EnvironmentOptions(Table):
 
 
 def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The run folders among files, and the other files.
-
-    Raises:
-        InputError: there is no run.
-    """
+    """The run folders among files, and the other files."""
     from ucfrec.runs.record import RUN
 
     paths = list(dict.fromkeys(map(Path, words)))
@@ -285,11 +265,7 @@ def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
 
 
 def read_duration(option: str, text: str) -> int:
-    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`.
-
-    Raises:
-        InputError: it is written otherwise, or is 0.
-    """
+    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", text.strip())
     milliseconds = 0 if match is None else round(float(match[1]) * _UNITS_MS[match[2]])
     if not milliseconds:

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, SEED, Table
+from ucfrec.commands.options import ARGUMENT, SEED, Group, Table
 from ucfrec.commands.shared_options import EnvironmentOptions
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
@@ -17,6 +17,8 @@ from ucfrec.results.rows_file import benchmarking, latest, read_rows
 if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell, Measurement
     from ucfrec.benchmark.suite import Benchmark as Suite
+
+_LOGS = Group("logs and seeds")
 
 
 class GridOptions(Table):
@@ -89,24 +91,7 @@ class GridOptions(Table):
             return run_grid(list_cells(), how, file, self.workers, describe, self.again)
 
 
-class LoggedOptions(EnvironmentOptions):
-    """The logs and seeds of a benchmark."""
-
-    title = "logs and seeds"
-
-    logs: Annotated[int | None, "N"] = None
-    """Logs of each task; simulated with N seeds, or N parts of a given log, 1 for all of it
-    (default: set by --budget)"""
-    log_seed: int = 0
-    """Seed of the first simulated log; the others follow it."""
-    training_seeds: Annotated[int | None, "N"] = None
-    """Training seeds of every method, from 0 (default: set by --budget)"""
-    evaluation_seed: Annotated[int | None, SEED, "SEED"] = None
-    """Seed of the evaluated episodes; the same for every training seed (default: set by
-    --budget)"""
-
-
-class Benchmark(LoggedOptions, GridOptions):
+class Benchmark(EnvironmentOptions, GridOptions):
     """`ucfrec benchmark`."""
 
     suite: Annotated[str, ARGUMENT, "SUITE"]
@@ -122,6 +107,16 @@ class Benchmark(LoggedOptions, GridOptions):
     env: str | None = None
     """Simulator or gymnasium:ID; its main table is measured instead of the suite's tasks, on logs
     of its mixture or, where it has none, of random actions (default: the suite's tasks)"""
+    logs: Annotated[int | None, _LOGS, "N"] = None
+    """Logs of each task; simulated with N seeds, or N parts of a given log, 1 for all of it
+    (default: set by --budget)"""
+    log_seed: Annotated[int, _LOGS] = 0
+    """Seed of the first simulated log; the others follow it."""
+    training_seeds: Annotated[int | None, _LOGS, "N"] = None
+    """Training seeds of every method, from 0 (default: set by --budget)"""
+    evaluation_seed: Annotated[int | None, _LOGS, SEED, "SEED"] = None
+    """Seed of the evaluated episodes; the same for every training seed (default: set by
+    --budget)"""
 
     def execute(self) -> None:
         """Measure what is missing, then print the tables."""

@@ -43,6 +43,10 @@ INPUT_FOLDER: Final = uri_or_path(Input, Path)
 OUTPUT: Final = uri_or_path(Output, Path)
 
 
+class Group(str):
+    """Marks a field of another group than that of its class, by the title; "" for none."""
+
+
 @dataclass(frozen=True)
 class Names:
     """Marks a field that takes names, which its help lists; others too, but where it is closed."""
@@ -105,7 +109,8 @@ def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
         hint = hints[field.name]
         kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         owner = next(cls for cls in table.__mro__ if field.name in inspect.get_annotations(cls))
-        title, _, more = (vars(owner).get("title") or "").partition("; ")
+        titles = [mark for mark in marks if isinstance(mark, Group)]
+        title, _, more = (titles or [vars(owner).get("title") or ""])[0].partition("; ")
         if title not in groups:
             groups[title] = parser.add_argument_group(title, more or None)
         group = groups[title]
@@ -137,7 +142,7 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
         return how | {"action": "store_true"}
     if origin is Literal:
         return how | {"choices": get_args(kind)}
-    metavar = next((mark for mark in marks if isinstance(mark, str)), None)
+    metavar = next((mark for mark in marks if type(mark) is str), None)
     if origin is tuple:
         return how | {"type": float, "nargs": 2, "metavar": tuple(str(metavar).split())}
     if several := origin is Sequence:

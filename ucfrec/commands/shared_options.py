@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Group, Table, settings_given
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
 
@@ -188,10 +188,14 @@ class AnswerOptions(RuleOptions):
     described_by = "ucfrec.recommending.requests:Limits"
     prefix = "max_"
     engine: str
-    k: int
-    keep_seen: bool
-    exposures: Path | None
 
+    k: Annotated[int, Group("")] = 10
+    """Items for each user; if a request does not say how many."""
+    exposures: Annotated[Path | None, Group(""), "PATH"] = None
+    """Write what was shown, with its probability, as Parquet; a folder of files for requests; see
+    docs/exposures.md"""
+    keep_seen: Annotated[bool, Group("")] = False
+    """Also recommend items that the user has seen; (default: leave them out)"""
     skip_unknown: bool = False
     """Ignore rows with items outside the catalogue of the run, and such candidates (default: an
     error)"""

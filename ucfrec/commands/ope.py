@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import OUTPUT, Table, settings_given
+from ucfrec.commands.options import OUTPUT, Group, settings_given
 from ucfrec.commands.shared_options import (
     LogOptions,
     RuleOptions,
@@ -28,29 +28,13 @@ if TYPE_CHECKING:
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
-class EstimateOptions(Table):
-    """What `ope` estimates."""
-
-    title = "what is estimated"
-    described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
-
-    discount: Annotated[float | None, "DISCOUNT"] = None
-    pages: bool = False
-    reward_range: Annotated[tuple[float, float] | None, "LEAST MOST"] = None
-    filter_seen: bool = False
-    lift: Annotated[float | None, "LIFT"] = None
-    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
-    logged return"""
-    item_groups: Annotated[int | None, "N"] = None
-    estimate_propensities: bool = False
-    anonymous: bool = False
-    """Treat each session as one of another user, for logs without user ids (as in obd)"""
+_ESTIMATED: Final = Group("what is estimated")
 
 
-class Ope(EstimateOptions, RuleOptions, LogOptions):
+class Ope(RuleOptions, LogOptions):
     """`ucfrec ope`."""
 
-    described_by = "ucfrec.python_api.recommender:Recommender.ope"
+    described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
     usage = "%(prog)s RUN... [LOGS...] [options]"
     epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
@@ -65,8 +49,20 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
     """LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: one row
     per session is in memory, and there are no reward models (DM, FQE, DR)"""
     seed: int = 0
+    """Of the folds and the bootstrap."""
     json: Path | None = None
     """Write the result rows here."""
+    discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
+    pages: Annotated[bool, _ESTIMATED] = False
+    reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
+    filter_seen: Annotated[bool, _ESTIMATED] = False
+    lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
+    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
+    logged return"""
+    item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
+    estimate_propensities: Annotated[bool, _ESTIMATED] = False
+    anonymous: Annotated[bool, _ESTIMATED] = False
+    """Treat each session as one of another user, for logs without user ids (as in obd)"""
 
     def execute(self) -> None:
         """Print the estimates and the verdict of every candidate."""

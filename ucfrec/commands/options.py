@@ -110,7 +110,7 @@ def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
         kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         owner = next(cls for cls in table.__mro__ if field.name in inspect.get_annotations(cls))
         titles = [mark for mark in marks if isinstance(mark, Group)]
-        title, _, more = (titles or [vars(owner).get("title") or ""])[0].partition("; ")
+        title, _, more = (titles or [Group(vars(owner).get("title") or "")])[0].partition("; ")
         if title not in groups:
             groups[title] = parser.add_argument_group(title, more or None)
         group = groups[title]

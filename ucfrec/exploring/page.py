@@ -249,14 +249,13 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
 
 def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:
     """The run's own rule, or that of the sliders."""
-    rule = trained.rule
     if fields.get("custom") is None:
-        return rule
+        return trained.rule
     names = [name for name in ("target", "reward_weight", "temperature") if name in fields]
     changes: dict[str, Any] = {name: _read_number(fields, name, 0.0, -1e12, 1e12) for name in names}
     if "tag_window" in fields:
         changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 0, 10))
-    return replace(rule, **changes)
+    return replace(trained.rule, **changes)
 
 
 def _read_number(

@@ -24,7 +24,7 @@ from ucfrec.benchmark.tables import average_seeds
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.record import RunRecord
 from ucfrec_control.benchmark.budgets import budget_of

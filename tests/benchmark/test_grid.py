@@ -13,8 +13,7 @@ from tests.support.result_rows import read_configurations
 from ucfrec.benchmark.cells import Cell, Evaluation, Measurement
 from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.errors import InputError
-from ucfrec.results.row import ResultRow, RowKey
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, RowKey, read_rows
 
 
 def _config(cell: Cell) -> dict[str, Any] | None:

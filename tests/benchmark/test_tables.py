@@ -21,7 +21,7 @@ from ucfrec.benchmark.tables import (
     score_table,
     select_best_target,
 )
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:

@@ -20,14 +20,12 @@ from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
 from ucfrec.commands.settings import settings_text
 from ucfrec.evaluation.collect import collect_store
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
 from ucfrec.provenance import provenance
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
-from ucfrec.results.table import ResultTable
+from ucfrec.results.rows import ResultRow, ResultTable, read_results
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.screened import screen_store
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -8,9 +8,9 @@ from typing import Any
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.provenance import config_hash
-from ucfrec.results.row import ResultRow, RowKey, Scalar
+from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.shared_stages import OWN, SharedStages

@@ -15,8 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
-from ucfrec.results.row import ResultRow, RowKey
-from ucfrec.results.rows_file import append_rows, read_rows, remove_rows
+from ucfrec.results.rows import ResultRow, RowKey, append_rows, read_rows, remove_rows
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def run_grid(
 
     Args:
         results: file of result rows (JSON lines); its other rows are kept. No other process may
-            fill it (`ucfrec.results.rows_file.benchmarking`).
+            fill it (`ucfrec.results.rows.benchmarking`).
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
         again: remove the rows, runs and shared stages of `cells` first. An interrupted call is

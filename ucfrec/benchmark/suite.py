@@ -8,8 +8,8 @@ from typing import Protocol
 from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.results.rows import ResultRow
 
 Rows = Sequence[ResultRow]
 

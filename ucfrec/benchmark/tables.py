@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ucfrec.reporting.plot_style import LIGHT, PLAIN, save, styled
-from ucfrec.reporting.plot_style import OURS as OURS_COLOR
+from ucfrec.reporting.charts import LIGHT, PLAIN, save, styled
+from ucfrec.reporting.charts import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from ucfrec.commands.options import ARGUMENT, SEED, Group, Table
 from ucfrec.commands.shared_options import EnvironmentOptions
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import benchmarking, latest, read_rows
+from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 
 if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell, Measurement

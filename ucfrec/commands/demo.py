@@ -13,7 +13,7 @@ from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress, progress
 
 if TYPE_CHECKING:
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
@@ -159,10 +159,10 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
         of `ENVIRONMENTS`.
     """
     from ucfrec.evaluation.collect import collect_store
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.reporting.page import write_report
-    from ucfrec.results.rows_file import write_results
+    from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
         _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
@@ -205,8 +205,8 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_policy
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
     from ucfrec.runs.shared_stages import SharedStages

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
     from ucfrec.off_policy.selection import Choice
     from ucfrec.off_policy.verdict import Verdict
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -70,7 +70,7 @@ class Ope(RuleOptions, LogOptions):
         from ucfrec.off_policy import evaluate
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
-        from ucfrec.results.rows_file import write_results
+        from ucfrec.results.rows import write_results
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
@@ -247,7 +247,7 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
         trained = TrainedPolicy.load(self.run, self.checkpoint)
         rule = self.make_rule(trained)
         if (master := self.find_spark()) is not None:
-            from ucfrec.off_policy.spark import score_with_spark
+            from ucfrec.off_policy.scored import score_with_spark
 
             files, mapping = self.find_logs(self.logs, trained, [self.out])
             sessions = score_with_spark(

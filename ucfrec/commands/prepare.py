@@ -90,7 +90,7 @@ class Datasets(Table):
 
     def execute(self) -> None:
         """Print the list, or how the loaded logs are prepared."""
-        from ucfrec.logs.releases import find_release, load_release
+        from ucfrec.logs.mapping import find_release, load_release
         from ucfrec.plugins import load_plugin, plugin_names
         from ucfrec.reporting.tables import text_table
 

@@ -8,7 +8,7 @@ from ucfrec.commands.options import POSITIVE
 from ucfrec.commands.shared_options import LogOptions, RuleOptions, find_runs
 
 if TYPE_CHECKING:
-    from ucfrec.results.table import Ranking
+    from ucfrec.results.rows import Ranking
 
 
 class Rank(LogOptions, RuleOptions):

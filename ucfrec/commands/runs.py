@@ -85,7 +85,7 @@ class Verify(Table):
 def _verify(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
     from ucfrec.episodes.record import StoreRecord
-    from ucfrec.results.rows_file import read_rows
+    from ucfrec.results.rows import read_rows
     from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord, read_training
 
     if path.is_file():

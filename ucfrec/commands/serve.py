@@ -184,7 +184,7 @@ class Explore(Table):
         """Show policies until Ctrl-C or TERM."""
         from ucfrec.exploring.page import Explorer, application
         from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
-        from ucfrec.reporting.samples import read_features
+        from ucfrec.reporting.training import read_features
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         features = None if self.items is None else read_features(self.items)

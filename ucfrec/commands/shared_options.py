@@ -13,7 +13,7 @@ from ucfrec.files.atomic import require_other_files
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
-    from ucfrec.evaluation.environment import Environment
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
     from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.recommending.exposures import ExposureLog
@@ -73,11 +73,11 @@ class LogOptions(Table):
             outputs: files that the command writes.
         """
         from ucfrec.logs.expressions import Expression
-        from ucfrec.logs.mapping import LogMapping, columns_given, read_mapping
+        from ucfrec.logs.mapping import LogMapping, read_columns, read_mapping
         from ucfrec.plugins import load_plugin
 
         mapping = LogMapping(
-            columns_given(self.column),
+            read_columns(self.column),
             time_format=self.time_format,
             earliest=self.earliest,
             where=self.where and Expression(self.where, "--where"),
@@ -251,7 +251,7 @@ class EnvironmentOptions(Table):
 
     def make_environment(self, name: str) -> "Environment":
         """The environment of that name with these parts."""
-        from ucfrec.evaluation.environment import Environment
+        from ucfrec.evaluation.simulator import Environment
 
         observe = tuple(key for key in self.observe.split(",") if key)
         return Environment(name, self.env_folder, observe=observe, item_features=self.item_features)

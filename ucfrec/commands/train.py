@@ -194,13 +194,12 @@ class Screen(Table):
         """Print which logged observation columns have no effect."""
         from dataclasses import asdict
 
-        from ucfrec.counterfactual.screening import describe_screening
         from ucfrec.episodes.store import EpisodeStore
         from ucfrec.files.atomic import write_json
         from ucfrec.provenance import provenance
         from ucfrec.runs.screened import screen_store
 
         report = screen_store(EpisodeStore.open(self.store), self.seed)
-        print(describe_screening(report))
+        print(report.describe())
         if self.json is not None:
             write_json(self.json, asdict(report) | provenance())

@@ -24,8 +24,8 @@ from ucfrec.recommending.recommend import name_some
 from ucfrec.recommending.server import AllowedHosts
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
-from ucfrec.reporting.page_results import find_quoted, read_evidence
-from ucfrec.results.row import ResultRow
+from ucfrec.reporting.results import find_quoted, read_evidence
+from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PACKAGE: Final = "ucfrec.exploring"

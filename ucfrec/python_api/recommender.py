@@ -24,15 +24,15 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.ranking_table import require_one_catalogue
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
-from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles
+from ucfrec.logs.rows import DAY_MS
 from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
@@ -55,7 +55,7 @@ from ucfrec.recommending.similar import similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
-from ucfrec.results.table import Evaluation, Ranking, ResultTable
+from ucfrec.results.rows import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run

@@ -19,8 +19,7 @@ from ucfrec import schema
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.liked import LikedByRange
-from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
+from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import lock_path

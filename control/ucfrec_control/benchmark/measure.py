@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ucfrec.benchmark.cells import Cell, Measurement, open_store, training_config
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy

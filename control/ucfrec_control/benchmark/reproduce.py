@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.plan import robustness_cells, score_cells

@@ -11,7 +11,7 @@ from ucfrec.benchmark.tables import (
 )
 from ucfrec.commands.options import Names
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
 from ucfrec_control.benchmark.plan import chosen_rates, score_cells

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import write_results
+from ucfrec.results.rows import ResultRow, write_results
 from ucfrec_control.commands.options import MAX_RETURN, target_given
 from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run, takes_target
 from ucfrec_control.training.rl_baselines import read_run

@@ -10,7 +10,7 @@ from ucfrec.benchmark.cells import Budget, Cell, Measurement
 from ucfrec.commands.benchmark import GridOptions
 from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, one_line
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import set_contexts

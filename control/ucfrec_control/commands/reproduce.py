@@ -5,7 +5,7 @@ from typing import Annotated
 from ucfrec.benchmark.cells import Cell
 from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
-from ucfrec.results.rows_file import latest, read_rows
+from ucfrec.results.rows import latest, read_rows
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.reproduce import (

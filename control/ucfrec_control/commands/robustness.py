@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from ucfrec.benchmark.tables import average_seeds
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.plan import robustness_cells

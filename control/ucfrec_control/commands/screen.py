@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Annotated
 
 from ucfrec.commands.options import ARGUMENT, SEED, Table
-from ucfrec.counterfactual.screening import describe_screening
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import write_json
 from ucfrec.provenance import provenance
-from ucfrec.runs.screened import screen_store
 from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.training.screening import screen_store
 
 
 class Screen(Table):
@@ -26,6 +25,6 @@ class Screen(Table):
     def execute(self) -> None:
         """Run `ucfrec-control screen`."""
         report = screen_store(EpisodeStore.open(self.store), self.seed)
-        print(describe_screening(report))
+        print(report.describe())
         if self.json is not None:
             write_json(self.json, dataclasses.asdict(report) | provenance(PACKAGES))

@@ -13,9 +13,8 @@ from ucfrec.benchmark.tables import select_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.plot_style import save
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
+from ucfrec.reporting.charts import save
+from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN, RunRecord
 from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES

@@ -1,22 +1,20 @@
 """Every table and figure of the paper has its cells, and one command makes it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.control_files import TINY, control, refused, write_made
 from tests.support.result_rows import result_row
 from ucfrec.benchmark.cells import Budget, Evaluation
-from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec.results.rows import append_rows, read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.benchmark.reproduce import PARTS, budget_of_part
-from ucfrec_control.cli import main
 from ucfrec_control.data.distractor import DISTRACTORS
 from ucfrec_control.figures.figures import make_row_figures
 
-TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=3")
+LAST = {"suite": SCORES, "metric": "score", "checkpoint": "last"}
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -30,16 +28,12 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     assert part.of_runs == (name in ("figure-5", "figure-6"))
 
 
-def test_one_command_makes_a_figure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_hdf5(tmp_path / "hopper_medium-zoo.hdf5", hopper_like((30, 8, 25) * 8))
+def test_one_command_makes_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_made(tmp_path, "hopper_medium-zoo")
     settings = (*TINY, "crm.epochs=1", "csg.epochs=1")
     tiny = Budget("small", ("unused",), 1, Evaluation(1, 1000), settings)
     monkeypatch.setitem(BUDGETS, "small", tiny)
-    arguments = ["reproduce", "figure-5", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
-    assert main(arguments) == 0
-    said = capsys.readouterr().err
+    said = control("reproduce", "figure-5", "--data", tmp_path, "--out", tmp_path / "out")[1]
     assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
     assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
     assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
@@ -51,18 +45,12 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
         rows = [
             result_row(
                 10.0 * number + seed,
-                suite=ROBUSTNESS if robust else SCORES,
+                **LAST | {"suite": ROBUSTNESS if robust else SCORES},
                 table=part.table,
-                metric="score",
                 task="d",
                 method=method,
                 training_seed=seed,
-                checkpoint="last",
-                conditions={
-                    "budget": "small",
-                    "distractor": distractor,
-                    "lambda_mask": number / 10,
-                },
+                conditions=small(distractor=distractor, lambda_mask=number / 10),
             )
             for number, method in enumerate(part.methods or TABLES[part.table])
             for distractor in part.distractors or (None,)
@@ -74,19 +62,19 @@ def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
     assert (tmp_path / "lambda-small.png").exists()
 
 
-def test_show_only_draws_the_rows_at_hand_and_measures_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def small(**conditions: object) -> dict[str, object]:
+    return {"budget": "small", **conditions}
+
+
+def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -> None:
     rows = [
         result_row(
             score,
-            suite=SCORES,
+            **LAST,
             table=table,
-            metric="score",
             task="hopper_medium-zoo",
             method=method,
             training_seed=0,
-            checkpoint="last",
             conditions={"budget": budget},
         )
         for table, method, budget, score in (
@@ -98,62 +86,46 @@ def test_show_only_draws_the_rows_at_hand_and_measures_nothing(
     ]
     results = tmp_path / "rows.jsonl"
     append_rows(results, rows)
-    asked = ["--show-only", "--results", str(results), "--out", str(tmp_path / "out")]
-    assert main(["reproduce", "table-1", *asked]) == 0
-    printed = capsys.readouterr().out
+    asked = ("--show-only", "--results", results, "--out", tmp_path / "out")
+    printed = control("reproduce", "table-1", *asked)[0]
     assert [score in printed for score in ("41.5", "42.5", "43.5", "44.5")] == [True] + [False] * 3
     assert read_rows(results) == rows
-    assert main(["reproduce", "table-9", *asked]) == 2
-    assert "no rows of table-9" in capsys.readouterr().err
-    assert main(["reproduce", "figure-5", *asked]) == 2
-    assert "drawn from its runs" in capsys.readouterr().err
+    assert "no rows of table-9" in refused("reproduce", "table-9", *asked)
+    assert "drawn from its runs" in refused("reproduce", "figure-5", *asked)
 
 
 @pytest.mark.parametrize(
     ("command", "suite", "conditions", "lacking"),
     [
         ("benchmark", SCORES, {}, "budget"),
-        ("robustness", ROBUSTNESS, {"budget": "small"}, "distractor"),
+        ("robustness", ROBUSTNESS, small(), "distractor"),
     ],
 )
 def test_rows_that_lack_what_is_shown_are_one_clear_error(
-    command: str,
-    suite: str,
-    conditions: dict[str, str],
-    lacking: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, command: str, suite: str, conditions: dict[str, object], lacking: str
 ) -> None:
     results = tmp_path / "rows.jsonl"
-    fields = {"suite": suite, "metric": "score", "checkpoint": "last", "conditions": conditions}
-    append_rows(results, [result_row(1.0, **fields)])
-    assert main([command, "--show-only", "--results", str(results)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in line
-    assert main(["figures", "--results", str(results), "--out", str(tmp_path / "out")]) == 2
-    assert f"{results} is damaged" in capsys.readouterr().err
+    row = result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)
+    append_rows(results, [row])
+    said = refused(command, "--show-only", "--results", results)
+    assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
+    said = refused("figures", "--results", results, "--out", tmp_path / "out")
+    assert f"{results} is damaged" in said
 
 
-def test_names_of_foreign_rows_do_not_steer_the_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_of_foreign_rows_do_not_steer_the_terminal(tmp_path: Path) -> None:
     results, name = tmp_path / "rows.jsonl", "d\x1b[2J\nforged"
-    row = result_row(1.0, suite=SCORES, table=MAIN, metric="score", task=name, checkpoint="last")
-    append_rows(results, [replace(row, conditions={"budget": "small"})])
-    assert main(["benchmark", "--show-only", "--results", str(results)]) == 0
-    printed = capsys.readouterr().out
+    append_rows(results, [result_row(1.0, **LAST, table=MAIN, task=name, conditions=small())])
+    printed = control("benchmark", "--show-only", "--results", results)[0]
     assert "\x1b" not in printed
     assert "d\\x1b[2J forged" in printed
 
 
-def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(tmp_path: Path) -> None:
     results, out = tmp_path / "rows.jsonl", tmp_path / "out"
-    row = result_row(1.0, suite=SCORES, table="lambda", metric="score", method="ucf")
     for weight in (0.5, "half"):
-        conditions = {"budget": "small", "lambda_mask": weight}
-        append_rows(results, [replace(row, checkpoint="last", conditions=conditions)])
-    assert main(["figures", "--results", str(results), "--out", str(out)]) == 0
-    assert "lambda-small: what it is drawn from is damaged" in capsys.readouterr().err
+        named = {"table": "lambda", "method": "ucf", "conditions": small(lambda_mask=weight)}
+        append_rows(results, [result_row(1.0, **LAST, **named)])
+    said = control("figures", "--results", results, "--out", out)[1]
+    assert "lambda-small: what it is drawn from is damaged" in said
     assert (out / "scores-small-lambda.png").exists()

@@ -13,56 +13,48 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.hdf5 import require_inside
 
 
-def linked(file: h5py.File, other: Path) -> None:
-    file["rewards"] = h5py.ExternalLink(str(other), "rewards")
-
-
-def soft(file: h5py.File, other: Path) -> None:
-    file["rewards"] = h5py.SoftLink("/actions")
-
-
-def stored_outside(file: h5py.File, other: Path) -> None:
-    file.create_dataset("rewards", (14,), "f4", external=[(str(other), 0, 56)])
-
-
-def virtual(file: h5py.File, other: Path) -> None:
+def virtual(other: Path) -> h5py.VirtualLayout:
     layout = h5py.VirtualLayout((14,), "f4")
     layout[:] = h5py.VirtualSource(str(other), "rewards", (14,))
-    file.create_virtual_dataset("rewards", layout)
+    return layout
 
 
-def huge(file: h5py.File, other: Path) -> None:
-    file.create_dataset("rewards", (10**13,), "f4", chunks=(1024,), compression="gzip")
-
-
-def huge_without_chunks(file: h5py.File, other: Path) -> None:
-    file.create_dataset("rewards", (10**12,), "f4")
-
-
-def group(file: h5py.File, other: Path) -> None:
-    file.create_group("rewards")
-
-
-def deep(file: h5py.File, other: Path) -> None:
-    file["rewards"] = np.zeros((14, 1, 1), "f4")
-
-
-def text(file: h5py.File, other: Path) -> None:
-    file["rewards"] = ["a\nb"] * 14
+CHUNKED = {"chunks": (1024,), "compression": "gzip"}
+OUTSIDE = "values of rewards lie in another file"
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (linked, "rewards is a link to another file"),
-        (soft, "rewards is a link to another name"),
-        (stored_outside, "values of rewards lie in another file"),
-        (virtual, "values of rewards lie in another file"),
-        (huge, r"rewards claims the shape \(10000000000000,\), but only 0 bytes"),
-        (huge_without_chunks, "rewards claims the shape"),
-        (group, "rewards is a group"),
-        (deep, "not 1 or 2 dimensions"),
-        (text, "not numbers"),
+        (
+            lambda file, other: file.update(rewards=h5py.ExternalLink(str(other), "rewards")),
+            "rewards is a link to another file",
+        ),
+        (
+            lambda file, _: file.update(rewards=h5py.SoftLink("/actions")),
+            "rewards is a link to another name",
+        ),
+        (
+            lambda file, other: file.create_dataset(
+                "rewards", (14,), "f4", external=[(str(other), 0, 56)]
+            ),
+            OUTSIDE,
+        ),
+        (lambda file, other: file.create_virtual_dataset("rewards", virtual(other)), OUTSIDE),
+        (
+            lambda file, _: file.create_dataset("rewards", (10**13,), "f4", **CHUNKED),
+            r"rewards claims the shape \(10000000000000,\), but only 0 bytes",
+        ),
+        (
+            lambda file, _: file.create_dataset("rewards", (10**12,), "f4"),
+            "rewards claims the shape",
+        ),
+        (lambda file, _: file.create_group("rewards"), "rewards is a group"),
+        (
+            lambda file, _: file.update(rewards=np.zeros((14, 1, 1), "f4")),
+            "not 1 or 2 dimensions",
+        ),
+        (lambda file, _: file.update(rewards=["a\nb"] * 14), "not numbers"),
     ],
 )
 def test_what_is_not_within_the_file_is_refused(

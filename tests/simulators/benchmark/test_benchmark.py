@@ -18,12 +18,11 @@ from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec.results.rows import ResultRow, append_rows, read_rows
 from ucfrec.runs.record import RUN, read_record
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
@@ -229,7 +228,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)

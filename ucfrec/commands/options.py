@@ -9,10 +9,10 @@ import argparse
 import ast
 import inspect
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
-from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
@@ -197,11 +197,10 @@ def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> 
 def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     """`CLASS.FIELD` and `CLASS.METHOD.ARGUMENT` of a module to what its source says of them, on one
     line, and to the default of a field."""
-    spec = find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
+    package, *names = module.split(".")
+    file = Path(sys.modules[package].__path__[0]).joinpath(*names).with_suffix(".py")
     texts = {}
-    for cls in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+    for cls in ast.parse(file.read_text(encoding="utf-8")).body:
         if not isinstance(cls, ast.ClassDef):
             continue
         for line, next_line in zip_longest(cls.body, cls.body[1:]):

@@ -23,15 +23,14 @@ _LOGS = Group("logs and seeds")
 class GridOptions(Table):
     """Where result rows are, and how they are measured."""
 
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
+
     out: Path = Path("runs/benchmark")
-    """Folder for logs, stores, runs and result rows; resumed."""
     results: Annotated[Path | None, "JSONL"] = None
     """File of result rows; measured cells are read from it, new ones appended to it (default:
     results.jsonl in --out)"""
     workers: int = os.cpu_count() or 1
-    """Parallel processes, one thread each."""
     again: bool = False
-    """Remove the rows and runs of the chosen cells first; resume without it."""
     show_only: bool = False
     """Print the tables from the rows in --results without measuring anything."""
 
@@ -93,6 +92,8 @@ class GridOptions(Table):
 class Benchmark(EnvironmentOptions, GridOptions):
     """`ucfrec benchmark`."""
 
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
+
     suite: Annotated[str, ARGUMENT, "SUITE"]
     """recommendation, or a suite of another installed package (entry point ucfrec.benchmarks)"""
     table: Sequence[str] = ()
@@ -107,15 +108,9 @@ class Benchmark(EnvironmentOptions, GridOptions):
     """Simulator or gymnasium:ID; its main table is measured instead of the suite's tasks, on logs
     of its mixture or, where it has none, of random actions (default: the suite's tasks)"""
     logs: Annotated[int | None, _LOGS, "N"] = None
-    """Logs of each task; simulated with N seeds, or N parts of a given log, 1 for all of it
-    (default: set by --budget)"""
     log_seed: Annotated[int, _LOGS] = 0
-    """Seed of the first simulated log; the others follow it."""
     training_seeds: Annotated[int | None, _LOGS, "N"] = None
-    """Training seeds of every method, from 0 (default: set by --budget)"""
     evaluation_seed: Annotated[int | None, _LOGS, SEED, "SEED"] = None
-    """Seed of the evaluated episodes; the same for every training seed (default: set by
-    --budget)"""
 
     def execute(self) -> None:
         """Measure what is missing, then print the tables."""

@@ -40,15 +40,13 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     candidates: Annotated[Path | None, "FILE"] = None
     """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
     new_session: Annotated[bool, Group("answering")] = False
-    """Recommend for the first step of a new session (default: the latest session of each user goes
-    on)"""
+    """Recommend for the first step of a new session (default: the user's latest one goes on)"""
     approximate: Annotated[bool, Group("answering")] = False
     """Find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule without a
     temperature; says the recall (default: exactly)"""
     engine: Annotated[Literal["torch", "onnxruntime", "spark"], Group("engine")] = "torch"
-    """What computes the network of requests that are not batched; onnxruntime is faster, but needs
-    ucfrec[export] and some 10 seconds at the start; spark: with LOGS, Spark's workers each
-    recommend to some of the users and write the parts of a folder --out"""
+    """What computes: onnxruntime, with --stream, is faster but needs ucfrec[export] and some 10
+    seconds at the start; with spark, each worker writes a part of the folder --out"""
 
     def execute(self) -> None:
         """Write the recommendations as Parquet, or answer a stream."""

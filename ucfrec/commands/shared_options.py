@@ -38,27 +38,23 @@ class LogOptions(Table):
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
     """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     dataset: Annotated[str | None, "NAME"] = None
-    """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there is one,
-    else generic)"""
+    """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, else generic)"""
     column: Annotated[Sequence[str], "NAME=COLUMN"] = ()
-    """File column or SQL expression for a log column, e.g. user_id=uid; repeatable (default: as in
-    the logs that the run was trained on, or the column of the same name)"""
+    """File column or SQL expression for a log column, e.g. user_id=uid; repeatable (default: as of
+    the run, or the column of the same name)"""
     mapping: Annotated[Path | None, "TOML"] = None
-    """File with column mapping, reward and feature tables; --column overrides it (default: none; a
-    run remembers the columns of its logs)"""
+    """File with column mapping, reward and feature tables; --column overrides it (default: none)"""
     time_format: Annotated[str | None, "FORMAT"] = None
     """How times are written that are text, e.g. '%d/%m/%Y %H:%M' (default: ISO 8601, and dates
     whose order of day and month the file settles)"""
     earliest: Annotated[str | None, "TIME"] = None
     """ISO time before which times are clock errors (default: 2000-01-01)"""
     where: Annotated[str | None, "SQL"] = None
-    """Condition over the log's columns; rows that do not fulfil it are excluded and counted, e.g.
-    "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
+    """Condition that rows must fulfil, e.g. "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
     partitions: bool = False
     """Read names of folders such as country=DE as columns."""
     memory_limit: Annotated[str, "SIZE"] = "2GB"
-    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to a
-    scratch folder"""
+    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to disk"""
 
     def find_logs(
         self,
@@ -127,8 +123,8 @@ class SparkOption(Table):
     engine: str
 
     spark_master: Annotated[str | None, "MASTER"] = None
-    """With --engine spark: its master, e.g. spark://HOST:7077; inputs and output must lie where
-    every worker sees them (default: local[*], this machine)"""
+    """With --engine spark: its master, e.g. spark://HOST:7077, whose workers see all inputs and
+    outputs (default: local[*], this machine)"""
 
     def find_spark(self) -> str | None:
         """Spark's master, if it is the engine; otherwise None."""
@@ -151,8 +147,8 @@ class RuleOptions(Table):
     checkpoint: Literal["best", "last"] = "best"
     """Policy weights: of the lowest validation loss, or the last ones."""
     target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
-    """Target return, in units of the reward: of a session, or of every step for returns-to-go of a
-    horizon or discounted ones"""
+    """Target return, in units of the reward, of a session; of every step with a horizon or
+    discount"""
     target_quantile: Annotated[float | None, EXCLUSIVE, "QUANTILE"] = None
     """Target return: this quantile of the training's, 0 to 1; 1 is the largest"""
     max_return: Annotated[bool, EXCLUSIVE] = False
@@ -197,8 +193,7 @@ class AnswerOptions(RuleOptions):
     keep_seen: Annotated[bool, Group("")] = False
     """Also recommend items that the user has seen; (default: leave them out)"""
     skip_unknown: bool = False
-    """Ignore rows with items outside the catalogue of the run, and such candidates (default: an
-    error)"""
+    """Ignore rows and candidates with items outside the run's catalogue (default: an error)"""
     seed: int = 0
     """Of the draws of a rule with --temperature or --explore."""
     max_bytes: Annotated[int | None, "N"] = None
@@ -242,9 +237,8 @@ class EnvironmentOptions(Table):
     env_folder: Annotated[Path | None, "FOLDER"] = None
     """Folder with the simulator's files, e.g. its weights (default: none)"""
     observe: Annotated[str, "KEY[,KEY…]"] = ""
-    """Of gymnasium:ID with a dict observation: entries that are observed, one after the other as
-    one vector (default: none, states come from the items shown and their rewards; environments of
-    vector actions need one)"""
+    """Of gymnasium:ID with a dict observation: entries that are observed, as one vector (default:
+    none, states come from the items shown and their rewards)"""
     item_features: Annotated[str | None, "SOURCE"] = None
     """Of gymnasium:ID with items: their features, from an attribute of the environment or a file
     .npy (a row for each item) or .parquet (with a column item_id from 0) (default: none)"""

@@ -123,11 +123,8 @@ class Recommender:
         return "".join(f"<p>{escape(line)}</p>" for line in lines)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The arguments of the constructor, as scikit-learn's estimators have it.
-
-        Args:
-            deep: also every setting, as `table__field`.
-        """
+        """The arguments of the constructor, as scikit-learn's estimators have it; with `deep`, also
+        every setting, as `table__field`."""
         params = {name: getattr(self, name) for name in _OWN}
         if deep:
             for table in TABLES:
@@ -176,13 +173,12 @@ class Recommender:
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
     ) -> Self:
-        """Train on a store's training episodes; logs are prepared into a store first.
+        """Train on a store's training episodes; returns this recommender. Logs are prepared first.
 
         Args:
             data: a store or its folder; or logs: files, folders and globs, what
-                `ucfrec_datasets.load` returns, or a frame with one row per interaction:
-                `user_id`, `item_id`, `timestamp` (milliseconds, dates or timestamps) and
-                feedback.
+                `ucfrec_datasets.load` returns, or a frame with one row per interaction: `user_id`,
+                `item_id`, `timestamp` (milliseconds, dates or timestamps) and feedback.
             out: run folder, resumed if training was interrupted; a store prepared from logs is kept
                 beside it, as `OUT-store`. None for temporary ones, which last as long as this
                 recommender.
@@ -199,9 +195,6 @@ class Recommender:
                 `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
             on_validation: called after every validation with the step and all that is logged.
-
-        Returns:
-            This recommender, trained.
         """
         options = {
             "reward": reward,
@@ -276,11 +269,10 @@ class Recommender:
         made of at most the last 1,000 rows of a user; all rows count as seen.
 
         Args:
-            histories: one row per interaction, in any order: `user_id`, `item_id`, `timestamp`
-                (milliseconds, dates or timestamps); `reward`, or the columns of the training
-                reward's expression; `session_id`, if the run's sessions are split by it; and
-                `observation` (lists of floats), if the run has observations. None for the rows
-                of the store that the policy was trained on.
+            histories: one row per interaction, as for `fit`, in any order: with `reward`, or the
+                columns of the training reward's expression; `session_id`, if the run's sessions
+                are split by it; and `observation` (lists of floats), if the run has observations.
+                None for the rows of the store that the policy was trained on.
             k: number of items per user, at least 1.
             users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
@@ -505,15 +497,12 @@ class Recommender:
         results: ResultTable | Path | str | Iterable[ResultTable | Path | str] = (),
         items: Path | str | None = None,
     ) -> Path:
-        """Write one HTML page about the training and results: `ucfrec report`.
+        """Write one HTML page about the training and results, and return it: `ucfrec report`.
 
         Args:
             file: HTML file to write.
             results: what `evaluate` and `ope` returned, or files of it; one or several.
             items: file with item features to show beside sample recommendations.
-
-        Returns:
-            The file.
         """
         what = "what evaluate or ope returned, or files of it"
         tables = [results] if isinstance(results, ResultTable) else results

@@ -4,40 +4,25 @@ import argparse
 from pathlib import Path
 
 from ucfrec.commands.grid_options import seed_given
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.data.collect import SHOWN as COLLECTED
-from ucfrec_control.data.collect import CollectConfig, collect, collect_agent
+from ucfrec_control.data.collect import SHOWN, CollectConfig, collect, collect_agent
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `collect`."""
-    parser.add_argument("--env", required=True, help="Gymnasium environment, e.g. Hopper-v5")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="of training (1000000)")
-    parser.add_argument(
-        "--every", type=int, default=10_000, help="steps between evaluations (10000)"
-    )
-    parser.add_argument(
-        "--fraction", type=float, default=1 / 3, help="of the expert's return, for medium (1/3)"
-    )
-    parser.add_argument(
-        "--size", type=int, default=1_000_000, help="steps of medium and of expert (1000000)"
-    )
-    parser.add_argument("--seed", type=seed_given, default=0)
-    parser.add_argument(
-        "--agent",
-        type=Path,
-        metavar="ZIP",
-        help="record this agent, saved by Stable-Baselines3, instead of training one; pickled "
-        "parts of the file are not read",
-    )
-    parser.add_argument(
-        "--noise",
-        type=float,
-        default=0.0,
-        help="standard deviation of the noise on the agent's actions, in halves of their range (0)",
-    )
+    option(parser, "--env", str, "Gymnasium environment, e.g. Hopper-v5", required=True)
+    option(parser, "--out", Path, "folder for the datasets", "FOLDER", required=True)
+    option(parser, "--steps", 1_000_000, "of training")
+    option(parser, "--every", 10_000, "steps between evaluations")
+    option(parser, "--fraction", float, "of the expert's return, for medium (1/3)", default=1 / 3)
+    option(parser, "--size", 1_000_000, "steps of medium and of expert")
+    option(parser, "--seed", seed_given, "of training and episodes (default: 0)", default=0)
+    text = "record this agent, saved by Stable-Baselines3, instead of training one; pickled parts"
+    option(parser, "--agent", Path, f"{text} of the file are not read", "ZIP")
+    text = "standard deviation of the noise on the agent's actions, in halves of their range"
+    option(parser, "--noise", 0.0, text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -48,9 +33,8 @@ def run(options: argparse.Namespace) -> None:
     elif options.noise:
         raise InputError("--noise is for the actions of an --agent")
     else:
-        config = CollectConfig(
-            steps=options.steps, every=options.every, fraction=options.fraction, size=options.size
-        )
+        names = ("steps", "every", "fraction", "size")
+        config = CollectConfig(**{name: getattr(options, name) for name in names})
         rows = collect(options.env, options.out, options.seed, config)
-    print(format_rows(rows, COLLECTED))
+    print(format_rows(rows, SHOWN))
     print(f"\nfiles: {options.out}")

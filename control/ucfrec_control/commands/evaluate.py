@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.commands.grid_options import seed_given
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
@@ -25,29 +26,18 @@ SHOWN = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `evaluate`."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--env", help="environment to evaluate in (that of the data)")
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--seed", type=seed_given, default=0)
-    parser.add_argument(
-        "--target",
-        type=target_given,
-        action="append",
-        default=[],
-        help="target return, or max for the largest that the policy expects in each state; "
-        "repeatable (the preset's)",
-    )
-    parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
-    parser.add_argument(
-        "--distractor", type=float, default=0.0, help="value that distractors are fixed to (0)"
-    )
-    parser.add_argument(
-        "--video",
-        type=Path,
-        metavar="MP4",
-        help="record an episode: FILE.mp4, or folder for frames",
-    )
-    parser.add_argument("--json", type=Path, help="write the result rows here")
+    option(parser, "runs", Path, "run folders", "RUN", nargs="+")
+    option(parser, "--env", str, "environment to evaluate in (that of the data)")
+    option(parser, "--episodes", 20, "of each checkpoint and target")
+    option(parser, "--seed", seed_given, "of environments and intervals (default: 0)", default=0)
+    text = "target return, or max for the largest that the policy expects in each state"
+    more = {"action": "append", "default": []}
+    option(parser, "--target", target_given, f"{text}; repeatable (the preset's)", **more)
+    kinds = ["both", "best", "last"]
+    option(parser, "--checkpoint", kinds, "of validation loss, or last step", default="both")
+    option(parser, "--distractor", 0.0, "value that distractors are fixed to")
+    option(parser, "--video", Path, "record an episode: FILE.mp4, or folder for frames", "MP4")
+    option(parser, "--json", Path, "write the result rows here")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -2,16 +2,14 @@
 
 import argparse
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
 from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.benchmark.grid import Measurement
-from ucfrec.commands.grid_options import budget_options, grid_options, rows_of
+from ucfrec.commands.grid_options import budget_options, grid_options
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError, one_line
-from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import set_contexts
 from ucfrec_control.data.d4rl import read_d4rl
@@ -49,24 +47,9 @@ def target_given(text: str) -> float | None:
 
 def source_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that name a dataset to read."""
-    parser.add_argument(
-        "source", metavar="SOURCE", help="HDF5 file, Minari identifier, or folder of one"
-    )
-    parser.add_argument("--env", help="environment of the data, if the file does not name it")
-    parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
-
-
-def context_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the history of single methods."""
-    parser.add_argument(
-        "--context",
-        dest="contexts",
-        type=context_given,
-        action="append",
-        default=[],
-        metavar="METHOD=STEPS",
-        help="steps of history of a method; repeatable (default: the budget's)",
-    )
+    option(parser, "source", str, "HDF5 file, Minari identifier, or folder of one", "SOURCE")
+    option(parser, "--env", str, "environment of the data, if the file does not name it")
+    option(parser, "--download", False, "let Minari fetch the dataset")
 
 
 def context_given(text: str) -> tuple[str, int]:
@@ -81,50 +64,50 @@ def context_given(text: str) -> tuple[str, int]:
     return method, int(steps)
 
 
-def data_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the folder of a benchmark's data."""
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of the HDF5 files")
+def control_grid_options(parser: argparse.ArgumentParser, whole: bool = True) -> None:
+    """Add the options for what a benchmark measures, and where its data, runs and rows are.
+
+    Args:
+        whole: whether files, methods and the seed of the evaluation can be chosen.
+    """
+    option(parser, "--data", Path, "folder of the HDF5 files", "FOLDER")
+    option(
+        parser,
+        "--context",
+        context_given,
+        "steps of history of a method; repeatable (default: the budget's)",
+        "METHOD=STEPS",
+        dest="contexts",
+        action="append",
+        default=[],
+    )
+    if whole:
+        budget_options(parser, "--file", "--seeds", BUDGETS)
+    else:
+        option(parser, "--budget", list(BUDGETS), "(default: small)", default="small")
+        text = "training seeds (default: set by --budget)"
+        option(parser, "--seeds", int, text, "N", dest="training_seeds")
+        parser.set_defaults(tasks=[], evaluation_seed=None)
+    grid_options(parser, "runs/control", 1)
 
 
-def data_given(options: argparse.Namespace) -> Path:
-    """The folder of the HDF5 files.
+def list_cells(
+    options: argparse.Namespace, budget: Budget, cells: Callable[[Path, Budget], Iterator[Cell]]
+) -> Iterator[Cell]:
+    """The cells of the folder of the data and of `budget` with the files, seeds and contexts of the
+    options.
 
     Raises:
-        InputError: no folder is given.
+        InputError: no folder is given, or `--seeds` is below 1.
     """
     if options.data is None:
         raise InputError(
             "name the folder of the HDF5 files with --data, or give --show-only for the rows that "
             "are there"
         )
-    folder: Path = options.data
-    return folder
-
-
-def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -> None:
-    """Add the options for what a benchmark measures, and where it keeps its runs and rows."""
-    if budget:
-        budget_options(parser, "--file", "--seeds", BUDGETS)
-    grid_options(parser, "runs/control", 1)
-
-
-def rows_of_suite(
-    options: argparse.Namespace,
-    suite: str,
-    how: Measurement[Cell],
-    cells: Callable[..., Iterable[Cell]],
-) -> list[ResultRow]:
-    """The rows that a command shows, as `ucfrec.commands.grid_options.rows_of`.
-
-    Args:
-        cells: makes the cells of data, folder, budget and methods.
-    """
-    budget = narrow_budget(budget_of(suite, options.budget), options)
-
-    def list_cells() -> Iterable[Cell]:
-        return cells(data_given(options), options.out, budget, options.methods)
-
-    return rows_of(options, suite, (), list_cells, how)
+    seed = options.evaluation_seed
+    narrow = budget.narrowed(options.tasks, options.training_seeds, evaluation_seed=seed)
+    return cells(options.data, set_contexts(narrow, dict(options.contexts)))
 
 
 def read_source(options: argparse.Namespace) -> Trajectories:
@@ -152,15 +135,3 @@ def describe_source(trajectories: Trajectories) -> str:
         f"{env_id}\n"
         f"mean return {returns.mean():.3f}{score}; dropped: {', '.join(dropped)}"
     )
-
-
-def narrow_budget(budget: Budget, options: argparse.Namespace) -> Budget:
-    """`budget` with the files, seeds and contexts of the options.
-
-    Raises:
-        InputError: `--seeds` is below 1.
-    """
-    budget = budget.narrowed(
-        options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
-    )
-    return set_contexts(budget, dict(options.contexts))

@@ -1,45 +1,92 @@
 """`ucfrec-control reproduce`: one table or figure of the paper; resumes."""
 
 import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
 
-from ucfrec.benchmark.cells import Cell
+from ucfrec.benchmark.cells import Budget, Cell
 from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.commands.options import option
 from ucfrec.errors import InputError
+from ucfrec.results.row import ResultRow
 from ucfrec.results.rows_file import latest, read_rows
+from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
-from ucfrec_control.benchmark.methods import ROBUSTNESS
-from ucfrec_control.benchmark.reproduce import (
-    PARTS,
-    budget_of_part,
-    cells_of_part,
-    rows_of_part,
-)
+from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
+from ucfrec_control.benchmark.plan import robustness_cells, score_cells
 from ucfrec_control.commands.benchmark import print_scores
-from ucfrec_control.commands.options import (
-    BUDGETS,
-    context_option,
-    control_grid_options,
-    data_given,
-    data_option,
-    narrow_budget,
-)
+from ucfrec_control.commands.options import control_grid_options, list_cells
 from ucfrec_control.commands.robustness import print_robustness
+from ucfrec_control.data.distractor import CLEAN
+
+
+@dataclass(frozen=True)
+class Part:
+    """A table or figure of the paper."""
+
+    table: str
+    """A key of `TABLES`, or `ROBUSTNESS`."""
+    methods: tuple[str, ...] = ()
+    """Rows; empty for all of the table."""
+    files: tuple[str, ...] = ()
+    """Files; empty for those of the budget."""
+    distractors: tuple[str, ...] = ()
+    """Of `ROBUSTNESS`; empty for all."""
+    of_runs: bool = False
+    """Whether it is drawn of its runs, not of its rows."""
+
+    def budget(self, name: str) -> Budget:
+        """The budget `name` with the files of the part."""
+        budget = budget_of(self.table, name)
+        return replace(budget, tasks=self.files) if self.files else budget
+
+    def cells(self, data: Path, folder: Path, budget: Budget) -> Iterator[Cell]:
+        """The cells of the part; writes the stores that they need.
+
+        Raises:
+            InputError: a file is missing.
+        """
+        if self.table == ROBUSTNESS:
+            return robustness_cells(data, folder, budget, self.methods, self.distractors)
+        return score_cells(data, folder, budget, self.table, self.methods)
+
+    def has(self, row: ResultRow) -> bool:
+        """Whether a row is of the part."""
+        if self.table == ROBUSTNESS:
+            kind = row.conditions.get("distractor")
+            of_table = row.suite == ROBUSTNESS and (
+                not self.distractors or kind in self.distractors
+            )
+        else:
+            of_table = (row.suite, row.table) == (SCORES, self.table)
+        of_method = not self.methods or row.method in self.methods
+        return of_table and of_method and (not self.files or row.task in self.files)
+
+
+_BASELINES = ("dt", "dt-wo-time", "dc", "dc-wo-time", "lsdt", "lsdt-wo-time")
+_DETERMINISTIC = (CLEAN, "deterministic")
+_EVALUATED = ("dt-wo-time", "dc-wo-time", "ucf", "ucf-dropped")
+PARTS: Final[Mapping[str, Part]] = {
+    "table-1": Part(MAIN, ("iql", "cql", *_BASELINES, "ucf-paper", "ucf")),
+    "table-3": Part(MAIN, ("ucf", "ucf-wo-count", "ucf-wo-arch", *_BASELINES)),
+    "table-9": Part("gate"),
+    "table-10": Part("band"),
+    "figure-2": Part("lambda"),
+    "figure-3": Part(ROBUSTNESS, _EVALUATED, distractors=_DETERMINISTIC),
+    "figure-4": Part(ROBUSTNESS, _EVALUATED, distractors=(*_DETERMINISTIC, "stochastic")),
+    "figure-5": Part(MAIN, ("ucf",), ("hopper_medium-zoo",), of_runs=True),
+    "figure-6": Part(MAIN, ("ucf",), ("halfcheetah_medium-zoo",), of_runs=True),
+}
+"""By name. Table 2 is `ucfrec benchmark recommendation`, tables 4 to 8 are settings, and figure 1
+is a diagram of the method."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `reproduce`."""
-    parser.add_argument("part", choices=list(PARTS), help="table or figure of the paper")
-    data_option(parser)
-    parser.add_argument("--budget", default="small", choices=list(BUDGETS))
-    parser.add_argument(
-        "--seeds",
-        dest="training_seeds",
-        type=int,
-        help="number of training seeds (default: set by --budget)",
-    )
-    context_option(parser)
-    control_grid_options(parser, budget=False)
-    parser.set_defaults(tasks=[], evaluation_seed=None)
+    option(parser, "part", list(PARTS), "table or figure of the paper")
+    control_grid_options(parser, whole=False)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -48,32 +95,38 @@ def run(options: argparse.Namespace) -> None:
     from ucfrec_control.figures.figures import make_figures, make_row_figures
 
     part, results = PARTS[options.part], results_given(options)
-    if options.show_only and part.of_runs:
-        raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
-    robust = part.table == ROBUSTNESS
-    budget = narrow_budget(budget_of_part(part, options.budget), options)
     cells: list[Cell] = []
     if options.show_only:
-        rows = rows_of_part(part, latest(read_rows(results)), options.budget)
+        if part.of_runs:
+            raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
+        of_budget = [
+            row
+            for row in latest(read_rows(results))
+            if row.conditions.get("budget") == options.budget
+        ]
+        rows = [row for row in of_budget if part.has(row)]
         if not rows:
             raise InputError(
                 f"{results} has no rows of {options.part} with budget {options.budget}; name a "
                 "file that has them with --results"
             )
     else:
-        cells += cells_of_part(part, data_given(options), options.out, budget)
-        how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
+        cells += list_cells(
+            options,
+            part.budget(options.budget),
+            lambda data, budget: part.cells(data, options.out, budget),
+        )
+        how = ROBUSTNESS_MEASUREMENT if part.table == ROBUSTNESS else SCORE_MEASUREMENT
         rows = rows_of(options, "", (), lambda: cells, how, f"reproduce {options.part}")
     pictures = options.out / options.part
     with rows_explained(options):
-        if robust:
+        if part.table == ROBUSTNESS:
             print_robustness(rows)
         else:
             print_scores(rows, part.table)
         if part.of_runs:
-            files, _ = make_figures(
-                [cell.run for cell in cells if cell.run is not None], [], pictures
-            )
+            runs = [cell.run for cell in cells if cell.run is not None]
+            files, _ = make_figures(runs, [], pictures)
         else:
             files = make_row_figures(rows, pictures)
     print("\n".join(["", *map(str, files)]))

@@ -4,9 +4,10 @@ import argparse
 from collections.abc import Sequence
 
 from ucfrec.benchmark.tables import over_seeds
-from ucfrec.commands.grid_options import results_given, rows_explained
+from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.row import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.plan import robustness_cells
@@ -20,24 +21,27 @@ from ucfrec_control.benchmark.robustness import (
     loss_rises,
     screening_rows,
 )
-from ucfrec_control.commands.options import (
-    context_option,
-    control_grid_options,
-    data_option,
-    rows_of_suite,
-)
+from ucfrec_control.commands.options import control_grid_options, list_cells
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `robustness`."""
-    data_option(parser)
-    context_option(parser)
     control_grid_options(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run `ucfrec-control robustness`."""
-    rows = rows_of_suite(options, ROBUSTNESS, ROBUSTNESS_MEASUREMENT, robustness_cells)
+    rows = rows_of(
+        options,
+        ROBUSTNESS,
+        (),
+        lambda: list_cells(
+            options,
+            budget_of(ROBUSTNESS, options.budget),
+            lambda data, own: robustness_cells(data, options.out, own, options.methods),
+        ),
+        ROBUSTNESS_MEASUREMENT,
+    )
     with rows_explained(options):
         print_robustness(rows)
     print(f"\nrows: {results_given(options)}")
@@ -52,5 +56,4 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     # A store is screened once, whatever method and seed it is for.
     screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
-    columns = [name for name in SHOWN_SCREENING if name != "training_seed"]
-    print(format_rows(list(screened.values()), columns))
+    print(format_rows(list(screened.values()), SHOWN_SCREENING))

@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option(parser, "--episodes", 20, "of each checkpoint and target")
     option(parser, "--seed", seed_given, "of environments and intervals (default: 0)", default=0)
     text = "target return, or max for the largest that the policy expects in each state"
-    more = {"action": "append", "default": []}
+    more: dict[str, Any] = {"action": "append", "default": []}
     option(parser, "--target", target_given, f"{text}; repeatable (the preset's)", **more)
     kinds = ["both", "best", "last"]
     option(parser, "--checkpoint", kinds, "of validation loss, or last step", default="both")

@@ -54,15 +54,14 @@ class Part:
 
     def has(self, row: ResultRow) -> bool:
         """Whether a row is of the part."""
-        if self.table == ROBUSTNESS:
-            kind = row.conditions.get("distractor")
-            of_table = row.suite == ROBUSTNESS and (
-                not self.distractors or kind in self.distractors
-            )
-        else:
-            of_table = (row.suite, row.table) == (SCORES, self.table)
-        of_method = not self.methods or row.method in self.methods
-        return of_table and of_method and (not self.files or row.task in self.files)
+        table = row.suite if self.table == ROBUSTNESS else row.table
+        chosen = (
+            (self.methods, row.method),
+            (self.files, row.task),
+            (self.distractors, row.conditions.get("distractor")),
+        )
+        of_table = table == self.table and row.suite in (SCORES, ROBUSTNESS)
+        return of_table and all(not names or name in names for names, name in chosen)
 
 
 _BASELINES = ("dt", "dt-wo-time", "dc", "dc-wo-time", "lsdt", "lsdt-wo-time")

@@ -107,8 +107,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     expected = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
     others = [n for n in tensors if n not in expected and n.startswith(("actor.", "features"))]
     if others:
-        first = min(others)
-        raise _refusal(file, f"its network has {first}, which is not a layer of a perceptron")
+        found = min(others)
+        raise _refusal(file, f"its network has {found}, which is not a layer of a perceptron")
     for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
         if not _is_plain(tensors[name]):
             raise _refusal(file, f"{name} is not of finite numbers stored one by one")

@@ -23,8 +23,7 @@ import pandas as pd
 
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import ResultRow, append_rows
 
 HERE = Path(__file__).resolve().parents[1]
 RESULTS = Path("runs/acting_time/results.jsonl")

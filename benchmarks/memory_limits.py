@@ -28,8 +28,7 @@ from prepare_time import make_log
 from ucfrec.logs.engine import anonymous_bytes, bytes_of
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import ResultRow, append_rows
 
 RESULTS = Path("runs/memory_limits/results.jsonl")
 OBSERVATION = 1024

@@ -17,7 +17,7 @@ import pandas as pd
 
 from ucfrec.commands.cli import main as ucfrec
 from ucfrec.logs.mapping import log_files
-from ucfrec.results.rows_file import append_rows, read_results
+from ucfrec.results.rows import append_rows, read_results
 from ucfrec.runs.record import read_record
 from ucfrec_simulators.folders import data_folder
 

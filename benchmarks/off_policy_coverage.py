@@ -41,13 +41,12 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import Estimate, estimate
-from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps
+from ucfrec.off_policy.models import fit_models
 from ucfrec.off_policy.verdict import conclude
 from ucfrec.progress import progress
 from ucfrec.provenance import provenance
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import ResultRow, append_rows
 
 SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
 LOW, HIGH = 0.90, 0.98

@@ -172,8 +172,7 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
     import shutil
 
     from ucfrec.provenance import provenance
-    from ucfrec.results.row import ResultRow
-    from ucfrec.results.rows_file import append_rows
+    from ucfrec.results.rows import ResultRow, append_rows
 
     log, out = folder / "log", folder / "out"
     make_log(log, rows, options.seed)

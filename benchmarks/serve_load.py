@@ -29,8 +29,7 @@ import numpy as np
 
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RESULTS = Path("runs/serve_load/results.jsonl")

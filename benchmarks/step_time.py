@@ -27,8 +27,7 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec.runs.config import resolve_config
 
 RESULTS = Path("runs/step_time/results.jsonl")

@@ -28,7 +28,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-from ucfrec.off_policy.intervals import cluster_intervals
+from ucfrec.off_policy.estimators import cluster_intervals
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Limits, Request

@@ -41,7 +41,6 @@ TESTED_HERE = {
     "tests/control/test_authors_networks.py",
     "tests/control/test_settings.py",
     "tests/logs/test_fuzzed_logs.py",
-    "tests/policies/test_baselines.py",
     "tests/policies/test_known_answers.py",
     "tests/reporting/test_page_items.py",
     "tests/runs/test_precision.py",
@@ -99,7 +98,7 @@ def modules_imported(package: str) -> dict[str, set[str]]:
 
 
 def room(module: str) -> str:
-    """`ucfrec.logs.kept` lies in `logs`; the package itself is `__init__`."""
+    """`ucfrec.logs.rows` lies in `logs`; the package itself is `__init__`."""
     return ([*module.split("."), "__init__"])[1]
 
 

@@ -1,6 +1,6 @@
 """Names and dtypes of log columns and of episode-store columns; defined in this module only."""
 
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 # Log columns, one row per impression.
 USER_ID: Final = "user_id"
@@ -8,6 +8,8 @@ ITEM_ID: Final = "item_id"
 TIMESTAMP: Final = "timestamp"
 """Milliseconds since the Unix epoch."""
 SESSION_ID: Final = "session_id"
+SessionBy: TypeAlias = Literal["session_id", "gap", "user"]
+"""How rows form sessions: by a column, by a pause of the user, or one session per user."""
 PROPENSITY: Final = "propensity"
 IS_RANDOM: Final = "is_random"
 ACTION: Final = "action"

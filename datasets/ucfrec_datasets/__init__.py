@@ -24,7 +24,7 @@ def load(name: str, folder: Path | str, part: str | None = None) -> "LogFiles":
         InputError: there is no such data set or part, or it cannot be downloaded; the message says
             how to do it by hand.
     """
-    from ucfrec.logs.releases import find_release, load_release
+    from ucfrec.logs.mapping import find_release, load_release
     from ucfrec_datasets import kuairand, kuairec, movielens, obd
 
     adapters = {

@@ -21,8 +21,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.simulator import Simulator
+from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec_simulators.kuai import kuairand
 from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import GymnasiumCatalog

@@ -9,8 +9,7 @@ import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actor
-from ucfrec.acting.uniform import Memoryless, Uniform
+from ucfrec.acting.rollout import Actor, Memoryless, Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator

@@ -39,7 +39,7 @@ from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
-from ucfrec.policies.item_knn import ItemKNNPolicy
+from ucfrec.policies.baselines import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
@@ -141,7 +141,7 @@ def naive_scores(scorer: Scorer, windows: Windows, excluded: Tensor) -> Tensor:
             score = scorer.reward_model.score(windows.states[:, -1], shown, sessions.users, every)
             if rule.lookahead:
                 assert scorer.session_end is not None
-                score = scorer.reward_model.expected(score)
+                score = scorer.reward_model.expect(score)
                 steps, recent = windows.timesteps[:, -1].numpy(), shown.latest(LAGS)
                 ends = [
                     torch.from_numpy(

@@ -13,10 +13,14 @@ import torch
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.by_simulation import RuleSearch, _warning, choose_by_simulation
-from ucfrec.choosing.candidates import near
+from ucfrec.choosing.by_simulation import (
+    Outcomes,
+    RuleSearch,
+    _warning,
+    choose_by_simulation,
+    find_neighbours,
+)
 from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
-from ucfrec.choosing.many_rules import Outcomes
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -374,7 +378,7 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     assert stays.rule == bad
     assert "supports no candidate, so the rule of the earlier run stays" in stays.warning
     ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
-    rules = [*near(ahead, given)]
+    rules = [*find_neighbours(ahead, given)]
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}
     assert {each.policy_weight for each in rules if each.lookahead} == {0.0, 0.5, 1.0}
     assert sum(not each.lookahead for each in rules) == 1

@@ -6,7 +6,8 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,19 @@ import pandas as pd
 import pytest
 from safetensors.numpy import load_file
 
-from ucfrec import Recommender
+from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
-from ucfrec.evaluation.environment import Environment
+from ucfrec.commands.settings import settings_text
+from ucfrec.evaluation.collect import collect_store
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.files.atomic import write_json
+from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
+from ucfrec.provenance import provenance
+from ucfrec.results.rows import ResultRow, ResultTable, read_results
+from ucfrec.runs.promoted import promote
+from ucfrec.runs.screened import screen_store
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TINY = [
@@ -225,53 +232,118 @@ def test_score_tells_the_probability_of_every_choice(
     pd.testing.assert_frame_equal(own, pd.read_parquet(out))
 
 
+def save(table: ResultTable | pd.DataFrame) -> None:
+    """Write what the Python API returns as the command of its name does."""
+    if isinstance(table, pd.DataFrame):
+        table.to_parquet("out")
+    else:
+        table.save("out")
+
+
+STORE, LATER = "synthetic-catalog-store", "later.parquet"
+ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
+    "prepare": (
+        "prepare later.parquet --out out --reward is_click --session-by gap --gap-minutes 7",
+        lambda _: prepare(
+            [LATER],
+            LogMapping(),
+            Path("out"),
+            PrepareOptions(reward="is_click", session_by="gap", gap_minutes=7),
+        ),
+    ),
+    "train": (
+        f"train {STORE} --out out {' '.join(settings())}",
+        lambda _: Recommender(settings=TINY).fit(STORE, "out", refit=True),
+    ),
+    "rank": ("rank run later.parquet --seed 2 --json out", lambda p: save(p.rank(LATER, seed=2))),
+    "ope": ("ope run later.parquet --seed 2 --json out", lambda p: save(p.ope(LATER, seed=2))),
+    "evaluate": (
+        "evaluate run --env synthetic-catalog --episodes 20 --behavior random --seed 2 --json out",
+        lambda p: save(p.evaluate("synthetic-catalog", 20, behaviors="random", seed=2)),
+    ),
+    "recommend": (
+        "recommend run later.parquet --out out",
+        lambda p: save(p.recommend(pd.read_parquet(LATER))),
+    ),
+    "score": ("score run later.parquet --out out", lambda p: save(p.score(LATER))),
+    "update": ("update run newer.parquet --out out", lambda p: p.update("newer.parquet", "out")),
+    "export": ("export run --onnx out --k 7", lambda p: p.export("out", 7)),
+    "report": ("report run --out out", lambda p: p.report("out")),
+    "collect": (
+        "collect --env synthetic-catalog --sessions 30 --seed 3 --out new/logs",
+        lambda _: (
+            collect_store(Environment("synthetic-catalog"), Path("new"), 30, 3),
+            shutil.rmtree("new/store"),
+        ),
+    ),
+    "screen": (
+        f"screen {STORE} --seed 1 --json out",
+        lambda _: write_json(
+            Path("out"), asdict(screen_store(EpisodeStore.open(STORE), 1)) | provenance()
+        ),
+    ),
+    "settings": (
+        "settings --policy dt",
+        lambda _: print(settings_text("dt", shutil.get_terminal_size().columns)),
+    ),
+    "promote": ("promote run --force", lambda _: promote(Path("run"), force=True)),
+}
+"""Command line, and what does the same in Python."""
+SLOW = ("train", "rank", "update", "export")
+
+
 @pytest.mark.parametrize(
     "command",
-    [
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("train", "rank")),
-        *("ope", "evaluate", "recommend", "score"),
-    ],
+    [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in ALIKE],
 )
 def test_a_command_does_what_the_python_api_does(
-    folder: Path, catalog: tuple[str, Path], command: str, tmp_path: Path
+    folder: Path,
+    catalog: tuple[str, Path],
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The same numbers, and the same files: two copies of a run end with equal model cards."""
-    environment, logs = "synthetic-catalog", tmp_path / "logs.parquet"
-    pd.read_parquet(catalog[1]).head(400).to_parquet(logs)
-    runs = [tmp_path / place / "run" for place in ("of-command", "of-api")]
-    for run in runs:
-        shutil.copytree(catalog[0], run)
-    policy, out = Recommender.load(runs[1]), tmp_path / "out"
-    if command == "train":
-        shutil.rmtree(runs[1])
-        store = folder / f"{environment}-store"
-        Recommender(settings=TINY).fit(store, runs[1], refit=True)
-        weights = [sorted(run.rglob("*.safetensors")) for run in runs]
-        assert len(weights[0]) > 2
-        for one, other in zip(*weights, strict=True):
-            tensors = load_file(one)
-            for name, tensor in load_file(other).items():
-                np.testing.assert_array_equal(tensors[name], tensor)
-    elif command in ("recommend", "score"):
-        assert main([command, str(runs[0]), str(logs), "--out", str(out)]) == 0
-        log = pd.read_parquet(logs)
-        frame = policy.recommend(log) if command == "recommend" else policy.score(log)
-        written = pd.read_parquet(out)
-        same = [name for name in frame if name != "request_id"]
-        pd.testing.assert_frame_equal(written[same], frame[same], check_dtype=False)
-    else:
-        seeded = ["--seed", "2", "--json", str(out)]
-        if command == "evaluate":
-            few = ["--env", environment, "--episodes", "20", "--behavior", "random"]
-            assert main([command, str(runs[0]), *few, *seeded]) == 0
-            policy.evaluate(environment, 20, behaviors="random", seed=2).save(tmp_path / "api")
+    """The same numbers and files, model cards of the run too."""
+    arguments, function = ALIKE[command]
+    log = pd.read_parquet(catalog[1])
+    written, printed = [], []
+    for place in ("command", "api"):
+        shutil.copytree(catalog[0], tmp_path / place / "run")
+        shutil.copytree(folder / STORE, tmp_path / place / STORE)
+        monkeypatch.chdir(tmp_path / place)
+        log.head(400).to_parquet(LATER)
+        log.assign(timestamp=log.timestamp + 10**9).head(600).to_parquet("newer.parquet")
+        capsys.readouterr()
+        if place == "command":
+            assert main(arguments.split()) == 0
         else:
-            assert main([command, str(runs[0]), str(logs), *seeded]) == 0
-            result = policy.rank(logs, seed=2) if command == "rank" else policy.ope(logs, seed=2)
-            result.save(tmp_path / "api")
-        assert _numbers(out) == _numbers(tmp_path / "api")
-    cards = [(run / "MODEL_CARD.md").read_text() for run in runs]
-    assert cards[0] == cards[1]
+            function(Recommender.load("run"))
+        printed.append(capsys.readouterr().out)
+        files = [path for path in Path().rglob("*") if path.is_file() and STORE not in str(path)]
+        written.append({str(path): _content(path) for path in files if "tfevents" not in path.name})
+    assert written[0].keys() == written[1].keys()
+    for name, content in written[0].items():
+        if isinstance(content, pd.DataFrame):
+            pd.testing.assert_frame_equal(content, written[1][name], check_dtype=False)
+        else:
+            assert content == written[1][name], name
+    if command == "settings":
+        assert printed[0] == printed[1]
+
+
+def _content(path: Path) -> object:
+    """What two runs of the same write alike."""
+    if path.suffix == ".safetensors":
+        return {name: tensor.tobytes() for name, tensor in load_file(path).items()}
+    if path.read_bytes()[:4] == b"PAR1":
+        return pd.read_parquet(path).drop(columns="request_id", errors="ignore")
+    if path.suffix in (".npy", ".onnx"):
+        return path.read_bytes()
+    if path.name == "out":
+        text = path.read_text()
+        return _numbers(path) if text.startswith("[") else text.replace("ucfrec screen", "")
+    return path.read_text() if path.suffix == ".md" else None
 
 
 def _numbers(file: Path) -> list[dict[str, object]]:

@@ -8,7 +8,6 @@ import pytest
 
 pytest.importorskip("mujoco", reason="needs ucfrec[control]")
 
-from ucfrec.counterfactual.screening import ScreeningConfig
 from ucfrec.errors import InputError
 from ucfrec.settings import describe
 from ucfrec_control.data.collect import CollectConfig
@@ -19,7 +18,7 @@ SOURCE = [Path(__file__).parents[2] / name for name in ("control", "ucfrec")]
 RL = {"algorithm": "iql", "steps": 100, "task": "hopper", "kind": "medium"}
 
 
-@pytest.mark.parametrize("table", [RLConfig(**RL), ScreeningConfig(), CollectConfig(), SacConfig()])
+@pytest.mark.parametrize("table", [RLConfig(**RL), CollectConfig(), SacConfig()])
 def test_every_field_means_something_and_is_read(table: Any) -> None:
     read = {
         node.attr
@@ -38,7 +37,6 @@ def test_every_field_means_something_and_is_read(table: Any) -> None:
     [
         (RLConfig, RL | {"algorithm": "sac"}, r"'sac'; it must be 'iql' or 'cql'"),
         (RLConfig, RL | {"steps": 0}, r"rl\.steps is 0; it must be a whole number from 1"),
-        (ScreeningConfig, {"level": 2}, r"screening\.level is 2; it must be a number from 0 to 1"),
         (CollectConfig, {"size": 0}, "size is 0; it must be a whole number from 1"),
         (CollectConfig, {"steps": 10_000}, "learning starts after 10000"),
         (SacConfig, {"target_rate": 0}, r"sac\.target_rate is 0; it must be a number above 0"),

@@ -22,9 +22,7 @@ from tests.support.episodes import (
     Logged,
     episode_columns,
     lengths_of,
-    random_action_augmentation,
     random_episodes,
-    random_overlay,
     some_states,
     state_before,
     step_columns,
@@ -34,7 +32,7 @@ from ucfrec import schema
 from ucfrec.episodes import store as store_module
 from ucfrec.episodes import view as view_module
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay, Windows
+from ucfrec.episodes.windows import Windows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, read_json, write_json
@@ -281,7 +279,6 @@ def test_padding_is_zero_with_a_plus_sign(folder: Path, items: bool) -> None:
         if episode.actions is not None:
             episode.actions = -np.abs(episode.actions)
     store = write_store(folder / "store", episodes, some_states() if items else None)
-    store = store.with_overlay(random_overlay(store, 6, seed=1)[0])
     windows = every_window(store, 12)
     padding = ~windows.mask
     assert padding.sum() > 100
@@ -357,12 +354,9 @@ def test_splits_part_the_episodes(folder: Path) -> None:
     assert sorted(everything.tolist()) == list(range(len(episodes)))
 
 
-@pytest.mark.parametrize("overlaid", [False, True])
-def test_draws_are_uniform_over_steps(folder: Path, overlaid: bool) -> None:
+def test_draws_are_uniform_over_steps(folder: Path) -> None:
     store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
     store = store.select(np.array([0, 2, 3, 5]))
-    if overlaid:
-        store = store.with_overlay(random_overlay(store, 3, seed=2)[0])
     episodes, steps = store.draw_steps(np.random.default_rng(0), 40_000)
     assert (steps >= 0).all()
     assert (steps < store.lengths[episodes]).all()
@@ -391,161 +385,6 @@ def test_state_statistics(folder: Path, limit: int, monkeypatch: pytest.MonkeyPa
     mean, std = store.state_statistics
     np.testing.assert_allclose(mean, seen.mean(0), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(std, seen.std(0), rtol=1e-3, atol=1e-4)
-
-
-# The overlay.
-
-
-@given(
-    lengths=lengths_of_episodes,
-    copies=st.integers(0, 6),
-    share=st.sampled_from([0.0, 0.3, 1.0]),
-    length=st.integers(1, 9),
-    items=st.booleans(),
-    seed=st.integers(0, 5),
-    shard_steps=st.sampled_from(SHARDS),
-)
-def test_copies_differ_from_their_source_at_the_edits_and_nowhere_else(
-    lengths: list[int],
-    copies: int,
-    share: float,
-    length: int,
-    items: bool,
-    seed: int,
-    shard_steps: int,
-) -> None:
-    with tempfile.TemporaryDirectory() as name:
-        base = write_store(
-            Path(name) / "store",
-            random_episodes(lengths, items=items),
-            some_states() if items else None,
-            shard_steps,
-        )
-        # A view that skips and reorders: copy_source counts base episodes, not positions.
-        base = base.select(np.arange(len(lengths))[::-1][: max(1, len(lengths) - 1)])
-        overlay, edits = random_overlay(base, copies, seed, share)
-        union = base.with_overlay(overlay)
-
-        assert len(union) == len(base) + copies
-        assert union.n_steps == base.n_steps + sum(lengths[i] for i in overlay.copy_source)
-        position = {int(number): at for at, number in enumerate(base.episode_ids)}
-        source = np.array([position[int(i)] for i in overlay.copy_source], dtype=np.int64)
-        origin = np.concatenate([np.arange(len(base)), source])
-        assert np.array_equal(union.returns, base.returns[origin])
-        assert np.array_equal(
-            union.episode_values(schema.SPLIT), base.episode_values(schema.SPLIT)[origin]
-        )
-
-        episodes, steps = union.all_steps()
-        got = union.windows(episodes, steps, length)
-        factual = base.windows(origin[episodes], steps, length)
-        expected = factual.states.clone()
-        for row, (episode, end) in enumerate(zip(episodes.tolist(), steps.tolist(), strict=True)):
-            for column in range(length):
-                edit = edits.get((episode - len(base), end - (length - 1) + column))
-                if edit is not None:
-                    assert not torch.equal(expected[row, column], torch.from_numpy(edit))
-                    expected[row, column] = torch.from_numpy(edit)
-        assert same(got, replace(factual, states=expected))
-
-        after = union.transitions(episodes, steps)
-        factual_after = base.transitions(origin[episodes], steps)
-        assert torch.equal(after.states, union.windows(episodes, steps, 1).states[:, 0])
-        for name in ("actions", "rewards", "next_states", "last"):
-            assert torch.equal(getattr(after, name), getattr(factual_after, name))
-
-
-@pytest.mark.parametrize("items", [True, False])
-def test_successors_are_the_factual_next_states(folder: Path, items: bool) -> None:
-    episodes = random_episodes(LENGTHS, items=items)
-    states = some_states() if items else None
-    base = write_store(folder / "store", episodes, states, shard_steps=6)
-    overlay, _ = random_overlay(base, 10, seed=3, share=1.0)
-    union = base.with_overlay(overlay)
-    logged_as = episodes + [episodes[i] for i in overlay.copy_source]
-    numbers, steps = union.all_steps()
-    moved = union.transitions(numbers, steps)
-    for row, (number, step) in enumerate(zip(numbers, steps, strict=True)):
-        logged = logged_as[number]
-        last = step == len(logged) - 1
-        assert moved.last[row] == last
-        assert moved.rewards[row] == logged.rewards[step]
-        expected = np.zeros(union.state_size) if last else state_before(logged, step + 1, states)
-        np.testing.assert_allclose(moved.next_states[row], expected, rtol=1e-5, atol=1e-6)
-        if states is None:
-            assert logged.actions is not None
-            assert np.array_equal(moved.actions[row], logged.actions[step])
-        else:
-            assert torch.equal(moved.actions[row], states.embeddings[logged.items[step]])
-
-
-def test_copies_are_never_dropped_silently(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS * 2), some_states())
-    union = base.with_overlay(random_overlay(base, 9, seed=4)[0])
-    for lose in (
-        lambda: union.split("train"),
-        lambda: union.select(np.arange(3)),
-        lambda: union.with_returns_to_go(np.zeros(union.n_steps, dtype=np.float32)),
-        lambda: union.without_observation_dimensions([0]),
-    ):
-        with pytest.raises(InputError, match=r"9 augmented episodes.*without_augmentation\(\)"):
-            lose()
-    plain = union.without_augmentation()
-    assert plain.overlay is None
-    assert same(every_window(plain, 4), every_window(base, 4))
-    for name in schema.SPLITS:
-        assert np.array_equal(plain.split(name).episode_ids, base.split(name).episode_ids)
-
-
-def test_a_second_overlay_comes_after_the_first(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    first, second = (random_overlay(base, copies, seed=copies)[0] for copies in (3, 2))
-    union = base.with_overlay(first).with_overlay(second)
-    assert same(every_window(union, 4), every_window(base.with_overlay(first.joined(second)), 4))
-
-
-def test_an_overlay_of_another_store_is_refused(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    good = random_overlay(base, 4, 1)[0].joined(random_action_augmentation(base, 3, seed=5))
-    for wrong in (
-        {"copy_source": good.copy_source + len(LENGTHS)},
-        {"action_source": good.action_source + len(LENGTHS)},
-        {"edit_step": good.edit_step + 7},
-        {"action_step": good.action_step - 7},
-        {"edit_state": good.edit_state[:, :1]},
-        {"action": good.action + 11},
-        {"action": good.action - 11},
-        {"action": np.zeros((3, 3), dtype=np.float32)},
-    ):
-        with pytest.raises(InputError, match="use the store that the copies were made from"):
-            base.with_overlay(replace(good, **wrong))
-    moving = write_store(folder / "vectors", random_episodes(LENGTHS, items=False))
-    copies = random_action_augmentation(moving, 3, seed=5)
-    for action in (copies.action[:, :1], np.zeros(3, dtype=np.int64)):
-        with pytest.raises(InputError, match="use the store that the copies were made from"):
-            moving.with_overlay(replace(copies, action=action))
-
-
-def test_an_overlay_file_whose_arrays_do_not_agree_is_refused(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    good = random_overlay(base, 4, 1)[0].joined(random_action_augmentation(base, 3, seed=5))
-    path = folder / "overlay.safetensors"
-    good.save(path)
-    assert np.array_equal(Overlay.load(path).action, good.action)
-    wrong: list[dict[str, object]] = [
-        {"edit_copy": good.edit_copy + len(good.copy_source)},
-        {"edit_copy": good.edit_copy - len(good.copy_source)},
-    ]
-    for name, values in vars(good).items():
-        if name == "_keys":
-            continue
-        wrong += [{name: values[..., None]}] if values.ndim == 1 and name != "action" else []
-        wrong += [{name: values[1:].copy()}] if name != "copy_source" else []
-        wrong += [{name: values.astype(np.float64)}] if values.dtype == np.int64 else []
-    for change in wrong:
-        replace(good, **change).save(path)  # type: ignore[arg-type]
-        with pytest.raises(InputError):
-            base.with_overlay(Overlay.load(path))
 
 
 # A store in memory.
@@ -598,9 +437,6 @@ def test_a_store_says_what_it_holds(folder: Path) -> None:
     assert (
         repr(train) == "EpisodeStore(700 steps, 1 episodes, 11 items, reward=reward, split=train)"
     )
-    overlay, edits = random_overlay(store, 3, seed=0, share=0.01)
-    assert "2 episodes and 3 augmented episodes" in repr(store.with_overlay(overlay))
-    assert repr(overlay) == f"Overlay(3 copies, {len(edits)} edited states of {store.state_size})"
     at = np.array([0, 1, 1]), np.array([5, 6, 7])
     assert repr(store.windows(*at, 4)) == (
         f"Windows(3 of 4 steps, states of {store.state_size}, actions are items)"
@@ -625,20 +461,6 @@ def test_steps_that_an_episode_does_not_have_are_refused(folder: Path) -> None:
             store.windows(np.array(episodes), np.array(ends), length)
     with pytest.raises(InputError, match="no split is called 'training'; there are train, valid"):
         store.split("training")
-
-
-def test_an_overlay_comes_back_from_its_file(folder: Path) -> None:
-    base = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    for copies in (0, 5):
-        overlay, _ = random_overlay(base, copies, seed=5)
-        overlay = overlay.joined(random_action_augmentation(base, copies, seed=6))
-        overlay.save(folder / "overlay.safetensors")
-        read = Overlay.load(folder / "overlay.safetensors")
-        for name, values in vars(overlay).items():
-            assert getattr(read, name).dtype == values.dtype
-            assert np.array_equal(getattr(read, name), values)
-        a, b = base.with_overlay(overlay), base.with_overlay(read)
-        assert same(every_window(a, 3), every_window(b, 3))
 
 
 # Opening, and what can be wrong.

@@ -1,21 +1,32 @@
-"""The engine by itself: whatever SQL it is given, it reads its inputs and writes its scratch."""
+"""Closed connections, and columns of files as expressions compute with them."""
 
 import gzip
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import duckdb
+import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from ucfrec import Recommender
+from ucfrec.commands.cli import main
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import read_json
 from ucfrec.files.locks import SCRATCH
-from ucfrec.logs import LogMapping, PrepareOptions, validate
 from ucfrec.logs.engine import engine
-from ucfrec.logs.tables import open_tables, text
+from ucfrec.logs.histories import frame_histories, read_histories
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
+from ucfrec.logs.tables import open_tables, quote
 
 SECRET = "the content of a file that was not named"
 
@@ -222,7 +233,7 @@ def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     for reward in (
         "reward * 2",
         f"{quoted}.{quoted} * reward",
-        f"{quoted}[{text(hostile)}] + reward",
+        f"{quoted}[{quote(hostile)}] + reward",
     ):
         options = PrepareOptions(reward=reward)
         assert validate([tmp_path / "log.parquet"], LogMapping(), options)["steps"] == rows
@@ -237,7 +248,7 @@ def test_every_connection_is_closed_to_the_environment() -> None:
     files = (path for package in packages for path in (root / package).rglob("*.py"))
     found = {path.name for path in files if opens.search(path.read_text(encoding="utf-8"))}
     assert found == {"engine.py"}
-    assert text("it's") == "'it''s'"
+    assert quote("it's") == "'it''s'"
 
 
 def test_scratch_of_a_killed_process_goes_with_the_next(inputs: list[Path], tmp_path: Path) -> None:
@@ -255,3 +266,336 @@ def test_scratch_of_a_killed_process_goes_with_the_next(inputs: list[Path], tmp_
     with engine(inputs, folder):
         assert sum(path.is_dir() for path in folder.iterdir()) == 1
     assert list(folder.iterdir()) == []
+
+
+START = 1_700_000_000_000
+
+
+def rewards_of(columns: dict[str, object], reward: str, folder: Path) -> list[float]:
+    """Rewards of rows in order, undefined ones excluded; checks that a frame gives the same."""
+    frame = pd.DataFrame(columns)
+    frame = frame.assign(user_id=1, item_id=2, timestamp=START + np.arange(len(frame)))
+    frame.to_parquet(folder / "log.parquet")
+    (batch,) = read_histories([folder / "log.parquet"], LogMapping(), reward, last=len(frame))
+    found: list[float] = batch["rewards"][0].as_py()
+    if len(found) == len(frame):
+        (batch,) = frame_histories(frame, LogMapping(), reward, last=len(frame))
+        assert batch["rewards"][0].as_py() == found
+    return found
+
+
+OVERFLOWING = {
+    "a * b": [10_000.0, 30.0],
+    "a * a * a * a * a": [1e10, 243.0],
+    "a - 2 * b": [-100.0, -17.0],
+    "least(a + b, 250)": [200.0, 13.0],
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "reward"),
+    [
+        *(("int8", reward) for reward in OVERFLOWING),
+        *((kind, "a * a * a * a * a") for kind in ("int32", "uint64")),
+        *((kind, "a - 2 * b") for kind in ("uint8", "uint32")),
+    ],
+)
+def test_integers_of_any_width_do_not_overflow(kind: str, reward: str, tmp_path: Path) -> None:
+    columns = {"a": np.array([100, 3], dtype=kind), "b": np.array([100, 10], dtype=kind)}
+    assert rewards_of(columns, reward, tmp_path) == OVERFLOWING[reward]
+
+
+def test_lists_of_narrow_integers_do_not_overflow(tmp_path: Path) -> None:
+    counts = [np.array([100, 100], dtype="int8"), np.array([3, 2], dtype="int8")]
+    assert rewards_of({"n": counts}, "n[1] * n[2]", tmp_path) == [10_000.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("reward", "wanted"),
+    [
+        ("x", [0.25, 1.0]),
+        ("x > 0.5", [0.0, 1.0]),
+        ("if(x > 0.5, 2, 1)", [1.0, 2.0, 1.0, 1.0]),
+        ("coalesce(x, 7)", [0.25, 1.0, 7.0, 7.0]),
+        ("if(isnan(x), 7, x)", [0.25, 1.0, 7.0, 7.0]),
+        ("clicks + x", [0.25, 2.0]),
+        # Extremes and number of missing values in the file show nothing of NaN.
+        ("y > 0.5", [1.0, 1.0, 1.0]),
+        ("y < 5", [1.0, 1.0, 1.0]),
+        ("if(y < 5, 1, 2)", [1.0, 1.0, 2.0, 1.0]),
+        ("coalesce(y, 7)", [0.75, 1.0, 7.0, 2.0]),
+        ("if(isnan(y), 7, y)", [0.75, 1.0, 7.0, 2.0]),
+        ("clicks / views > 0.1", [1.0, 0.0, 1.0]),
+        ("coalesce(clicks / views, 7)", [7.0, 0.5, 0.0, 1.5]),
+        ("ln(views) > 0.5", [1.0, 0.0, 1.0]),
+        ("ln(views) + ln(views)", [1.3862944, 0.0, 1.3862944]),
+        ("least(ln(views), 5)", [0.6931472, 0.0, 0.6931472]),
+        ("greatest(sqrt(clicks - 1), 0)", [0.0, 1.4142135]),
+    ],
+)
+def test_what_is_undefined_is_above_no_threshold(
+    reward: str, wanted: list[float], tmp_path: Path
+) -> None:
+    columns = {
+        "x": pa.array([0.25, 1.0, float("nan"), None]),
+        "y": pa.array([0.75, 1.0, float("nan"), 2.0], pa.float32()),
+        "clicks": pa.array([0, 1, 0, 3]),
+        "views": pa.array([0, 2, 1, 2]),
+        "user_id": pa.array([1] * 4),
+        "item_id": pa.array([2] * 4),
+        "timestamp": pa.array(START + np.arange(4)),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    (batch,) = read_histories([tmp_path / "log.parquet"], LogMapping(), reward, last=4)
+    assert batch["rewards"][0].as_py() == pytest.approx(wanted)
+
+
+def test_only_true_and_one_are_random_choices(tmp_path: Path) -> None:
+    given = [1.0, 0.0, float("nan"), None, float("inf"), -1.0, 2.0, 1.0]
+    n = len(given)
+    columns = {
+        "user_id": pa.array([1] * n),
+        "item_id": pa.array(range(n)),
+        "timestamp": pa.array(START + np.arange(n)),
+        "reward": pa.array(range(n)),
+        "propensity": pa.array([0.5] * n),
+        "is_random": pa.array(given),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    for mapping, wanted in (
+        (LogMapping(), [1, 0, 0, 0, 0, 0, 0, 1]),
+        (LogMapping({"is_random": "ln(is_random) = 0"}), [1, 0, 0, 0, 0, 0, 0, 1]),
+        (LogMapping({"is_random": "1 / is_random > 0.5"}), [1, 0, 0, 0, 0, 0, 0, 1]),
+    ):
+        out = tmp_path / f"store{len(list(tmp_path.iterdir()))}"
+        prepare([tmp_path / "log.parquet"], mapping, out, PrepareOptions(embedding_size=2))
+        store = EpisodeStore.open(out)
+        assert store.step_values("is_random", *store.all_steps()).tolist() == wanted
+
+
+def test_undefined_numbers_of_features_are_missing(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"user_id": [1, 2, 3, 4], "item_id": [0, 1, 2, 3], "reward": [0, 1, 2, 3]})
+    frame.assign(timestamp=START + frame.index).to_parquet(tmp_path / "log.parquet")
+    pd.DataFrame({"item_id": [0, 1, 2, 3], "price": [-1, 0, 1, 9]}).to_parquet(
+        tmp_path / "items.parquet"
+    )
+    table = FeatureTable((tmp_path / "items.parquet",), "item_id", ("ln(price)",))
+    mapping = LogMapping(item_features=(table,))
+    options = PrepareOptions(split=(1.0, 0.0, 0.0), embedding_size=2)
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store", options)
+    states = EpisodeStore.open(tmp_path / "store").item_states
+    assert bool(states.embeddings.isfinite().all())
+
+
+def csv_of(folder: Path, column: str, first: str, later: str) -> Path:
+    """A CSV log whose `column` is `first`, in more rows than types are inferred from, then
+    `later`."""
+    rows = 25_000
+    lines = [f"{column},user_id,item_id,timestamp"]
+    values = [first] * (rows - 1) + [later]
+    lines += [f"{value},{n % 7},{n % 5},{START + n}" for n, value in enumerate(values)]
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "reward", "wanted"),
+    [
+        ("1", "0.25", "x", 0.25),
+        ("2024-01-01", "2024-01-01 12:30:00", "hour(x::TIMESTAMP)", 12.0),
+        ("2024-01-01 00:00:00", "2024-01-01 12:30:00+02:00", "hour(x::TIMESTAMP)", 10.0),
+    ],
+)
+def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
+    tmp_path: Path, first: str, later: str, reward: str, wanted: float
+) -> None:
+    path = csv_of(tmp_path, "x", first, later)
+    users = pa.Table.from_batches(list(read_histories([path], LogMapping(), reward, last=1)))
+    latest = max(users.to_pylist(), key=lambda user: int(user["timestamps"][0]))
+    assert latest["rewards"] == [wanted]
+
+
+def test_a_later_row_of_csv_with_a_leading_zero_is_text_in_expressions(tmp_path: Path) -> None:
+    """As it is in the first rows, from which types are inferred."""
+    path = csv_of(tmp_path, "visitor", "7", "007")
+    for written, rows in (("7", 24_999), ("007", 1)):
+        mapping = LogMapping(where=f"visitor = '{written}'")
+        users = pa.Table.from_batches(list(read_histories([path], mapping, "1", last=25_000)))
+        assert sum(map(len, users["item_ids"].to_pylist())) == rows
+
+
+def test_the_line_is_named_where_an_identifier_is_also_in_an_expression(tmp_path: Path) -> None:
+    path = csv_of(tmp_path, "visitor", "1", "u7")
+    mapping = LogMapping({"user_id": "visitor"}, where="visitor <> 'bot'")
+    with pytest.raises(InputError, match=r"log.csv, line 25001: column visitor: .*Parquet"):
+        list(read_histories([path], mapping, "1", last=1))
+
+
+@pytest.mark.parametrize("later", ["u7", "9" * 100_000])
+def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
+    path = csv_of(tmp_path, "visit", "1", later)
+    with pytest.raises(InputError, match=r"log.csv, line 25001: column visit: .*Parquet") as caught:
+        list(read_histories([path], LogMapping(), "visit", last=1))
+    assert len(str(caught.value)) < 700
+    # What names a session is text, whatever the first rows look like.
+    mapping = LogMapping({"session_id": "visit"})
+    assert list(read_histories([path], mapping, "1", last=1, session_by="session_id"))
+
+
+MAPPING = """
+reward = "least(stars, 5) >= 4"
+time_format = "%d/%m/%Y %H:%M:%S"
+where = "agent <> 'bot'"
+[columns]
+user_id = "uid"
+item_id = "concat('i', sku)"
+timestamp = "at"
+propensity = "shown_with"
+"""
+TRAIN = ["--set", "train.steps=60", "--set", "train.validate_every=30", "--set", "policy.dim=8"]
+TRAIN += ["--set", "policy.context=4", "--set", "rule.choose=false", "--set", "augment.copies=0"]
+
+
+def shop(rows: int = 1500, start: str = "2024-02-03", seed: int = 0) -> pd.DataFrame:
+    rng = np.random.default_rng(seed)
+    frame = pd.DataFrame({"uid": rng.integers(50, size=rows), "sku": rng.integers(12, size=rows)})
+    times = pd.Timestamp(start) + pd.to_timedelta(np.arange(rows) * 60, unit="s")
+    frame["at"] = times.strftime("%d/%m/%Y %H:%M:%S")
+    frame["stars"] = rng.integers(1, 7, size=rows)
+    frame["shown_with"] = 1 / 12
+    return frame.assign(agent=np.where(frame.uid == 7, "bot", "person"))
+
+
+def plain(frame: pd.DataFrame) -> pd.DataFrame:
+    """The same log with the names of the schema."""
+    kept = frame[frame.agent != "bot"]
+    times = pd.to_datetime(kept["at"], format="%d/%m/%Y %H:%M:%S")
+    ids = {"user_id": kept.uid, "item_id": "i" + kept.sku.astype(str)}
+    rewards = (kept.stars.clip(upper=5) >= 4).astype(float)
+    frame = pd.DataFrame({**ids, "timestamp": times, "propensity": 1 / 12, "reward": rewards})
+    return frame.reset_index(drop=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("remembered")
+    (folder / "shop.toml").write_text(MAPPING)
+    shop().to_parquet(folder / "log.parquet")
+    late = shop(400, "2024-02-10", 1)
+    late.to_parquet(folder / "late.parquet")
+    late.to_csv(folder / "late.csv", index=False)
+    plain(late).to_parquet(folder / "plain.parquet")
+    paths = [str(folder / name) for name in ("log.parquet", "store", "run", "shop.toml")]
+    assert main(["prepare", paths[0], "--mapping", paths[3], "--out", paths[1]]) == 0
+    assert main(["train", paths[1], "--policy", "dt", "--out", paths[2], *TRAIN]) == 0
+    return folder
+
+
+def scored(folder: Path, log: str, *more: str) -> pd.DataFrame:
+    out = folder / f"{log}-{len(more)}.parquet"
+    assert main(["score", str(folder / "run"), str(folder / log), "--out", str(out), *more]) == 0
+    return pd.read_parquet(out)
+
+
+def test_the_record_keeps_all_of_the_mapping(folder: Path) -> None:
+    for source in (
+        read_json(folder / "store/meta.json")["source"],
+        read_json(folder / "run/run.json")["data"],
+    ):
+        assert source["mapping"]["item_id"] == "concat('i', sku)"
+        assert source["time_format"] == "%d/%m/%Y %H:%M:%S"
+        assert source["where"] == "agent <> 'bot'"
+
+
+@pytest.mark.parametrize("log", ["late.csv", "plain.parquet"])
+def test_a_later_log_is_read_as_the_first_whatever_its_names(folder: Path, log: str) -> None:
+    """ISO times, plain names and a plain reward stand for what the run remembers."""
+    expected = scored(folder, "late.parquet", "--mapping", str(folder / "shop.toml"))
+    assert 0 < len(expected) < 400
+    pd.testing.assert_frame_equal(scored(folder, log), expected)
+
+
+def test_no_command_needs_the_mapping_again(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, late, mapping = (str(folder / name) for name in ("run", "late.parquet", "shop.toml"))
+    for command in ("rank", "ope"):
+        told = []
+        for more in ([], ["--mapping", mapping]):
+            assert main([command, run, late, *more]) == 0
+            told.append(capsys.readouterr().out)
+        assert told[0] == told[1]
+    frames = []
+    for n, more in enumerate(([], ["--mapping", mapping])):
+        out = folder / f"next-{n}.parquet"
+        assert main(["recommend", run, late, "--k", "3", "--out", str(out), *more]) == 0
+        frames.append(pd.read_parquet(out))
+    pd.testing.assert_frame_equal(frames[0], frames[1])
+    assert 7 not in set(frames[0].user_id)
+
+
+def test_a_given_column_or_condition_wins(folder: Path) -> None:
+    late = pd.read_parquet(folder / "late.parquet").assign(other=lambda frame: frame.uid + 1000)
+    late.to_parquet(folder / "other.parquet")
+    assert scored(folder, "other.parquet").user_id.max() < 1000
+    found = scored(folder, "other.parquet", "--column", "user_id=other", "--where", "1 = 1")
+    assert found.user_id.min() >= 1000
+    assert 1007 in set(found.user_id)
+
+
+def test_a_log_with_neither_column_is_refused_with_both_names(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = pd.read_parquet(folder / "late.parquet").rename(columns={"uid": "who"})
+    late.to_parquet(folder / "who.parquet")
+    run, out = str(folder / "run"), str(folder / "no.parquet")
+    assert main(["score", run, str(folder / "who.parquet"), "--out", out]) != 0
+    told = capsys.readouterr().err
+    assert re.search("has neither 'uid'.* nor a column 'user_id'", told)
+    with pytest.raises(InputError, match=r"neither 'uid'.*nor a column 'user_id'") as error:
+        Recommender.load(folder / "run").recommend(late)
+    assert str(error.value).startswith("histories ")
+    assert "--" not in str(error.value)
+
+
+def test_frames_are_read_as_the_training_log(folder: Path) -> None:
+    policy, late = Recommender.load(folder / "run"), pd.read_parquet(folder / "late.parquet")
+    found = policy.recommend(late, k=3)
+    pd.testing.assert_frame_equal(found, policy.recommend(plain(late), k=3))
+    columns = {"user_id": "cast(uid as varchar)"}
+    as_text = policy.recommend(late, k=3, mapping=LogMapping(columns))
+    assert set(as_text.user_id) == set(found.user_id.astype(str))
+
+
+def frame_without(**changes: Any) -> pd.DataFrame:
+    rng, n = np.random.default_rng(0), 300
+    frame = pd.DataFrame({"user_id": rng.integers(9, size=n), "item_id": rng.integers(5, size=n)})
+    frame = frame.assign(
+        timestamp=1_700_000_000_000 + 1000 * np.arange(n), reward=1.0 * (rng.random(n) < 0.4)
+    )
+    return frame.rename(columns={k: v for k, v in changes.items() if isinstance(v, str)}).assign(
+        **{k: v for k, v in changes.items() if not isinstance(v, str)}
+    )
+
+
+@pytest.mark.parametrize(
+    ("frame", "said"),
+    [
+        (frame_without(user_id="who"), "mapping=LogMapping({'user_id': ...})"),
+        (frame_without(user_id=0.5), "'(user_id)::BIGINT'"),
+        (frame_without(timestamp=True), "'seconds * 1000'"),
+        (frame_without(reward=np.nan), "reward is missing"),
+    ],
+)
+def test_errors_of_frames_name_the_frame_not_a_scratch_file_or_an_option(
+    frame: pd.DataFrame, said: str
+) -> None:
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        with pytest.raises(InputError) as error:
+            Recommender("popular").fit(frame)
+    for text in (str(error.value), *(str(each.message) for each in noted)):
+        assert text.startswith("data"), text
+        assert ".parquet" not in text
+        assert "--" not in text
+    assert said in str(error.value)

@@ -21,15 +21,8 @@ from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
-from ucfrec.logs.binding import bind
-from ucfrec.logs.engine import engine, engine_in_memory
-from ucfrec.logs.expressions import (
-    COPYING,
-    FUNCTIONS,
-    TYPES,
-    NotScalarError,
-    columns_of,
-)
+from ucfrec.logs.engine import bind, engine, engine_in_memory
+from ucfrec.logs.expressions import COPYING, FUNCTIONS, TYPES, NotScalarError, columns_of
 from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_datasets import kuairand, kuairec, obd

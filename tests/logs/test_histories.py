@@ -42,7 +42,7 @@ def make_log(text: bool) -> pd.DataFrame:
 def test_files_and_frames_have_the_same_histories(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bool, block: int, session_by: str
 ) -> None:
-    monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", block)
+    monkeypatch.setattr("ucfrec.logs.typed.BATCH_ROWS", block)
     log = make_log(text)
     log.to_parquet(tmp_path / "log.parquet")
     given = LogMapping(), "reward * 2", 7

@@ -1,4 +1,4 @@
-"""Item embeddings: what they see, what they say, and of whom."""
+"""Item embeddings: what they see, what they say, and of whom; and the decomposition behind them."""
 
 from pathlib import Path
 
@@ -6,11 +6,21 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy import sparse
+from sklearn.utils.extmath import randomized_svd
 
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.logs.items import Exposure, item_embeddings, write_item_states
+from ucfrec.logs.append import append_logs
+from ucfrec.logs.features import EncodedFeatures
+from ucfrec.logs.items import (
+    Exposure,
+    SparseRows,
+    item_embeddings,
+    right_singular_vectors,
+    write_item_states,
+)
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 
@@ -161,7 +171,12 @@ def test_few_users_or_items_give_few_dimensions(tmp_path: Path) -> None:
 
 def test_states_can_be_written_without_features(tmp_path: Path) -> None:
     store = learn(tmp_path / "a", make_log(), features=False)
-    write_item_states(store.path, tmp_path, None, None, 30, 90, 4)
+    items, users = (
+        pd.read_parquet(store.path / f"{name}.parquet").train_count.to_numpy()
+        for name in ("items", "users")
+    )
+    known = EncodedFeatures(None, None, items, users, np.zeros((30, 0), dtype=np.int64))
+    write_item_states(store.path, tmp_path, known, 4)
     found = ItemStates.load(store.path / "item_states.safetensors")
     assert found.embeddings.shape == (30, 4)
     assert found.embeddings[:27].norm(dim=1).min() > 0.1
@@ -185,3 +200,64 @@ def test_bad_features_are_one_clear_error(tmp_path: Path, change, message: str) 
     with pytest.raises(InputError, match=message):
         learn(tmp_path / "a", make_log(), items=change(catalogue()))
     assert not (tmp_path / "a" / "s").exists()
+
+
+def on_disk(path: Path, matrix: sparse.csr_matrix) -> SparseRows:
+    rows = SparseRows(path, matrix.shape[1])
+    for begin in range(0, matrix.shape[0], 37):
+        rows.append(matrix[begin : begin + 37])
+    return rows
+
+
+@pytest.mark.parametrize("shape", [(400, 90), (90, 400), (60, 60)])
+def test_it_is_that_of_scikit_learn(tmp_path: Path, shape: tuple[int, int]) -> None:
+    generator = np.random.default_rng(0)
+    strong = generator.normal(size=(shape[0], 4)) @ generator.normal(size=(4, shape[1]))
+    dense = np.where(generator.random(shape) < 0.3, 3 + strong + generator.normal(size=shape), 0)
+    matrix = sparse.csr_matrix(dense.astype(np.float32))
+    by_column = 1 + generator.random(shape[1])
+    found, vectors = right_singular_vectors(on_disk(tmp_path / "m", matrix), by_column, 12)
+    divided = matrix.astype(np.float64) @ sparse.diags(1 / by_column)
+    _, values, expected = randomized_svd(divided, 12, random_state=0)
+    np.testing.assert_allclose(found, values, rtol=1e-5)
+    signs = np.sign((vectors * expected).sum(axis=1))
+    np.testing.assert_allclose(vectors * signs[:, None], expected, atol=1e-4)
+    assert (vectors[np.arange(12), np.abs(vectors).argmax(axis=1)] > 0).all()
+
+
+def test_directions_beyond_the_rank_are_zero(tmp_path: Path) -> None:
+    matrix = sparse.csr_matrix(np.outer(np.arange(1, 6), [1.0, 0, 2, 0]).astype(np.float32))
+    values, vectors = right_singular_vectors(on_disk(tmp_path / "m", matrix), np.ones(4), 3)
+    np.testing.assert_allclose(values, [np.sqrt(55 * 5), 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(vectors[0], np.array([1, 0, 2, 0]) / np.sqrt(5), atol=1e-6)
+    assert not vectors[1:].any()
+
+
+def of_two_kinds(users: int, items: list[int], start: int, seed: int) -> pd.DataFrame:
+    """Users of one kind are shown, and like, even items; those of the other odd ones."""
+    rng = np.random.default_rng(seed)
+    rows = [
+        (user, item, start + 1000 * user + step, int(rng.random() < 0.8))
+        for user in range(users)
+        for step, item in enumerate(rng.permutation([i for i in items if i % 2 == user % 2]))
+    ]
+    return pd.DataFrame(rows, columns=["user_id", "item_id", "timestamp", "reward"])
+
+
+def test_a_new_item_lies_with_what_its_users_were_shown(tmp_path: Path) -> None:
+    day = 86_400_000
+    start = 1_700_000_000_000
+    of_two_kinds(80, [*range(12)], start, 0).to_parquet(tmp_path / "old.parquet")
+    of_two_kinds(80, [*range(14)], start + day, 1).to_parquet(tmp_path / "new.parquet")
+    options = PrepareOptions(embedding_size=4)
+    prepare([tmp_path / "old.parquet"], LogMapping(), tmp_path / "store", options)
+    append_logs(tmp_path / "store", [tmp_path / "new.parquet"], tmp_path / "grown")
+    old, new = (
+        EpisodeStore.open(tmp_path / name).item_states.embeddings.numpy()
+        for name in ("store", "grown")
+    )
+    # Old vectors moved a little; new ones lie on the side of their kind.
+    assert np.abs(new[:12] - old).max() < 0.5
+    for item in (12, 13):
+        near = new[:12] @ new[item]
+        assert near[item % 2 :: 2].mean() > near[1 - item % 2 :: 2].mean() + 0.3

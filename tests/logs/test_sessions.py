@@ -41,7 +41,7 @@ def test_a_session_that_ended_within_the_gap_before_the_end_may_have_gone_on(
 def test_splits_begin_at_a_place_of_the_sorted_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, span: int, shares: tuple[float, ...]
 ) -> None:
-    monkeypatch.setattr("ucfrec.logs.engine.BATCH_ROWS", 17)
+    monkeypatch.setattr("ucfrec.logs.typed.BATCH_ROWS", 17)
     times = np.random.default_rng(0).integers(span, size=200)
     times[0] = -1  # so that some row is before the first boundary
     path = write_log(tmp_path, times, user_id=np.arange(200) % 9, item_id=range(200))

@@ -19,7 +19,7 @@ from ucfrec.errors import InputError, InputNote
 from ucfrec.files.record import CARD
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, collect_steps, evaluate_off_policy
-from ucfrec.off_policy.features import make_inputs
+from ucfrec.off_policy.models import make_inputs
 from ucfrec.off_policy.score import (
     LoggedSessions,
     read_logged_sessions,

@@ -13,7 +13,7 @@ from ucfrec.errors import InputError
 from ucfrec.off_policy import LoggedSteps, conclude
 from ucfrec.off_policy.estimators import session_terms
 from ucfrec.off_policy.evaluate import OffPolicyReport
-from ucfrec.off_policy.fqe import ModelReport
+from ucfrec.off_policy.models import ModelReport
 from ucfrec.off_policy.selection import Selection, choose, names_of, select
 
 ITEMS = 8

@@ -11,7 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.policies.boosted import BoostedPolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
-from ucfrec.user_model.trees import BoostedTrees
+from ucfrec.user_model.session_end import BoostedTrees, fit_trees
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_tables_are_the_trees_of_scikit_learn(
     policy, store = fitted
     numbers = np.arange(store.n_steps)
     inputs, liked = policy._rows(store, numbers)
-    trees = BoostedTrees.fit(inputs, liked, 0)
+    trees = BoostedTrees(**fit_trees(inputs, liked, 0))
     at = store.locate(numbers[:200])
     windows = store.windows(*at, 6)
     monkeypatch.setattr(policy, "_inputs", lambda *_: torch.from_numpy(inputs[:200, None]))

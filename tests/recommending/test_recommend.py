@@ -463,7 +463,7 @@ def test_items_of_many_requests_are_as_frequent_as_their_propensities(n: int) ->
     chances = rule.log_probabilities(scores[:1]).double().exp()[0].numpy()
     ids = np.arange(n)
     for users, requests in ((ids, ids * 0), (ids * 0, ids)):
-        items, _ = rule.ranked(scores, 1, uniforms(users, requests, 13, 0))
+        items, _ = rule.rank_items(scores, 1, uniforms(users, requests, 13, 0))
         counts = np.bincount(items[:, 0].numpy(), minlength=12)
         assert chisquare(counts, n * chances / chances.sum()).pvalue > 1e-3
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
+from ucfrec.off_policy.models import fit_models
 
 REFERENCE = Path(__file__).parents[1] / "off_policy" / "fixtures" / "reference.npz"
 

@@ -118,11 +118,11 @@ def test_level_is_what_all_items_share() -> None:
 def test_expected_rewards_are_in_reward_units() -> None:
     model = planted(tags=False)
     scores = torch.tensor([-50.0, 0.0, 50.0])
-    torch.testing.assert_close(model.expected(scores), torch.tensor([-1.0, 0.5, 2.0]))
+    torch.testing.assert_close(model.expect(scores), torch.tensor([-1.0, 0.5, 2.0]))
     model.binary.fill_(False)
     model.reward_mean.fill_(3.0)
     model.reward_std.fill_(2.0)
-    torch.testing.assert_close(model.expected(scores), torch.tensor([-97.0, 3.0, 103.0]))
+    torch.testing.assert_close(model.expect(scores), torch.tensor([-97.0, 3.0, 103.0]))
 
 
 CATALOGUE, SIZE = 12, 3

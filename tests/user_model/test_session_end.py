@@ -9,7 +9,13 @@ import torch
 from ucfrec.episodes.exposure import Likeness, Shown
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, whole_sessions
+from ucfrec.user_model.session_end import (
+    BoostedTrees,
+    LoggedEnds,
+    SessionEnd,
+    fit_trees,
+    whole_sessions,
+)
 
 ITEMS = 12
 
@@ -44,8 +50,8 @@ def test_that_repetition_ends_sessions_is_found_if_there_are_steps_to_show_it(la
     likeness, logged = planted_ends()
     held_out = part_of(logged, slice(4000, last + 2000 * (last == 4000)))
     end, report = SessionEnd.fit(likeness, part_of(logged, slice(4000)), held_out, 0)
-    again = (logged.items == logged.shown.items[:, 0]).numpy()
-    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    again = (logged.items == logged.history.items[:, 0]).numpy()
+    found = end.probabilities(logged.history, logged.items, logged.rewards, logged.steps)
     if last == 4000:
         assert report.kept in ("logistic", "boosted")
         assert report.loss[report.kept] < report.loss["constant"] - 0.1
@@ -67,7 +73,7 @@ def test_steps_later_than_logged_ones_are_like_the_last() -> None:
 
     def at(step: int) -> float:
         steps = np.full(len(logged.steps), step)
-        return float(end.probabilities(logged.shown, logged.items, logged.rewards, steps).mean())
+        return float(end.probabilities(logged.history, logged.items, logged.rewards, steps).mean())
 
     assert at(7) == pytest.approx(0.4, abs=0.05)
     assert at(7) > at(6)
@@ -77,7 +83,7 @@ def test_steps_later_than_logged_ones_are_like_the_last() -> None:
 def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
     """Sessions end with the second of two alike items, but not with the third."""
     likeness, logged = planted_ends()
-    items, shown = logged.items, logged.shown.items
+    items, shown = logged.items, logged.history.items
     ended = ((items == shown[:, 0]) != (items == shown[:, 1])).numpy()
     parts = [
         part_of(replace(logged, ended=ended), rows) for rows in (slice(4000), slice(4000, 6000))
@@ -85,7 +91,7 @@ def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
     end, report = SessionEnd.fit(likeness, *parts, 0)
     assert report.kept == "boosted"
     assert report.loss["boosted"] < 0.1 * report.loss["logistic"]
-    inputs = logged.shown, items, logged.rewards, logged.steps
+    inputs = logged.history, items, logged.rewards, logged.steps
     again = SessionEnd.of(likeness, {**end.tensors})
     np.testing.assert_array_equal(again.probabilities(*inputs), end.probabilities(*inputs))
     with pytest.raises(ValueError, match="beyond the last input"):
@@ -114,12 +120,12 @@ def test_all_items_at_once_end_sessions_as_each_alone() -> None:
     steps, rewards = torch.from_numpy(logged.steps), torch.from_numpy(logged.rewards)
     every = torch.arange(ITEMS).expand(400, -1)
     rewards = rewards.unsqueeze(1).expand(-1, ITEMS)
-    (together,) = end.of_items(logged.shown, every, [rewards], steps)
-    two = end.of_items(logged.shown, every, [torch.zeros_like(rewards), rewards], steps)
+    (together,) = end.score_items(logged.history, every, [rewards], steps)
+    two = end.score_items(logged.history, every, [torch.zeros_like(rewards), rewards], steps)
     assert torch.equal(two[1], together)
     for item in range(ITEMS):
         alone = end.probabilities(
-            *(logged.shown, torch.full((400,), item), logged.rewards, logged.steps)
+            *(logged.history, torch.full((400,), item), logged.rewards, logged.steps)
         )
         np.testing.assert_allclose(together[:, item].numpy(), alone, atol=1e-6)
 
@@ -129,7 +135,7 @@ def test_sessions_that_all_end_or_never_do_are_a_constant() -> None:
     for ends in (False, True):
         given = replace(logged, ended=np.full(50, ends))
         end, report = SessionEnd.fit(likeness, given, given, 0)
-        found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+        found = end.probabilities(logged.history, logged.items, logged.rewards, logged.steps)
         assert found.tolist() == [float(ends)] * 50
         assert (report.kept, report.loss) == ("constant", {"constant": 0.0})
 
@@ -158,7 +164,7 @@ def test_the_share_of_steps_that_end_sessions_is_the_logged_one(sessions: int) -
     store = EpisodeStore.from_arrays(columns, lengths, episodes, states)
     logged = LoggedEnds.of(store, 2, n, 0)
     end, _ = SessionEnd.fit(Likeness.of(states), logged, logged, 0)
-    found = end.probabilities(logged.shown, logged.items, logged.rewards, logged.steps)
+    found = end.probabilities(logged.history, logged.items, logged.rewards, logged.steps)
     assert found.mean() == pytest.approx(0.4, abs=0.02)
 
 
@@ -203,8 +209,8 @@ def test_ends_of_the_rows_of_users_are_no_ends_of_sessions(cut: bool) -> None:
     halves = [store.select(np.flatnonzero(np.array(users) % 2 == half)) for half in (0, 1)]
     logged, held_out = (LoggedEnds.of(half, 4, len(items), 0) for half in halves)
     end, report = SessionEnd.fit(Likeness.of(states), logged, held_out, 0)
-    again = (held_out.items == held_out.shown.items[:, 0]).numpy()
-    given = held_out.shown, held_out.items, held_out.rewards, held_out.steps
+    again = (held_out.items == held_out.history.items[:, 0]).numpy()
+    given = held_out.history, held_out.items, held_out.rewards, held_out.steps
     found = end.probabilities(*given)
     assert report.last_sessions is not cut
     assert found[again].mean() > 0.9
@@ -230,3 +236,17 @@ def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
         np.testing.assert_array_equal(getattr(drawn, name), getattr(known, name)[chosen])
     episode = np.searchsorted(np.cumsum(lengths), known.rewards, side="right")
     np.testing.assert_array_equal(known.ended, known.steps == lengths[episode] - 1)
+
+
+def test_another_value_of_one_input_is_as_if_it_were_there() -> None:
+    rng = np.random.default_rng(0)
+    inputs = rng.integers(4, size=(2000, 3)).astype(np.float64)
+    trees = BoostedTrees(**fit_trees(inputs, (inputs.sum(1) + rng.normal(size=2000)) > 5, 0))
+    given, other = torch.from_numpy(inputs), torch.from_numpy(rng.integers(4, size=2000))
+    for number in range(3):
+        changed = given.clone()
+        changed[:, number] = other
+        odds = trees.replace_input(given, number, [other, given[:, number]])
+        assert torch.equal(odds[0], trees(changed))
+        assert torch.equal(odds[1], trees(given))
+        assert not torch.equal(*odds)

@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from ucfrec.acting.item_product import multipliers
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
@@ -127,8 +127,9 @@ class ItemIndex:
         """The best k of the candidates and their scores, (B, k) each."""
         scorer, n_items = self._scorer, self._index.ntotal
         query = scorer.query(sessions)
-        part, count = scorer.weighted(query), min(n_items, 4 * k + _MORE)
-        products, numbers = self._index.search(multipliers(part), count)
+        part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
+        factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
+        products, numbers = self._index.search(factors, count)
         items, missing = torch.from_numpy(numbers), torch.from_numpy(numbers < 0)
         items = items.clamp(min=0)
         scores = scorer.scores_of_some(query, part, items, torch.from_numpy(products))

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.benchmark.grid import Measurement, run_grid
+from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.results.rows import ResultRow
 
 Rows = Sequence[ResultRow]
 
@@ -52,7 +52,7 @@ class Benchmark:
     methods: Collection[str]
     """Names that `BenchmarkRequest.methods` may have."""
     plan: Callable[["BenchmarkRequest", Budget], Cells]
-    how: Measurement[Cell]
+    how: Measurement
 
 
 @dataclass(frozen=True)
@@ -96,14 +96,12 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         InputError: the budget, a task or a method is unknown, another table than main is requested
             of a single environment, or cells failed.
     """
-    if request.budget not in suite.budgets:
-        budgets = ", ".join(suite.budgets)
-        raise InputError(f"unknown budget {request.budget}; choose one of {budgets}")
-    budget = suite.budgets[request.budget].narrowed(
+    select_names(suite.budgets, [request.budget], "budget")
+    select_names(suite.tasks, request.tasks, "task")
+    select_names(suite.methods, request.methods, "method")
+    budget = suite.budgets[request.budget].narrow(
         seeds=request.training_seeds, logs=request.logs, evaluation_seed=request.evaluation_seed
     )
-    _require_known("task", request.tasks, suite.tasks)
-    _require_known("method", request.methods, suite.methods)
     tables = list(request.tables)
     if request.environment is not None and not (tables := [t for t in tables if t == "main"]):
         raise InputError("--env gives the table main only; omit --table")
@@ -129,8 +127,3 @@ def show(suite: Benchmark, tables: Sequence[str], rows: Rows) -> str:
     """The tables that have rows in `rows`, as Markdown; nothing is measured."""
     by_table = {table: [row for row in rows if row.table == table] for table in tables}
     return "\n\n".join(suite.tables[t].show(group) for t, group in by_table.items() if group)
-
-
-def _require_known(kind: str, names: Sequence[str], choices: Collection[str]) -> None:
-    if unknown := [name for name in names if name not in choices]:
-        raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(choices)}")

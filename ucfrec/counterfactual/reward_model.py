@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.arrays import IntArray
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.settings import (
@@ -100,8 +100,8 @@ class ELBO(NamedTuple):
 class EffectsMean(nn.Module):
     """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states.
 
-    Actions are those of `transitions`: the item's vector, then the part of the linear predictor
-    that does not depend on the state.
+    Actions are those of `read_transitions`: the item's vector, then the part of the linear
+    predictor that does not depend on the state.
     """
 
     state_mean: Tensor
@@ -272,21 +272,28 @@ def _normalise(values: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     return (values - mean) / torch.where(std > 0, std, 1.0)
 
 
-class EffectTransitions:
-    """Reads transitions whose actions `EffectsMean` understands."""
+@torch.no_grad()
+def read_transitions(
+    view: EpisodeStore,
+    episodes: IntArray,
+    steps: IntArray,
+    item_rewards: ItemRewardModel | None = None,
+    actions: Array | None = None,
+) -> Transitions:
+    """Single steps of a view with the actions (M, A) that the reward model is fitted to.
 
-    def __init__(self, model: ItemRewardModel) -> None:
-        self._model = model
-
-    @torch.no_grad()
-    def __call__(self, view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps of a view without augmented episodes, as `EpisodeStore.transitions`.
-
-        Actions are (M, D + 1): the vectors of the items, then what of their scores does not depend
-        on the state.
-        """
-        model = self._model
-        read = view.transitions(episodes, steps)
-        rows = RewardRows.at(view, episodes, steps, model.reach)
-        fixed = model.fixed_part(rows.shown, rows.users, rows.items)
-        return replace(read, actions=torch.cat([model.vectors[rows.items], fixed[:, None]], 1))
+    Args:
+        item_rewards: what `EffectsMean` is made of; actions are then (M, D + 1): the vectors of
+            the items, then what of their scores does not depend on the state.
+        actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
+    """
+    transitions = view.transitions(episodes, steps)
+    other = None if actions is None else torch.from_numpy(actions)
+    if item_rewards is None:
+        if other is None:
+            return transitions
+        return replace(transitions, actions=view.action_vectors(other))
+    rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
+    items = rows.items if other is None else other
+    fixed = item_rewards.score_without_state(rows.history, rows.users, items)
+    return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))

@@ -17,6 +17,7 @@ from ucfrec.counterfactual.reward_model import (
     CRMConfig,
     EffectsMean,
     kl_to_prior,
+    read_transitions,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
@@ -25,9 +26,8 @@ from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_trained, load_weights
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.processes import random_state_kept
+from ucfrec.user_model.reward import ItemRewardModel
 
-Read = Callable[[EpisodeStore, IntArray, IntArray], Transitions]
-"""Reads the transitions of (view, episodes, steps)."""
 INITIAL: Final = "initial.safetensors"
 """Weights of an older reward model, in the folder of the new one."""
 _ACTIVE_NATS = 0.01
@@ -350,7 +350,8 @@ def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, I
 
 
 def sample_transitions(
-    view: EpisodeStore, limit: int, seed: int, read: Read = EpisodeStore.transitions
+    view: EpisodeStore, limit: int, seed: int, item_rewards: ItemRewardModel | None = None
 ) -> Transitions:
-    """The transitions of `sample_steps`."""
-    return read(view, *sample_steps(view, limit, seed))
+    """The transitions of `sample_steps`, as `read_transitions` reads them."""
+    episodes, steps = sample_steps(view, limit, seed)
+    return read_transitions(view, episodes, steps, item_rewards)

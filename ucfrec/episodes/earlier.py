@@ -7,9 +7,9 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.episodes.columns import Columns, StepColumn
 from ucfrec.episodes.returns import returns_to_go
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.view import Columns, StepColumn
 
 LONGEST_HISTORY: Final = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
@@ -199,9 +199,5 @@ class _ContinuedColumns(Columns):
         sizes = {"n_steps": len(source), "n_episodes": len(lengths), "n_shards": 0}
         record = later.record.copy_with(**sizes)
         super().__init__(later.path, record, arrays, later.item_states)
-        self._rows, self._source, self.skipped = rows, source, counts
-
-    def _column(self, name: str) -> StepColumn:
-        if name not in self._arrays:
-            return _JoinedColumn(self._rows, name, self._source)
-        return super()._column(name)
+        self.skipped = counts
+        self._steps = {name: _JoinedColumn(rows, name, source) for name in record.columns}

@@ -56,7 +56,7 @@ class Source(Entry):
     where: Text | None = None
     """Condition of the rows that were read."""
     partitions: bool = False
-    session_by: Text | None = None
+    session_by: schema.SessionBy | None = None
     session_gap_ms: Count | None = None
     min_steps: _Positive = 1
     """Episodes with fewer steps were dropped."""

@@ -12,12 +12,10 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.columns import Columns
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.view import EpisodeView
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
 from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
 from ucfrec.errors import InputError
 from ucfrec.files.parquet import read_ids
@@ -37,8 +35,8 @@ _LISTS: Final = (schema.OBSERVATION, schema.ACTION)
 class EpisodeStore(EpisodeView):
     """Episodes (user sessions, robot trajectories) of a store, or a view of some of them.
 
-    `open`, `write` and `from_arrays` (in memory) return a view of all episodes of a store; `split`,
-    `select` and `with_overlay` return other views of the same columns. Views are never modified.
+    `open`, `write` and `from_arrays` (in memory) return a view of all episodes of a store; `split`
+    and `select` return other views of the same columns. Views are never modified.
     """
 
     @classmethod
@@ -124,7 +122,7 @@ class EpisodeStore(EpisodeView):
 
     def _repr_html_(self) -> str:
         heads = ("", "episodes", "steps", "mean return")
-        views = {name: self.split(name) for name in schema.SPLITS if self.overlay is None}
+        views = {name: self.split(name) for name in schema.SPLITS}
         lines = [
             (name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}")
             for name, view in {"all": self, **views}.items()
@@ -141,11 +139,7 @@ class EpisodeStore(EpisodeView):
 
         Args:
             episodes: positions, 0 to E − 1, of any number.
-
-        Raises:
-            InputError: this view has augmented episodes.
         """
-        _require_no_copies(self, "select from")
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
@@ -155,49 +149,17 @@ class EpisodeStore(EpisodeView):
             name: "train", "validation" or "test"; the split may be empty.
 
         Raises:
-            InputError: `name` is none of these, or this view has augmented episodes.
+            InputError: `name` is none of these.
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
-        _require_no_copies(self, "split")
         in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
         return self.select(np.flatnonzero(in_split))
 
-    def with_overlay(self, overlay: Overlay) -> "EpisodeStore":
-        """A view with the copies of `overlay` appended after the episodes of this view.
-
-        Raises:
-            InputError: the overlay was made from another store.
-        """
-        sources = np.concatenate([overlay.copy_source, overlay.action_source])
-        edited = overlay.copy_source[overlay.edit_copy]
-        steps = np.concatenate([overlay.edit_step, overlay.action_step])
-        fits = not len(sources) or 0 <= sources.min() <= sources.max() < self.record.n_episodes
-        if fits:
-            ends = self._columns.lengths[np.concatenate([edited, overlay.action_source])]
-            fits = bool(((steps >= 0) & (steps < ends)).all())
-        fits = fits and overlay.edit_state.shape[1] == self.state_size
-        if not fits or not self._has_actions(overlay.action):
-            raise InputError(
-                f"{overlay} has other episodes, steps, states or actions than {self.path}; use the "
-                "store that the copies were made from"
-            )
-        joined = overlay if self.overlay is None else self.overlay.joined(overlay)
-        return EpisodeStore(self._columns, self._selected, joined)
-
-    def _has_actions(self, actions: Array) -> bool:
-        """Whether actions are items (N,) of the catalogue, or vectors (N, A) of its size."""
-        if not len(actions):
-            return True
-        if not self.has_items:
-            return list(actions.shape[1:]) == self.record.columns[schema.ACTION]
-        last = len(self.item_states.embeddings) - 1
-        whole = actions.dtype.kind == "i" and actions.ndim == 1
-        return whole and 0 <= int(actions.min()) <= int(actions.max()) <= last
-
-    def without_augmentation(self) -> "EpisodeStore":
-        """A view of the same logged episodes, without augmented episodes."""
-        return EpisodeStore(self._columns, self._selected)
+    @cached_property
+    def whole(self) -> "EpisodeStore":
+        """A view of all episodes of the store."""
+        return EpisodeStore(self._columns)
 
     def with_returns_to_go(
         self, values: Float32Array, definition: ReturnToGo | None = None
@@ -207,23 +169,16 @@ class EpisodeStore(EpisodeView):
         Args:
             values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
             definition: what they count; None for what they counted before.
-
-        Raises:
-            InputError: this view has augmented episodes.
         """
-        _require_no_copies(self, "replace the returns-to-go of")
-        column = self._columns.step_column(schema.RETURN_TO_GO)
+        name = schema.RETURN_TO_GO
+        returns = self._columns.step_column(name).take(np.arange(self.record.n_steps))
         episodes, steps = self.all_steps()
-        column[self._columns.starts[self._sources[episodes]] + steps] = values
-        columns = self._columns.with_step_column(schema.RETURN_TO_GO, column, definition)
+        returns[self._columns.starts[self.episode_ids[episodes]] + steps] = values
+        columns = self._columns.replace(name, StepColumn([returns]), (), definition)
         return EpisodeStore(columns, self._selected)
 
     def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
-        """A view of the same episodes whose returns-to-go are counted by `definition`.
-
-        Raises:
-            InputError: this view has augmented episodes.
-        """
+        """A view of the same episodes whose returns-to-go are counted by `definition`."""
         rewards = self.step_values(schema.REWARD, *self.all_steps())
         offsets = np.concatenate([[0], np.cumsum(self.lengths)])
         return self.with_returns_to_go(definition.of_logs(rewards, offsets), definition)
@@ -233,13 +188,11 @@ class EpisodeStore(EpisodeView):
 
         Args:
             dimensions: to remove, each 0 to O − 1.
-
-        Raises:
-            InputError: this view has augmented episodes; their states include all dimensions.
         """
-        _require_no_copies(self, "remove observation dimensions from")
-        kept = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        return EpisodeStore(self._columns.with_observation_dimensions(kept), self._selected)
+        rest = np.setdiff1d(np.arange(self.observation_size), dimensions)
+        column = self._columns.step_column(schema.OBSERVATION).select_dimensions(rest)
+        columns = self._columns.replace(schema.OBSERVATION, column, (len(rest),), None)
+        return EpisodeStore(columns, self._selected)
 
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
@@ -260,14 +213,6 @@ class EpisodeStore(EpisodeView):
         return mean.float(), variance.sqrt().float()
 
 
-def _require_no_copies(store: EpisodeStore, operation: str) -> None:
-    if store.overlay is not None:
-        raise InputError(
-            f"{store} has augmented episodes; {operation} its without_augmentation(), then add "
-            "them with with_overlay"
-        )
-
-
 def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:
     return {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
 
@@ -278,10 +223,8 @@ def store_frame(store: EpisodeStore) -> "pd.DataFrame":
     the other columns of the log that the store has, and `split`.
 
     Raises:
-        InputError: the view has augmented episodes, or a file of the store is damaged.
+        InputError: a file of the store is damaged.
     """
-    if store.overlay is not None:
-        raise InputError(f"{store} has augmented episodes; take its without_augmentation()")
     import pandas as pd  # most stores are never shown
 
     episodes, steps = store.all_steps()

@@ -14,8 +14,7 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.simulator import Simulator
+from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.processes import random_state_kept
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID

@@ -13,10 +13,8 @@ import pyarrow.parquet as pq
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.parquet import require_regular
 from ucfrec.schema import ITEM_ID, USER_IDS
 
@@ -31,26 +29,6 @@ FEATURES: Final = "features"
 """Column of the item table with an array's numbers."""
 TAGS: Final = "tags"
 """Column of the item table with the numbers of an array's true columns."""
-
-
-def gymnasium_simulator(
-    env_id: str, observe: Sequence[str], item_features: str | None
-) -> Simulator:
-    """The simulator that wraps a Gymnasium environment.
-
-    Args:
-        env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
-        observe: entries of a dict observation that are observed, see `GymnasiumEnvironment`.
-        item_features: file or attribute with item features, see `gymnasium_items.item_table`.
-    """
-
-    def make(num_envs: int, folder: Path | None) -> GymnasiumEnvironment:
-        if item_features is None:
-            return GymnasiumEnvironment(env_id, num_envs, observe)
-        return GymnasiumCatalog(env_id, num_envs, partial(item_table, item_features), observe)
-
-    summary = f"the Gymnasium environment {env_id}"
-    return Simulator(summary, make, behaviors={"random": Uniform}, feedback=REWARD)
 
 
 class GymnasiumEnvironment(SyncVectorEnv):

@@ -15,16 +15,16 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.liked import Liked
-from ucfrec.evaluation.ranking import Ranker, Steps
-from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
-from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
-from ucfrec.policies.popular import (
+from ucfrec.evaluation.ranking import Liked, Ranker, Steps
+from ucfrec.policies.baselines import (
+    ItemKNNConfig,
+    ItemKNNPolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
-    decayed_counts,
-    liked_rates,
+    count_decayed,
+    shrink_rates,
 )
+from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
 from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -181,7 +181,7 @@ def recent_rankers(
     rankers: list[Ranker] = []
     for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
         hours = kind.best_half_life(first, validation, liked_of)
-        scores = kind.scores_of(decayed_counts(train, hours, liked_of))
+        scores = kind.scores_of(count_decayed(train, hours, liked_of))
         rankers.append(SameForAll(f"recent {name}", scores.double()))
     return rankers
 
@@ -206,7 +206,7 @@ def baselines(
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
-        SameForAll("item click rate", liked_rates(counts)),
+        SameForAll("item click rate", shrink_rates(counts)),
     ]
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))

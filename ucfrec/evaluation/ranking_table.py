@@ -10,11 +10,12 @@ from ucfrec.arrays import Array
 from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.liked import Liked, LikedByRange
 from ucfrec.evaluation.ranking import (
     MEASURES,
     Compared,
     Later,
+    Liked,
+    LikedByRange,
     Period,
     Ranker,
     compare,
@@ -28,7 +29,7 @@ from ucfrec.evaluation.ranking_baselines import (
     recent_rankers,
 )
 from ucfrec.provenance import config_hash, provenance
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "rank"

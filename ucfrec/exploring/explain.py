@@ -94,7 +94,7 @@ def explain(
     return Explained(rows, cards, tuple(excluded))
 
 
-def pasted_history(text: str) -> pd.DataFrame:
+def read_pasted(text: str) -> pd.DataFrame:
     """The history that someone pasted: a row per line, `item_id` or `item_id, reward`, the latest
     last, as a frame of one user whose rows are a minute apart.
 

@@ -1,28 +1,31 @@
-"""The page of the explorer as HTML, from what a visitor asked for."""
+"""The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+from fastapi import FastAPI, Request, Response
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
+from ucfrec.exploring.explain import PARTS, Explained, explain, read_pasted
 from ucfrec.files.record import CARD
-from ucfrec.python_api.given_data import histories_given
+from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
+from ucfrec.recommending.server import AllowedHosts
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
-from ucfrec.reporting.page_results import find_quoted, read_evidence
-from ucfrec.results.row import ResultRow
+from ucfrec.reporting.results import find_quoted, read_evidence
+from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PACKAGE: Final = "ucfrec.exploring"
@@ -31,6 +34,14 @@ _IMAGES: Final = ("image", "image_url", "picture")
 _NUMBER: Final = re.compile(r"-?\d{1,12}(\.\d{1,12})?")
 _USERS_LISTED: Final = 1000
 _MOST_ITEMS: Final = 100
+_HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'unsafe-inline'; "
+        "img-src http: https:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
 
 
 @dataclass(frozen=True)
@@ -153,8 +164,7 @@ class Explorer:
     def _recommend(
         self, trained: TrainedPolicy, fields: Mapping[str, str]
     ) -> tuple[str, str, Explained]:
-        text, user = fields.get("history", "").strip(), fields.get("user", "").strip()
-        history = _read_pasted(trained, text) if text else _read_stored(trained, user)
+        history = _read_history(trained, fields)
         rule = _read_rule(trained, fields)
         k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
         filter_seen = fields.get("keep_seen") is None
@@ -206,20 +216,24 @@ class Explorer:
         return card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
 
 
-def _read_pasted(trained: TrainedPolicy, text: str) -> Histories:
-    (history,) = histories_given(trained, pasted_history(text), None, ["pasted"])
-    unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
-    if len(unknown):
-        raise InputError(
-            f"the run {trained.folder.name} does not know the items "
-            f"{name_some(list(dict.fromkeys(unknown.tolist()))):.200}; take their "
-            "lines out of the history"
-        )
-    return history
+def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
+    """The history that is pasted, else that of the user in the store.
 
-
-def _read_stored(trained: TrainedPolicy, user: str) -> Histories:
-    run = trained.folder.name
+    Raises:
+        InputError: the text cannot be used, or there is no such user or no store.
+    """
+    run, text = trained.folder.name, fields.get("history", "").strip()
+    if text:
+        (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
+        unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
+        if len(unknown):
+            raise InputError(
+                f"the run {run} does not know the items "
+                f"{name_some(list(dict.fromkeys(unknown.tolist()))):.200}; take their lines out of "
+                "the history"
+            )
+        return history
+    user = fields.get("user", "").strip()
     if trained.users.numbers(np.asarray([user]))[0] < 0:
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
@@ -229,7 +243,7 @@ def _read_stored(trained: TrainedPolicy, user: str) -> Histories:
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"
         )
-    (history,) = histories_given(trained, None, None, [user])
+    (history,) = read_histories(trained, None, None, [user])
     return history
 
 
@@ -258,3 +272,44 @@ def _read_number(
     if not low <= value <= high:
         raise InputError(f"{name} is {text[:40]!r}; give a number from {low:g} to {high:g}")
     return value
+
+
+def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
+    """The application, which keeps no state of its visitors.
+
+    Args:
+        allowed_hosts: values of the header `Host` that are answered.
+    """
+    app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
+    remedy = "open the address that `ucfrec explore` printed"
+    app.add_middleware(AllowedHosts, allowed=allowed_hosts, remedy=remedy)
+    script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
+
+    def html(text: str) -> Response:
+        # Texts of files may have bytes that are not valid Unicode.
+        content = text.encode("utf-8", errors="backslashreplace")
+        return Response(content, media_type="text/html; charset=utf-8", headers=_HEADERS)
+
+    @app.get("/")
+    def page(request: Request) -> Response:
+        """The page, filled in as the address says."""
+        return html(explorer.page(request.query_params))
+
+    @app.get("/results")
+    def results(request: Request) -> Response:
+        """The list alone."""
+        return html(explorer.results(request.query_params))
+
+    @app.get("/explore.js")
+    def javascript() -> Response:
+        """The script of the page."""
+        return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
+
+    @app.get("/report/{number}")
+    def report(number: int) -> Response:
+        """The report of a run."""
+        if not 0 <= number < len(explorer.runs):
+            return Response("there is no such run", 404)
+        return html(explorer.reports[number])
+
+    return app

@@ -1,29 +1,45 @@
-"""DuckDB connections that can open nothing but their inputs and a scratch folder."""
+"""DuckDB connections that can open nothing but their inputs, and expressions over their tables.
 
+Every text that is run as SQL is bound here to the columns of a table first, and what DuckDB says of
+files, memory and disk is explained here. Of a later log, `settle_mapping` chooses between the
+columns that a run remembers of its training log and the plain ones.
+"""
+
+import difflib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import duckdb
 import numpy as np
+from safetensors import SafetensorError
 
-from ucfrec.arrays import Array, IntArray
+from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.tables import glob_pattern, text
+from ucfrec.logs.expressions import NotScalarError, cast_truth_values, columns_of, refusal
+from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
+from ucfrec.logs.tables import (
+    Table,
+    fault_of_line,
+    first_line,
+    glob_pattern,
+    quote,
+    quote_name,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 BATCH_ROWS: Final = 2**17
 """Most rows of a batch read from DuckDB."""
-_BATCH_BYTES: Final = 2**25
 _BESIDE: Final = 370 * 2**20
 """Bytes that going through rows takes beside the engine and what the process has already."""
-
 _CLOSED: Final = {
     "allow_community_extensions": False,
     "allow_persistent_secrets": False,
@@ -32,6 +48,14 @@ _CLOSED: Final = {
     # Otherwise SQL could read any Python variable as a table.
     "python_enable_replacements": False,
 }
+_NAME: Final = re.compile(r"[^\W\d]\w*")
+_DISK_FULL: Final = (
+    "No space left",
+    "quota exceeded",
+    "max_temp_directory_size",
+    "requested and",
+)
+"""In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
 
 @contextmanager
@@ -72,60 +96,16 @@ def engine(
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
-            _close(connection, inputs, str(work))
+            _close(connection, inputs, work)
             yield connection
         finally:
             connection.close()
 
 
-def _set_memory_limit(connection: duckdb.DuckDBPyConnection, size: str) -> None:
-    try:
-        connection.execute("SET memory_limit = ?", [size])
-    except duckdb.Error:
-        raise InputError(f"memory_limit {size!r} is not a size; write e.g. 2GB") from None
-
-
-def anonymous_bytes(process: int | None = None) -> int:
-    """Memory of a process that is not mapped from files, which the system cannot take back.
-
-    Args:
-        process: its number; None for this one.
-
-    Returns:
-        0 where the system does not say, or the process has ended.
-    """
-    try:
-        lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()
-    except OSError:
-        return 0
-    return sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
-
-
-def bytes_of(size: str) -> int | None:
-    """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
-    if match is None:
-        return None
-    number, prefix, binary = match.groups()
-    return int(float(number) * (1024 if binary else 1000) ** " kmgt".index(prefix or " "))
-
-
-def rows_of_batch(numbers: int) -> int:
-    """Rows of a batch, fewer if they are long.
-
-    Args:
-        numbers: of the vectors of a row, float32.
-    """
-    return min(BATCH_ROWS, max(_BATCH_BYTES // (64 + 4 * numbers), 1))
-
-
 @contextmanager
 def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
     """A DuckDB connection for registered tables only: it opens no file and never uses the disk.
-
-    Args:
-        memory_limit: of the engine, such as "256MB"; None for DuckDB's default.
-    """
+    `memory_limit` such as "256MB" is that of the engine; None for DuckDB's default."""
     connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
     try:
         if memory_limit is not None:
@@ -137,22 +117,11 @@ def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBP
         connection.close()
 
 
-def as_numpy(column: "pa.Array") -> Array:
-    """A column of numbers or truth values without missing ones, copied only if it must be.
-
-    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
-    """
-    if str(column.type) == "bool":
-        return np.from_dlpack(column.cast("uint8")).view(np.bool_)
-    return np.from_dlpack(column)
-
-
-def as_arrow(numbers: IntArray) -> "pa.Array":
-    """Whole numbers as a column; `pyarrow.array` would import pandas."""
-    import pyarrow as pa
-
-    buffer = pa.py_buffer(np.ascontiguousarray(numbers, dtype=np.int64))
-    return pa.Array.from_buffers(pa.int64(), len(numbers), [None, buffer])
+def _set_memory_limit(connection: duckdb.DuckDBPyConnection, size: str) -> None:
+    try:
+        connection.execute("SET memory_limit = ?", [size])
+    except duckdb.Error:
+        raise InputError(f"memory_limit {size!r} is not a size; write e.g. 2GB") from None
 
 
 def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
@@ -176,17 +145,231 @@ def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
             f"isfinite(b::DOUBLE) THEN CASE WHEN a {sign} b THEN a ELSE b END END, "
             f"(a, b, c) AS {name}({name}(a, b), c)"
         )
-    # Tables read NaN as missing (`ucfrec.logs.binding.Table`).
+    # Tables read NaN as missing (`ucfrec.logs.tables.Table`).
     connection.execute("CREATE TEMP MACRO isnan(a) AS coalesce(system.main.isnan(a), true)")
 
 
-def _close(connection: duckdb.DuckDBPyConnection, inputs: Iterable[Path], work: str | None) -> None:
+def _close(
+    connection: duckdb.DuckDBPyConnection, inputs: Iterable[Path], work: Path | None
+) -> None:
     """Forbid access to other files and lock the settings; must come after every other setting."""
     # DuckDB first looks a path up as a glob pattern, then opens the file that it matches.
     allowed = {path for file in inputs for path in (str(file), glob_pattern(file))}
-    paths = ", ".join(map(text, sorted(allowed)))
     if work is not None:
-        connection.execute(f"SET allowed_directories = [{text(work)}]")
-        connection.execute(f"SET allowed_paths = [{paths}]")
+        connection.execute(f"SET allowed_directories = [{quote(str(work))}]")
+        connection.execute(f"SET allowed_paths = [{', '.join(map(quote, sorted(allowed)))}]")
     connection.execute("SET enable_external_access = false")
     connection.execute("SET lock_configuration = true")
+
+
+def anonymous_bytes(process: int | None = None) -> int:
+    """Memory of a process (by number; None for this one) that is not mapped from files.
+
+    The system cannot take it back. 0 where it does not say, or the process has ended.
+    """
+    try:
+        lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))
+
+
+def bytes_of(size: str) -> int | None:
+    """A size such as "2GB" or "1.5 GiB" in bytes; None if it is written in another way."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmgt]?)(i?)b?\s*", size.lower())
+    if match is None:
+        return None
+    number, prefix, binary = match.groups()
+    return int(float(number) * (1024 if binary else 1000) ** " kmgt".index(prefix or " "))
+
+
+def to_numpy(column: "pa.Array") -> Array:
+    """A column of numbers or truth values without missing ones, copied only if it must be.
+
+    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
+    """
+    if str(column.type) == "bool":
+        return np.from_dlpack(column.cast("uint8")).view(np.bool_)
+    return np.from_dlpack(column)
+
+
+def to_arrow(numbers: IntArray | BoolArray) -> "pa.Array":
+    """Whole numbers, or truth values as 0 and 1; `pyarrow.array` would import pandas."""
+    import pyarrow as pa
+
+    buffer = pa.py_buffer(np.ascontiguousarray(numbers, dtype=np.int64))
+    return pa.Array.from_buffers(pa.int64(), len(numbers), [None, buffer])
+
+
+class Bound(NamedTuple):
+    """What a column name or an expression is to a table."""
+
+    sql: str
+    kind: str
+    """DuckDB type."""
+    columns: tuple[str, ...]
+    """Columns of the table that it reads."""
+    is_column: bool
+    """Whether it is the name of a column."""
+
+
+def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, expression: str) -> Bound:
+    """Resolve a column name (in any case) or a scalar SQL expression against a table's columns.
+
+    An expression that computes with truth values, such as `is_click + 2 * is_like`, takes them as 0
+    and 1.
+
+    Raises:
+        InputError: a name is not a column of the table, or `expression` is no scalar expression.
+    """
+    columns = table.columns
+    names = {name.casefold(): name for name in columns}
+    if expression.casefold() in names:
+        name = names[expression.casefold()]
+        return Bound(quote_name(name), columns[name], (name,), True)
+    if _NAME.fullmatch(expression):
+        raise _missing(table, what, expression)
+    try:
+        # DuckDB would read some names that are not columns as the current user or time.
+        reads = columns_of(connection, expression)
+        for name in reads:
+            if name.casefold() not in names:
+                raise _missing(table, what, name)
+        read_columns = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
+        types = {name: columns[name] for name in read_columns}
+        try:
+            sql = f"({expression}\n)"
+            kind = _find_type(connection, sql, types)
+        except duckdb.BinderException:
+            truth = {name for name, kind in types.items() if kind == "BOOLEAN"}
+            if not truth:
+                raise
+            sql = f"({cast_truth_values(connection, expression, truth)}\n)"
+            kind = _find_type(connection, sql, types)
+    except (duckdb.Error, NotScalarError) as error:
+        raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
+    return Bound(sql, kind, read_columns, False)
+
+
+def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping[str, str]) -> str:
+    """DuckDB type of an expression over columns of some types."""
+    nulls = (f"CAST(NULL AS {kind}) AS {quote_name(name)}" for name, kind in columns.items())
+    source = f"FROM (SELECT {', '.join(nulls)})" if columns else ""
+    return str(connection.sql(f"DESCRIBE SELECT {sql} AS x {source}").fetchall()[0][1])
+
+
+def _missing(table: Table, what: str, name: str) -> InputError:
+    folded = {column.casefold(): column for column in table.columns}
+    near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
+    hint = ", ".join(folded[column] for column in near)
+    hint = f"nearest: {hint}" if hint else f"it has {', '.join(table.columns)}"
+    return InputError(f"{table.files[0]} has no column {name!r} ({what}); {hint}")
+
+
+def wrong_type(table: Table, what: str, expression: str, kind: str, remedy: str) -> InputError:
+    """Error for a column of an unsupported type."""
+    return InputError(f"{table.files[0]}: {what} ({expression}) is {kind}; {remedy}")
+
+
+@contextmanager
+def explain_errors(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], folder: Path
+) -> Iterator[None]:
+    """Turn errors of files, memory and the disk of `folder` in the block into `InputError`: the
+    limit or disk is exhausted, or a file or value cannot be read."""
+    try:
+        yield
+    except (OSError, SafetensorError, duckdb.Error) as error:
+        if any(phrase in str(error) for phrase in _DISK_FULL):
+            raise InputError(
+                f"no space left on the disk of {folder}; free space or write elsewhere"
+            ) from None
+        if not isinstance(error, duckdb.Error):
+            raise
+        if isinstance(error, duckdb.OutOfMemoryException):
+            raise InputError(f"{first_line(error)}; raise memory_limit") from None
+        raise _find_fault(connection, tables, error) or error from None
+
+
+def _find_fault(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], error: duckdb.Error
+) -> InputError | None:
+    """The file, and its line or values, that an error is about; None for an error of DuckDB."""
+    if fault := fault_of_line(error):
+        return fault
+    for file, single in ((f, replace(t, files=(f,))) for t in tables for f in t.files):
+        try:
+            connection.sql(f"SELECT max(hash(t)) FROM {single.sql} AS t").fetchall()
+        except duckdb.Error as damage:
+            return fault_of_line(damage) or InputError(
+                f"{file} cannot be read, it may be damaged ({first_line(damage)}); fetch it again"
+            )
+    if isinstance(error, duckdb.InternalError):
+        return None
+    files = ", ".join(str(file) for table in tables for file in table.files[:3])
+    return InputError(
+        f"{files}: {first_line(error)}; correct the values, or try_cast them in the mapping"
+    )
+
+
+def settle_mapping(
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[Table],
+    mapping: LogMapping,
+    reward: str,
+) -> tuple[LogMapping, str]:
+    """The mapping and the reward of a log, with the names of a run's training log or plain ones.
+
+    What is mapped counts. Otherwise a remembered column, condition or reward counts if all files
+    have the columns that it needs; if not, the plain name does, and no condition. The column
+    `reward` stands for the reward of a log whose columns were mapped.
+
+    Raises:
+        InputError: a file has neither the remembered column nor the plain one that it must have.
+    """
+    remembered = mapping.remembered
+    if remembered is None:
+        return mapping, reward
+    columns = dict(mapping.columns)
+    for name, text in remembered.columns.items():
+        if name in columns:
+            continue
+        if not text or _find_lacking(connection, tables, text) is None:
+            columns[name] = text
+        elif name in KEY_COLUMNS and (table := _find_lacking(connection, tables, name)):
+            raise InputError(
+                f"{table.files[0]} has neither {str(text)!r}, which is {name} in the log that the "
+                f"run was trained on, nor a column {name!r}; map it with --column {name}=..."
+            )
+    usual = remembered.columns.get(schema.TIMESTAMP) or schema.TIMESTAMP
+    if mapping.time_format is None and (columns.get(schema.TIMESTAMP) or schema.TIMESTAMP) == usual:
+        mapping = replace(mapping, time_format=remembered.time_format)
+    where, earlier = mapping.where, remembered.where
+    if where is None and earlier and _find_lacking(connection, tables, earlier) is None:
+        where = earlier
+    if (
+        any(remembered.columns.values())
+        and _find_lacking(connection, tables, reward) is not None
+        and _find_lacking(connection, tables, schema.REWARD) is None
+    ):
+        reward = schema.REWARD
+    return replace(mapping, columns=columns, where=where, remembered=None), reward
+
+
+def _find_lacking(
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], expression: str
+) -> Table | None:
+    """The first table that lacks a column which a name or expression reads; None if none does."""
+    for table in tables:
+        names = {name.casefold() for name in table.columns}
+        if expression.casefold() in names:
+            continue
+        if expression.isidentifier():
+            return table
+        try:
+            reads = columns_of(connection, expression)
+        except (duckdb.Error, NotScalarError):
+            continue  # it is refused where it is bound, with the reason
+        if not {name.casefold() for name in reads} <= names:
+            return table
+    return None

@@ -7,7 +7,7 @@ tree) and every node of the tree must be of a kind listed here.
 
 import json
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ucfrec import schema
@@ -132,12 +132,8 @@ class NotScalarError(Exception):
 
 
 def refusal(what: str, expression: str, source: str, reason: str) -> InputError:
-    """One-line error for an expression that cannot be used.
-
-    Args:
-        what: purpose of the expression, e.g. "for the reward".
-        source: file or table whose columns it may use.
-    """
+    """One-line error for an expression that cannot be used, `what` for (e.g. "for the reward"),
+    over the columns of a file or table, `source`."""
     origin = f"{expression.origin}: " if isinstance(expression, Expression) else ""
     return InputError(
         f"{origin}{what.partition(';')[0]}: {_quote(expression)} is not a scalar SQL expression "
@@ -146,15 +142,10 @@ def refusal(what: str, expression: str, source: str, reason: str) -> InputError:
 
 
 def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tuple[str, ...]:
-    """Check that `expression` is one allowed scalar expression, without evaluating it.
+    """Names of the columns that an expression reads, once it is found to be one allowed scalar one.
 
-    Whether its columns exist and its types match is not checked.
-
-    Returns:
-        Names of the columns that it reads, each once, in order of appearance.
-
-    Raises:
-        NotScalarError: it is anything else, too long, too large, or nested too deep.
+    It is not evaluated, nor are the existence and types of columns checked. Raises NotScalarError
+    if it is anything else, too long, too large, or nested too deep.
     """
     _require_small(expression)
     # Parsed alone and in the brackets in which it will be used: a text with an unmatched bracket,
@@ -179,11 +170,7 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
 def cast_truth_values(
     connection: "duckdb.DuckDBPyConnection", expression: str, columns: Collection[str]
 ) -> str:
-    """The same expression with 0 and 1 in place of the truth values of some columns.
-
-    Args:
-        expression: as `columns_of` allows it.
-    """
+    """An allowed expression with 0 and 1 in place of the truth values of some columns."""
     query = "SELECT json_serialize_sql(?)"
     (tree,) = connection.execute(query, [f"SELECT {expression}\n"]).fetchall()[0]
     text, folded = f"SELECT {expression}".encode(), {name.casefold() for name in columns}
@@ -284,14 +271,8 @@ def _remove_locations(tree: Any) -> Any:
 
 
 def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
-    """Check every node of a tree.
-
-    Args:
-        columns: the names of the columns that the tree reads are added to it.
-
-    Returns:
-        Number of its nodes, counting every copy of those that DuckDB copies.
-    """
+    """Check every node of a tree and add the names of columns that it reads; returns the number of
+    its nodes, counting every copy of those that DuckDB copies."""
     if not isinstance(tree, dict) or "class" not in tree:
         return sum(_walk(part, depth, columns) for part in _parts(tree))
     if depth == MAX_NESTING:
@@ -317,7 +298,12 @@ def _growth(tree: Any) -> int:
     arguments = [argument["expression"] for argument in tree["arguments"]]
     grown = [_growth(argument) for argument in arguments] or [1]
     if name == "array_to_string":
-        return grown[0] * (1 + _length_of_separator(arguments))
+        # The separator may not come from a column.
+        expression = arguments[1] if len(arguments) > 1 else {}
+        literal = expression["literal"] if expression.get("class") == "CONSTANT" else {}
+        if literal.get("kind") != "STRING":
+            raise NotScalarError("the separator of array_to_string is not quoted text; write one")
+        return grown[0] * (1 + len(literal["text"]))
     if name == "concat_ws":
         return grown[0] * len(grown) + sum(grown[1:])
     if name in _JOINING:
@@ -327,15 +313,6 @@ def _growth(tree: Any) -> int:
     if name == "strftime":
         return _DATE_PARTS * max(grown)
     return max(grown) * (_QUOTES if name in _QUOTING else 1)
-
-
-def _length_of_separator(arguments: Sequence[Any]) -> int:
-    """Characters of the separator of `array_to_string`, which may not come from a column."""
-    expression = arguments[1] if len(arguments) > 1 else {}
-    literal = expression["literal"] if expression.get("class") == "CONSTANT" else {}
-    if literal.get("kind") != "STRING":
-        raise NotScalarError("the separator of array_to_string is not quoted text; write one")
-    return len(literal["text"])
 
 
 def _require_listed(node: dict[str, Any]) -> None:

@@ -1,109 +1,361 @@
-"""Encode the features of items and users as sparse matrices."""
+"""Features of items and users: tables that are read with a log, then sparse matrices."""
 
-from collections.abc import Sequence
-from typing import Final, TypeAlias
+import hashlib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import duckdb
 import numpy as np
-from scipy import sparse
 
-from ucfrec.arrays import Array
+from ucfrec import schema
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
+from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
+from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
+from ucfrec.logs.sessions import ID_TABLES
+from ucfrec.logs.tables import (
+    NOTHING,
+    PANDAS_INDEX,
+    Table,
+    cast_timestamp,
+    is_integer,
+    is_number,
+    is_vector,
+    open_tables,
+    quote_name,
+    raw_name,
+)
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 CATEGORIES: Final = 200
 """Most categories or tags of one column: the most frequent among trained ids are kept."""
 CLIP: Final = 5.0
 """Standardised numbers are clipped to ± this many standard deviations."""
+_WHOLE: Final = {"FLOAT": 2**24, "DOUBLE": 2**53}
+"""DuckDB type of reals to the bound below which it holds every whole number."""
+_MANY_LACKING: Final = 0.2
+"""Share of the ids without a row above which a note says so."""
 
-Features: TypeAlias = sparse.csr_matrix
+
+@dataclass(frozen=True)
+class _Part:
+    """Files of a feature table with the same columns."""
+
+    table: Table
+    key: Bound
+    first_by: str
+    features: dict[str, tuple[str, str]]
+    """Feature, without regard to case, to its (SQL, type)."""
+
+
+def load_features(
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[FeatureTable],
+    kind: str,
+    id_type: str,
+) -> list[str]:
+    """Read feature tables into DuckDB tables, whose names are returned, with columns `id`, `f0`, ….
+
+    The parts of a table are joined by the names of their columns, whatever their order: what a part
+    lacks is missing for its rows. A key is not a feature. `kind` is "item_id" or "user_id"; rows
+    whose key is no id of the log's DuckDB type are excluded.
+
+    Raises InputError if a file or column cannot be used, two parts have a column of different
+    types, or a table repeats an id.
+    """
+    names = []
+    for number, table in enumerate(tables):
+        name = f"{kind}_features_{number}"
+        opened = open_tables(connection, log_files(table.files))
+        parts = [_read_part(connection, part, table, kind) for part in opened]
+        types = _find_common_types(parts, kind)
+        rows_of_parts = " UNION ALL ".join(_select_rows(part, types, id_type) for part in parts)
+        with explain_errors(connection, opened, opened[0].files[0].parent):
+            connection.execute(
+                f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
+            )
+        ((rows, ids),) = connection.sql(
+            f"SELECT count(*), count(DISTINCT id) FROM {name}"
+        ).fetchall()
+        if rows != ids:
+            raise InputError(
+                f"{', '.join(map(str, table.files))}: {rows - ids} of {rows} rows "
+                f"repeat a {table.key}; keep one row per {kind}"
+            )
+        names.append(name)
+    return names
+
+
+def _read_part(
+    connection: duckdb.DuckDBPyConnection, opened: Table, table: FeatureTable, kind: str
+) -> _Part:
+    key = bind(connection, opened, f"key of {kind} features", table.key)
+    key_columns = {name.casefold() for name in key.columns}
+    names = table.columns or tuple(
+        name
+        for name in opened.columns
+        if name.casefold() not in key_columns and not PANDAS_INDEX.fullmatch(name)
+    )
+    # The text of a CSV file is what its keys are, not what DuckDB makes of it.
+    raw = key.columns if key.is_column and not opened.columnar else ()
+    if raw:
+        key = Bound(quote_name(raw_name(raw[0])), "VARCHAR", (), False)
+    sources, features, first_by = [key], {}, ""
+    for name in names:
+        feature = bind(connection, opened, f"{kind} feature", name)
+        comparable = _cast_feature(feature.sql, feature.kind)
+        if comparable is None:
+            remedy = "cast it to a number, text, or a list of either"
+            raise wrong_type(opened, f"{kind} feature", name, feature.kind, remedy)
+        features[name.casefold()] = comparable
+        sources.append(feature)
+    if table.first_by:
+        order = bind(connection, opened, f"first_by of {kind} features", table.first_by)
+        sources.append(order)
+        first_by = order.sql
+    columns = (column for source in sources for column in source.columns)
+    return _Part(opened.of(columns, raw), key, first_by, features)
+
+
+def _cast_feature(sql: str, kind: str) -> tuple[str, str] | None:
+    """SQL of a feature as DOUBLE, VARCHAR, VARCHAR[] or FLOAT[], and that type; None for others."""
+    if kind == NOTHING:
+        return "NULL", NOTHING
+    if is_number(kind):
+        # Undefined numbers, such as the logarithm of 0, are missing.
+        return f"TRY(CAST({sql} AS DOUBLE))", "DOUBLE"
+    if time := cast_timestamp(sql, kind):
+        return f"epoch({time}) / 86400", "DOUBLE"
+    if kind in ("VARCHAR", "BOOLEAN", "UUID") or kind.startswith("ENUM"):
+        return f"CAST({sql} AS VARCHAR)", "VARCHAR"
+    if is_vector(kind) and not is_integer(kind.partition("[")[0]):
+        return f"CAST({sql} AS FLOAT[])", "FLOAT[]"
+    if kind.endswith("[]"):
+        return f"CAST({sql} AS VARCHAR[])", "VARCHAR[]"
+    return None
+
+
+def _find_common_types(parts: Sequence[_Part], kind: str) -> dict[str, str]:
+    """Feature to its type, which all parts of a table that have it must agree on."""
+    types: dict[str, str] = {}
+    files: dict[str, Path] = {}
+    for part in parts:
+        for name, (_, type_) in part.features.items():
+            earlier = types.get(name, NOTHING)
+            if earlier == NOTHING:
+                types[name], files[name] = type_, part.table.files[0]
+            elif type_ not in (earlier, NOTHING):
+                raise InputError(
+                    f"{part.table.files[0]}: {kind} feature {name} is {type_} here and {earlier} "
+                    f"in {files[name]}; write it in one type"
+                )
+    return {name: "VARCHAR" if type_ == NOTHING else type_ for name, type_ in types.items()}
+
+
+def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
+    """SQL of the rows of a part: `id`, `f0`, …."""
+    id_sql, first = _cast_id(part.key.sql, part.key.kind, id_type), ""
+    columns = [
+        f"CAST({part.features.get(name, ('NULL', ''))[0]} AS {type_})"
+        for name, type_ in types.items()
+    ]
+    if part.first_by:
+        # Ties are broken by the features, so that the order of rows does not matter.
+        order = ", ".join([part.first_by, *columns])
+        first = f" QUALIFY row_number() OVER (PARTITION BY {id_sql} ORDER BY {order}) = 1"
+    values = "".join(f", {sql} AS f{index}" for index, sql in enumerate(columns))
+    return f"SELECT {id_sql} AS id{values} FROM {part.table.sql}{first}"
+
+
+def _cast_id(key: str, key_type: str, id_type: str) -> str:
+    """SQL that casts a key to an id type, NULL where no cast does."""
+    if is_number(key_type) and not is_integer(key_type):
+        # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id, as the
+        # file did with whole numbers that its type does not hold.
+        exact = f"AND abs({key}) < {_WHOLE[key_type]}" if key_type in _WHOLE else ""
+        key = f"CASE WHEN {key} = trunc({key}) {exact} THEN TRY_CAST({key} AS HUGEINT) END"
+    elif id_type == "BIGINT" and not is_integer(key_type):
+        # Text is an integer only if it is written as the integer is: 007 is not 7.
+        number = f"TRY_CAST({key} AS BIGINT)"
+        return f"CASE WHEN CAST({number} AS VARCHAR) = CAST({key} AS VARCHAR) THEN {number} END"
+    as_id = f"TRY_CAST({key} AS {id_type})"
+    # Text without a character is missing, as in the log.
+    return as_id if id_type == "BIGINT" else f"nullif({as_id}, '')"
+
+
+def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> str:
+    """A digest of every id and value of feature tables, in whatever order their rows are."""
+    digest = hashlib.sha256()
+    for name in names:
+        columns = connection.sql(f"DESCRIBE {name}").fetchall()
+        digest.update(repr([(column[0], column[1]) for column in columns]).encode())
+        rows = connection.sql(f"SELECT * FROM {name} ORDER BY id")
+        for batch in rows.to_arrow_reader(BATCH_ROWS):
+            for column in batch.columns:
+                if str(column.type) == "double":
+                    values = np.asarray(column.fill_null(np.nan))
+                    digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+                else:
+                    digest.update("\n".join(map(repr, column.to_pylist())).encode())
+    return digest.hexdigest()
+
+
+def require_known_ids(
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[FeatureTable],
+    names: Sequence[str],
+    kind: str,
+    noted: bool,
+) -> None:
+    """Raise InputError if a feature table has no row of an id of the log; if `noted`, warn if many
+    ids have none. `names` are those of `load_features`, `kind` as there."""
+    used = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
+    for table, name in zip(tables, names, strict=True):
+        count = _count(connection, used)
+        without_row = _count(connection, f"{used} ANTI JOIN {name} ON id = {kind}")
+        files = ", ".join(map(str, table.files))
+        if without_row == count:
+            ids, log_ids = (
+                connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
+                for column, rows in (("id", name), (kind, used))
+            )
+            keys = f"is {_list_values(ids)}" if ids else "is never such an id"
+            raise InputError(
+                f"{files}: no row belongs to a {kind} of the log, which "
+                f"are {_list_values(log_ids)}, and {table.key} {keys}; let the key be an "
+                "expression that gives the same ids, or leave the file out"
+            )
+        if noted and without_row > _MANY_LACKING * count:
+            warnings.warn(
+                f"{files}: {without_row:,} of {count:,} {kind}s of the log have no row; their "
+                "features count as missing",
+                InputNote,
+                stacklevel=3,
+            )
+
+
+def note_lacking(
+    connection: duckdb.DuckDBPyConnection,
+    tables: Sequence[FeatureTable],
+    names: Sequence[str],
+    kind: str,
+    new: str,
+    lost: str,
+) -> None:
+    """Note the `new` ids (SQL) of a store that grows which feature tables say nothing of.
+
+    `names` and `kind` are as of `require_known_ids`; `lost` is the store, if it was made with such
+    tables, or empty.
+    """
+    count, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
+    what = "embeddings" if ids == "item" else "features"
+    notes = []
+    if lost and count and not tables:
+        notes.append(
+            f"{lost} was prepared with {ids} features and none are given now: the {what} of all "
+            f"{count:,} new {ids}s begin at the mean"
+        )
+    for table, name in zip(tables, names, strict=True):
+        without_row = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
+        if without_row:
+            notes.append(
+                f"{', '.join(map(str, table.files))}: {without_row:,} of {count:,} new {ids}s have "
+                f"no row in the {ids} features; their {what} say nothing of them"
+            )
+    for note in notes:
+        warnings.warn(f"{note}; give a current table with --mapping", InputNote, stacklevel=3)
+
+
+def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:
+    """Note a table called `items.*` or `users.*` beside the files of a log that was named alone."""
+    folders = dict.fromkeys(file.parent for file in files)
+    for name, tables in (("items", mapping.item_features), ("users", mapping.user_features)):
+        beside = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
+        table = next((file for file in beside if is_table(file) and file not in files), None)
+        if table is not None and not tables:
+            warnings.warn(
+                f"{table} lies beside the log and is not read; if it holds features of {name}, "
+                f"name the folder {table.parent}, or the file too",
+                InputNote,
+                stacklevel=2,
+            )
+
+
+def _count(connection: duckdb.DuckDBPyConnection, rows: str) -> int:
+    ((count,),) = connection.sql(f"SELECT count(*) FROM {rows}").fetchall()
+    return int(count)
+
+
+def _list_values(rows: Sequence[tuple[object, ...]]) -> str:
+    return ", ".join([*(f"{value!r:.40}" for (value,) in rows), "…"])
+
+
+@dataclass(frozen=True)
+class EncodedFeatures:
+    """What is known of the users and items of a store, by number."""
+
+    items: "sparse.csr_matrix | None"
+    """(n_items, F) float32; None without features."""
+    users: "sparse.csr_matrix | None"
+    """(n_users, G) float32; None without features."""
+    item_counts: IntArray
+    """(n_items,) training steps that show each."""
+    user_counts: IntArray
+    """(n_users,) training steps of each."""
+    tags: IntArray
+    """(n_items, T) tags, padded with −1; T is 0 without any."""
+
+
+def encode_ids(
+    connection: duckdb.DuckDBPyConnection, names: Mapping[str, Sequence[str]]
+) -> EncodedFeatures:
+    """Encode the features of all users and items, by id column the tables of `load_features`."""
+    features, counts = {}, {}
+    for name, table, _ in ID_TABLES:
+        features[name] = encode_features(connection, names[name], table, name)
+        rows = connection.sql(f"SELECT train_count FROM {table} ORDER BY number").fetchnumpy()
+        counts[name] = rows["train_count"].astype(np.int64)
+    items, users = schema.ITEM_ID, schema.USER_ID
+    tags = item_tags(connection, names[items], len(counts[items]))
+    return EncodedFeatures(features[items], features[users], counts[items], counts[users], tags)
 
 
 def encode_features(
     connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
-) -> Features | None:
-    """Encode feature tables; row i belongs to the id with `number` i in the table `ids`.
+) -> "sparse.csr_matrix | None":
+    """(n_ids, F) float32 features, row i of the id with `number` i in the table `ids`; None if
+    there are none.
 
     Numbers are standardised and clipped, with 0 for missing ones; categories and tags are one-hot.
-    Means, standard deviations and the kept categories come only from ids that occur in the
-    training split (`train_count` above 0).
-
-    Args:
-        names: feature tables of `load_features`.
-        ids: table with `number`, `train_count` and the ids.
-
-    Returns:
-        (n_ids, F) float32; None if no column has a feature.
-
-    Raises:
-        InputError: the vectors of a column differ in length.
+    Means, standard deviations and the kept categories come only from ids that occur in the training
+    split (`train_count` above 0). Raises InputError if the vectors of a column differ in length.
     """
-    ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
-    blocks = []
+    from scipy import sparse  # takes a moment to import
+
+    count, blocks = _count(connection, ids), []
     for name in names:
         joined = f"{ids} JOIN {name} ON {ids}.{id_column} = {name}.id"
         for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]:
-            block = _encode(connection, joined, column, kind, count)
+            if kind in ("DOUBLE", "FLOAT[]"):
+                vector = column if kind == "FLOAT[]" else f"[{column}]"
+                block = _encode_numbers(connection, joined, column, vector, count)
+            else:
+                value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
+                block = _encode_categories(connection, joined, value, count)
             if block.shape[1]:
                 blocks.append(block)
     return sparse.hstack(blocks, format="csr", dtype=np.float32) if blocks else None
 
 
-def item_tags(
-    connection: duckdb.DuckDBPyConnection, names: Sequence[str], ids: str, id_column: str
-) -> Array:
-    """Number the tags of items; row i belongs to the id with `number` i in the table `ids`.
-
-    The tags are the values of all columns of lists, the `DISTINCT_TAGS` most frequent ones. An item
-    without any shares none.
-
-    Args:
-        names: feature tables of `load_features`.
-        ids: table with `number` and the ids.
-
-    Returns:
-        (n_ids, T) int64, padded with −1, T at most `TAGS_PER_ITEM`, and 0 without tags.
-    """
-    ((count,),) = connection.sql(f"SELECT count(*) FROM {ids}").fetchall()
-    cases = [
-        f"SELECT number, '{name}.{column}:' || unnest(list_distinct({column})) AS tag "
-        f"FROM {ids} JOIN {name} ON {ids}.{id_column} = {name}.id"
-        for name in names
-        for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]
-        if kind == "VARCHAR[]"
-    ]
-    if not cases:
-        return np.zeros((count, 0), dtype=np.int64)
-    rows = connection.sql(f"""
-        WITH cases AS ({" UNION ALL ".join(cases)}),
-        tags AS (
-            SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
-            FROM cases WHERE tag IS NOT NULL GROUP BY tag
-            ORDER BY tag_number LIMIT {DISTINCT_TAGS}
-        )
-        SELECT number, tag_number,
-            row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
-        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
-    """).fetchnumpy()
-    places = rows["place"].astype(np.int64)
-    tags = np.full((count, int(places.max(initial=-1)) + 1), -1, dtype=np.int64)
-    tags[rows["number"].astype(np.int64), places] = rows["tag_number"]
-    return tags
-
-
-def _encode(
-    connection: duckdb.DuckDBPyConnection, joined: str, column: str, kind: str, count: int
-) -> Features:
-    if kind in ("DOUBLE", "FLOAT[]"):
-        vector = column if kind == "FLOAT[]" else f"[{column}]"
-        return _numbers(connection, joined, column, vector, count)
-    value = column if kind == "VARCHAR" else f"unnest(list_distinct({column}))"
-    return _categories(connection, joined, value, count)
-
-
-def _numbers(
+def _encode_numbers(
     connection: duckdb.DuckDBPyConnection, joined: str, column: str, vector: str, count: int
-) -> Features:
+) -> "sparse.csr_matrix":
     sizes = connection.sql(
         f"SELECT DISTINCT len({vector}) FROM {joined} WHERE {column} IS NOT NULL"
     ).fetchall()
@@ -114,26 +366,22 @@ def _numbers(
         f"WHERE list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}]) ORDER BY number"
     ).to_arrow_table()
     values = rows["value"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    numbers, trained = rows["number"].to_numpy(), rows["trained"].to_numpy()
-    return _standardise(numbers, trained, values.reshape(-1, *(sizes[0] if sizes else (1,))), count)
-
-
-def _standardise(rows: Array, trained: Array, values: Array, count: int) -> Features:
-    training = values[trained.astype(bool)]
+    values = values.reshape(-1, sizes[0][0] if sizes else 1)
+    numbers, training = rows["number"].to_numpy(), values[rows["trained"].to_numpy().astype(bool)]
     if not len(training):
-        return _sparse(values[:0, :0], rows[:0], rows[:0], (count, 0))
+        return _fill(values[:0, :0], numbers[:0], numbers[:0], (count, 0))
     deviation = training.std(axis=0)
     varied = deviation > 0
     scaled = (values - training.mean(axis=0))[:, varied] / deviation[varied]
     scaled = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
     size = scaled.shape[1]
-    columns = np.tile(np.arange(size), len(rows))
-    return _sparse(scaled, np.repeat(rows, size), columns, (count, size))
+    columns = np.tile(np.arange(size), len(numbers))
+    return _fill(scaled, np.repeat(numbers, size), columns, (count, size))
 
 
-def _categories(
+def _encode_categories(
     connection: duckdb.DuckDBPyConnection, joined: str, value: str, count: int
-) -> Features:
+) -> "sparse.csr_matrix":
     rows = connection.sql(f"""
         WITH cases AS (SELECT number, train_count, {value} AS value FROM {joined}),
         kept AS (
@@ -146,8 +394,46 @@ def _categories(
     """).fetchnumpy()
     size = int(rows["column_index"].max(initial=-1)) + 1
     ones = np.ones(len(rows["number"]), dtype=np.float32)
-    return _sparse(ones, rows["number"], rows["column_index"], (count, size))
+    return _fill(ones, rows["number"], rows["column_index"], (count, size))
 
 
-def _sparse(values: Array, rows: Array, columns: Array, shape: tuple[int, int]) -> Features:
+def _fill(
+    values: Array, rows: Array, columns: Array, shape: tuple[int, int]
+) -> "sparse.csr_matrix":
+    from scipy import sparse
+
     return sparse.coo_matrix((values.ravel(), (rows, columns)), shape=shape).tocsr()
+
+
+def item_tags(
+    connection: duckdb.DuckDBPyConnection, names: Sequence[str], n_items: int
+) -> IntArray:
+    """(n_items, T) numbers of tags, padded with −1, T at most `TAGS_PER_ITEM` and 0 without tags.
+
+    Tags are the values of all columns of lists; only the `DISTINCT_TAGS` most frequent ones count.
+    An item without any shares none.
+    """
+    cases = [
+        f"SELECT number, '{name}.{column}:' || unnest(list_distinct({column})) AS tag "
+        f"FROM items JOIN {name} ON items.{schema.ITEM_ID} = {name}.id"
+        for name in names
+        for column, kind, *_ in connection.sql(f"DESCRIBE {name}").fetchall()[1:]
+        if kind == "VARCHAR[]"
+    ]
+    if not cases:
+        return np.zeros((n_items, 0), dtype=np.int64)
+    rows = connection.sql(f"""
+        WITH cases AS ({" UNION ALL ".join(cases)}),
+        tags AS (
+            SELECT tag, row_number() OVER (ORDER BY count(*) DESC, tag) - 1 AS tag_number
+            FROM cases WHERE tag IS NOT NULL GROUP BY tag
+            ORDER BY tag_number LIMIT {DISTINCT_TAGS}
+        )
+        SELECT number, tag_number,
+            row_number() OVER (PARTITION BY number ORDER BY tag_number) - 1 AS place
+        FROM cases JOIN tags USING (tag) QUALIFY place < {TAGS_PER_ITEM}
+    """).fetchnumpy()
+    places = rows["place"].astype(np.int64)
+    tags = np.full((n_items, int(places.max(initial=-1)) + 1), -1, dtype=np.int64)
+    tags[rows["number"].astype(np.int64), places] = rows["tag_number"]
+    return tags

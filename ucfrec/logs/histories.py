@@ -2,7 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,19 +16,12 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained, settled
-from ucfrec.logs.engine import as_arrow, engine, engine_in_memory
-from ucfrec.logs.kept import note_dropped, require_rows
+from ucfrec.logs.engine import engine, engine_in_memory, explain_errors, settle_mapping, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files
-from ucfrec.logs.sorted_rows import (
-    ITEM,
-    SESSION,
-    USER,
-    SortedRows,
-    sort_rows,
-)
-from ucfrec.logs.tables import Table, open_tables, quoted
-from ucfrec.logs.typed import TypedLog, typed_log
+from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
+from ucfrec.logs.summary import note_dropped, require_rows
+from ucfrec.logs.tables import Table, quote_name
+from ucfrec.logs.typed import LogTables, open_log, open_log_tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,6 +29,14 @@ if TYPE_CHECKING:
 
 HISTORIES: Final = "histories"
 """Name of a data frame in messages and in the engine."""
+_UNREAD: Final = (
+    pa.types.is_float16,
+    pa.types.is_decimal256,
+    pa.types.is_interval,
+    pa.types.is_run_end_encoded,
+    pa.types.is_union,
+)
+"""Types of Arrow that the engine or Parquet lacks."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class FrameTable(Table):
 
     @property
     def source(self) -> str:
-        return quoted(str(self.files[0]))
+        return quote_name(str(self.files[0]))
 
 
 def read_histories(
@@ -60,16 +61,12 @@ def read_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
-    """Read the history of each user of a log, cleaned as `prepare` cleans it.
+    """Read the history of each user of a log, cleaned as `prepare` cleans it, with a warning.
 
     Args:
-        paths: log files, folders and globs.
-        mapping: log columns to the files' columns.
-        reward: scalar SQL expression over the files' columns.
         last: most rows of each user, the most recent ones.
-        memory_limit: of the process, such as "2GB", for logs of any size; rows spill to disk.
+        memory_limit: as of `PrepareOptions`, and so is `duplicates`.
         session_by: with "session_id", batches have the column `session_ids`.
-        duplicates: see `PrepareOptions.duplicates`.
 
     Yields:
         Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32), `timestamps`
@@ -85,16 +82,8 @@ def read_histories(
         scratch_folder(Path(gettempdir()), "histories") as folder,
         engine(files, folder, memory_limit, shared=True) as connection,
     ):
-        tables = tuple(open_tables(connection, files, mapping.partitions))
-        mapping, reward = settled(connection, tables, mapping, reward)
-        log = typed_log(connection, tables, mapping, reward, session_by, folder)
-        _require_items(log)
-        with explained(connection, tables, folder):
-            rows = sort_rows(log, None, duplicates, folder)
-        require_rows(log, rows.count, rows.dropped)
-        note_dropped(log.name, rows.dropped, rows.read)
-        with explained(connection, tables, folder):
-            yield from _by_users(rows, last)
+        tables = open_log_tables(connection, files, mapping, reward, session_by)
+        yield from _read_users(tables, last, duplicates, folder)
 
 
 def frame_histories(
@@ -105,50 +94,23 @@ def frame_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[pa.RecordBatch]:
-    """`read_histories` of a log in memory, without using the disk.
-
-    Rows that `prepare` would drop are left out, with a warning, as in `read_histories`.
-
-    Args:
-        frame: one row per interaction.
-        mapping: log columns to the frame's columns.
-        reward: scalar SQL expression over the frame's columns.
-        last: most rows of each user, the most recent ones.
-        session_by: with "session_id", batches have the column `session_ids`.
-        duplicates: see `PrepareOptions.duplicates`.
-
-    Yields:
-        Batches as of `read_histories`.
-
-    Raises:
-        InputError: `frame` is not a data frame or has no rows, a column is missing, repeated or of
-            a wrong type, or no row can be used.
-    """
+    """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
+    too."""
     columns = log_table(frame, HISTORIES)
     with engine_in_memory() as connection:
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
-        source = Path(HISTORIES)
-        mapping, reward = settled(connection, (table,), mapping, reward)
-        log = typed_log(connection, (table,), mapping, reward, session_by, source)
-        _require_items(log)
-        with explained(connection, log.tables, source):
-            rows = sort_rows(log, None, duplicates, None)
-            require_rows(log, rows.count, rows.dropped)
-            note_dropped(HISTORIES, rows.dropped, rows.read)
-            yield from _by_users(rows, last)
+        mapping, reward = settle_mapping(connection, (table,), mapping, reward)
+        tables = LogTables(connection, (table,), mapping, reward, session_by)
+        yield from _read_users(tables, last, duplicates, None)
 
 
 def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     """Convert a data frame to Arrow, leaving out, with a note, columns that it cannot hold.
 
-    Args:
-        frame: one row per interaction.
-
-    Raises:
-        InputError: `frame` is not a data frame or has no rows, two columns have the same name, or a
-            key column has values of several types, durations or periods.
+    Raises InputError if `frame` is not a data frame or has no rows, two columns have the same name,
+    or a key column has values of several types, durations or periods.
     """
     import pandas as pd
 
@@ -167,7 +129,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     columns = {}
     for column in frame.columns:
         try:
-            columns[str(column)] = _as_array(frame[column])
+            columns[str(column)] = _to_array(frame[column])
         except _UnusableError as error:
             if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
                 raise InputError(f"{name}: {column} {error}") from None
@@ -181,13 +143,8 @@ class _UnusableError(Exception):
     """A column cannot be read; the message says why, and what to do."""
 
 
-def _as_array(values: "pd.Series[Any]") -> pa.Array:
-    """A column of a data frame.
-
-    Raises:
-        _UnusableError: it has mixed Python objects, durations or periods, whole numbers that Arrow
-            does not hold, or a type that the engine or Parquet lacks.
-    """
+def _to_array(values: "pd.Series[Any]") -> pa.Array:
+    """A column of a data frame, or _UnusableError."""
     import pandas as pd
 
     if isinstance(values.dtype, pd.PeriodDtype):
@@ -209,47 +166,38 @@ def _as_array(values: "pd.Series[Any]") -> pa.Array:
         raise _UnusableError("holds dates and times; convert them with pandas.to_datetime")
     if pa.types.is_float16(array.type):
         return array.cast(pa.float32())
-    for unsupported in filter(_is_lacking, _types_in(array.type)):
-        raise _UnusableError(f"is of type {unsupported}, which is not read; convert it")
+    for kind in _list_types(array.type):
+        if any(is_kind(kind) for is_kind in _UNREAD) or kind == pa.struct([]):
+            raise _UnusableError(f"is of type {kind}, which is not read; convert it")
     return array
 
 
-def _types_in(kind: pa.DataType) -> Iterator[pa.DataType]:
+def _list_types(kind: pa.DataType) -> Iterator[pa.DataType]:
     """A type, and those of its parts."""
     yield kind
     if pa.types.is_dictionary(kind):
         yield kind.value_type
     for number in range(kind.num_fields):
-        yield from _types_in(kind.field(number).type)
+        yield from _list_types(kind.field(number).type)
 
 
-def _is_lacking(kind: pa.DataType) -> bool:
-    """Whether the engine or Parquet lacks a type of Arrow."""
-    of = pa.types
-    unsupported = (
-        of.is_float16,
-        of.is_decimal256,
-        of.is_interval,
-        of.is_run_end_encoded,
-        of.is_union,
-    )
-    return any(each(kind) for each in unsupported) or (of.is_struct(kind) and not kind.num_fields)
+def _read_users(
+    tables: LogTables, last: int, duplicates: str, folder: Path | None
+) -> Iterator[pa.RecordBatch]:
+    """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
+    log = open_log(tables, folder or Path(HISTORIES))
+    log.require_items()
+    with explain_errors(log.connection, log.tables, folder or Path(HISTORIES)):
+        rows = sort_rows(log, None, duplicates, folder)
+        require_rows(log, rows.count, rows.dropped)
+        note_dropped(log.name, rows.dropped, rows.read)
+        query = f"SELECT {schema.ITEM_ID} FROM item_codes ORDER BY code"
+        items = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+        for batch in rows.file.read():
+            yield _gather_histories(rows, batch, items, last)
 
 
-def _require_items(log: TypedLog) -> None:
-    if log.key != schema.ITEM_ID:
-        raise InputError(f"{log.tables[0].files[0]}: its actions are vectors; map item_id instead")
-
-
-def _by_users(rows: SortedRows, last: int) -> Iterator[pa.RecordBatch]:
-    """The users of sorted rows, some thousand rows at a time."""
-    query = f"SELECT {schema.ITEM_ID} FROM item_codes ORDER BY code"
-    items = rows.log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
-    for batch in rows.file.read():
-        yield _histories(rows, batch, items, last)
-
-
-def _histories(
+def _gather_histories(
     sorted_rows: SortedRows, rows: dict[str, Array], items: pa.Array, last: int
 ) -> pa.RecordBatch:
     """The users of rows, which are all theirs."""
@@ -258,40 +206,35 @@ def _histories(
     ends = np.append(first[1:], len(codes))
     recent = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
     offsets = np.append(0, np.cumsum(recent)[ends - 1])
-
-    def lists(name: str, of: Callable[[Array], pa.Array]) -> pa.ListArray:
-        return _lists(offsets, of(rows[name][recent]))
-
     query = (
         f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "
         "ORDER BY code"
     )
     users = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
-    columns: dict[str, pa.Array] = {
-        schema.USER_ID: users.take(as_arrow(codes[first].astype(np.int64) - codes[0]))
-    }
-    columns["item_ids"] = lists(ITEM, lambda codes: items.take(as_arrow(codes)))
-    columns["rewards"] = lists(
-        schema.REWARD, lambda values: _numbers(values.astype(np.float32), pa.float32())
-    )
-    columns["timestamps"] = lists(schema.TIMESTAMP, as_arrow)
-    if log.session_by == schema.SESSION_ID:
-        columns["session_ids"] = lists(SESSION, as_arrow)
     # Codes of items are in the order of their ids.
     owner = np.repeat(np.arange(len(first)), ends - first)
     seen = np.unique(owner * len(items) + rows[ITEM])
     bounds = np.searchsorted(seen, np.arange(len(first) + 1) * len(items))
-    columns["seen"] = _lists(bounds, items.take(as_arrow(seen % len(items))))
+    columns = {
+        schema.USER_ID: users.take(to_arrow(codes[first].astype(np.int64) - codes[0])),
+        "item_ids": _to_lists(offsets, items.take(to_arrow(rows[ITEM][recent]))),
+        "rewards": _to_lists(offsets, _to_floats(rows[schema.REWARD][recent])),
+        "timestamps": _to_lists(offsets, to_arrow(rows[schema.TIMESTAMP][recent])),
+        "seen": _to_lists(bounds, items.take(to_arrow(seen % len(items)))),
+    }
+    if log.session_by == schema.SESSION_ID:
+        columns["session_ids"] = _to_lists(offsets, to_arrow(rows[SESSION][recent]))
     if sorted_rows.observations is not None:
         observations = sorted_rows.observations.of_rows(rows["row"][ends - 1])
         bounds = np.arange(len(first) + 1) * observations.shape[1]
-        columns[schema.OBSERVATION] = _lists(bounds, _numbers(observations.ravel(), pa.float32()))
+        columns[schema.OBSERVATION] = _to_lists(bounds, _to_floats(observations.ravel()))
     return pa.record_batch(columns)
 
 
-def _lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
-    return pa.ListArray.from_arrays(as_arrow(offsets).cast(pa.int32()), values)
+def _to_lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
+    return pa.ListArray.from_arrays(to_arrow(offsets).cast(pa.int32()), values)
 
 
-def _numbers(values: Array, kind: pa.DataType) -> pa.Array:
-    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+def _to_floats(values: Array) -> pa.Array:
+    buffer = pa.py_buffer(np.ascontiguousarray(values, dtype=np.float32))
+    return pa.Array.from_buffers(pa.float32(), len(values), [None, buffer])

@@ -1,20 +1,24 @@
-"""Item embeddings and user features, learnt from the training split only."""
+"""Item embeddings and user features of a store, learnt from the training split only.
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+A policy that was trained on them goes on with those of a store that has grown, so these lie in the
+same space: old rows stay where they are.
+"""
+
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import numpy as np
 from scipy import sparse
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.item_table import ITEM_STATES, write_item_table
+from ucfrec.episodes.item_table import DISTINCT_TAGS, ITEM_STATES, write_item_table
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.errors import InputError
-from ucfrec.logs.measures import Moments
-from ucfrec.logs.spectral import SparseRows, right_singular_vectors
+from ucfrec.logs.features import EncodedFeatures
+from ucfrec.logs.rows import keep_users_whole
+from ucfrec.logs.sessions import Moments
 from ucfrec.processes import require_blas_memory
 
 PRIOR_COUNT: Final = 3.0
@@ -29,52 +33,22 @@ BLOCK_STEPS: Final = 2**19
 """Training steps in memory at a time, or more if one user has more."""
 EXPOSURE: Final = 0.25
 """Weight of an impression without any liking; full liking adds 1."""
+_OVERSAMPLES: Final = 10
+_SMALL: Final = 1e-10
+"""Eigenvalues below this share of the largest are rounding errors."""
+_ALIKE: Final = 0.5
+"""Share of items that two tags must have in common (Jaccard) to be the same tag."""
 
 
-@dataclass(frozen=True)
-class TrainingSteps:
-    """Training steps in which those of one user follow each other."""
-
-    users: IntArray
-    """(M,) number of the user."""
-    items: IntArray
-    """(M,) number of the item."""
-    rewards: Float64Array
-    """(M,)."""
-
-
-def training_steps(folder: Path) -> Iterator[TrainingSteps]:
-    """The training steps of a store, in batches that end between two users.
-
-    Args:
-        folder: store of a log of items, as `prepare` writes it: in order of the users.
-    """
-    held: list[TrainingSteps] = []
-    for batch in steps_of_shards(folder, range(StoreRecord.read(folder).n_shards)):
-        held.append(batch)
-        if sum(len(batch.users) for batch in held) < BLOCK_STEPS:
-            continue
-        joined = joined_steps(held)
-        changes = np.flatnonzero(joined.users[1:] != joined.users[:-1])
-        if not len(changes):
-            held = [joined]
-            continue
-        end = int(changes[-1]) + 1
-        yield _part(joined, slice(end))
-        held = [_part(joined, slice(end, None))]
-    if held:
-        yield joined_steps(held)
-
-
-def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSteps]:
-    """The training steps of some shards of a store, in batches, in order."""
+def read_training_steps(folder: Path, shards: Iterable[int]) -> Iterator[dict[str, Array]]:
+    """The `user`, `item` and `reward` of training steps of some shards of a store, in order."""
     for number in shards:
         shard = folder / f"shard-{number:05d}"
-        columns = {
-            name: np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, "reward")
-        }
+        items, rewards = (
+            np.load(shard / f"{name}.npy", mmap_mode="r") for name in (schema.ITEM, schema.REWARD)
+        )
         offsets, users, splits = (
-            np.load(shard / f"{name}.npy") for name in (schema.OFFSETS, "user", "split")
+            np.load(shard / f"{name}.npy") for name in (schema.OFFSETS, schema.USER, schema.SPLIT)
         )
         begin = 0
         while begin < len(users):
@@ -83,85 +57,49 @@ def steps_of_shards(folder: Path, shards: Iterable[int]) -> Iterator[TrainingSte
             lengths = np.diff(offsets[begin : end + 1])
             training = np.repeat(splits[begin:end] == 0, lengths)
             rows = slice(int(offsets[begin]), int(offsets[end]))
-            yield TrainingSteps(
-                np.repeat(users[begin:end], lengths)[training],
-                columns[schema.ITEM][rows][training].astype(np.int64),
-                columns["reward"][rows][training].astype(np.float64),
-            )
+            yield {
+                schema.USER: np.repeat(users[begin:end], lengths)[training],
+                schema.ITEM: items[rows][training].astype(np.int64),
+                schema.REWARD: rewards[rows][training].astype(np.float64),
+            }
             begin = end
 
 
-def joined_steps(batches: Sequence[TrainingSteps]) -> TrainingSteps:
-    """The steps of all batches as one."""
-    return TrainingSteps(
-        np.concatenate([batch.users for batch in batches]),
-        np.concatenate([batch.items for batch in batches]),
-        np.concatenate([batch.rewards for batch in batches]),
-    )
-
-
-def _part(batch: TrainingSteps, rows: slice) -> TrainingSteps:
-    return TrainingSteps(batch.users[rows], batch.items[rows], batch.rewards[rows])
-
-
-def write_item_states(
-    folder: Path,
-    scratch: Path,
-    item_features: sparse.csr_matrix | None,
-    user_features: sparse.csr_matrix | None,
-    n_items: int,
-    n_users: int,
-    size: int,
-    tags: IntArray | None = None,
-) -> None:
-    """Learn the item embeddings and user features of the store at `folder` and write them there.
-
-    Args:
-        folder: episode store, which receives the file of item states.
-        scratch: folder for files that are of no use afterwards.
-        item_features: (n_items, F) as from `ucfrec.logs.features.encode_features`; None for none.
-        user_features: (n_users, G) likewise.
-        tags: (n_items, T) as from `ucfrec.logs.features.item_tags`; None for none.
-
-    Raises:
-        InputError: the rewards of the training split are all equal.
+def write_item_states(folder: Path, scratch: Path, known: EncodedFeatures, size: int) -> None:
+    """Learn the item embeddings (at most `size` dimensions) and user features of the store at
+    `folder` and write them there. Raises InputError if all rewards of the training split are equal.
     """
-    counts = np.zeros(n_items, dtype=np.int64)
-    trained = np.zeros(n_users, dtype=bool)
+    shards = range(StoreRecord.read(folder).n_shards)
     moments, low, highest = Moments(1), np.inf, -np.inf
-    for batch in training_steps(folder):
-        counts += np.bincount(batch.items, minlength=n_items)
-        trained[batch.users] = True
-        moments.add(batch.rewards)
-        low = min(low, float(batch.rewards.min(initial=np.inf)))
-        highest = max(highest, float(batch.rewards.max(initial=-np.inf)))
+    for batch in read_training_steps(folder, shards):
+        rewards = batch[schema.REWARD]
+        moments.add(rewards)
+        low = min(low, float(rewards.min(initial=np.inf)))
+        highest = max(highest, float(rewards.max(initial=-np.inf)))
     high = min(highest, float(moments.mean[0] + 2 * np.sqrt(moments.covariance[0, 0])))
     if not low < high:
         raise InputError(
             f"all {moments.count} rewards of the training split equal {low}; choose another reward"
         )
-    matrix = Exposure(scratch / "exposure.bin", counts)
-    for batch in training_steps(folder):
-        liking = np.clip((batch.rewards - low) / (high - low), 0, 1)
-        matrix.add(batch.users, batch.items, EXPOSURE + liking)
-    embeddings = item_embeddings(matrix, item_features, size)
-    user_vectors = np.zeros((n_users, 0), dtype=np.float32)
-    if user_features is not None:
-        trained_rows = np.flatnonzero(trained)
-        user_vectors = _reduce(user_features, trained_rows, USER_SIZE)
+    matrix = Exposure(scratch / "exposure.bin", known.item_counts)
+    for batch in keep_users_whole(read_training_steps(folder, shards), schema.USER):
+        liking = np.clip((batch[schema.REWARD] - low) / (high - low), 0, 1)
+        matrix.add(batch[schema.USER], batch[schema.ITEM], EXPOSURE + liking)
+    embeddings = item_embeddings(matrix, known.items, size)
+    user_vectors = np.zeros((len(known.user_counts), 0), dtype=np.float32)
+    if known.users is not None:
+        trained_rows = np.flatnonzero(known.user_counts)
+        user_vectors = _reduce(known.users, trained_rows, USER_SIZE)
         spread = user_vectors[trained_rows].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
-    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, tags)
+    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, known.tags)
 
 
 class Exposure:
     """The user × item matrix of exposure and liking, on disk."""
 
     def __init__(self, path: Path, counts: IntArray) -> None:
-        """
-        Args:
-            counts: (n_items,) number of training steps that show each item.
-        """
+        """Of items with (n_items,) numbers of training steps that show each; `path` is scratch."""
         self.counts = counts
         self.trained = np.flatnonzero(counts)
         """Items that are shown: item of each column."""
@@ -170,15 +108,8 @@ class Exposure:
         self._by_item = np.zeros(len(self.trained))
 
     def add(self, users: IntArray, items: IntArray, weights: Float64Array) -> None:
-        """Add steps.
-
-        Args:
-            users: (M,) user of each step; those of one user follow each other, in one call.
-            items: (M,) item shown.
-            weights: (M,) above 0; those of one user and item are added up.
-        """
-        if not len(users):
-            return
+        """Add steps (M,); those of one user follow each other, in one call, and weights (above 0)
+        of one user and item are added up."""
         rows = np.cumsum(np.append(False, users[1:] != users[:-1]))
         shape = (int(rows[-1]) + 1, len(self.trained))
         block = sparse.coo_matrix((weights, (rows, self._column[items])), shape=shape).tocsr()
@@ -208,20 +139,14 @@ class Exposure:
 def item_embeddings(
     exposure: Exposure, features: sparse.csr_matrix | None = None, size: int = 32
 ) -> Float32Array:
-    """Embed items by co-occurrence in users' histories and by their features.
+    """(n_items, D) float32 embeddings by co-occurrence in users' histories and by features.
 
     The co-occurrence part is the truncated SVD of the user × item matrix of exposure and liking,
     scaled to unit rows. It is averaged with the prediction of a ridge regression from the item's
-    features (zero without features), whose weight grows the fewer times the item was shown: an item
-    never shown has the prediction alone. With features, up to half of the dimensions are the
-    features themselves, reduced by SVD. No embedding has a norm above 1.
-
-    Args:
-        features: (n_items, F); None for none.
-        size: largest D.
-
-    Returns:
-        (n_items, D) float32; D is below `size` if there are few users, items or features.
+    features (n_items, F) (zero without), whose weight grows the fewer times the item was shown: an
+    item never shown has the prediction alone. With features, up to half of the dimensions are the
+    features themselves, reduced by SVD. No embedding has a norm above 1. D is at most `size`, and
+    below it if there are few users, items or features.
     """
     trained = exposure.trained
     counts = exposure.counts[trained]
@@ -231,14 +156,14 @@ def item_embeddings(
     trust = (counts / (counts + PRIOR_COUNT))[:, None]
     combined = np.zeros((len(exposure.counts), cooccurrence.shape[1]))
     if features is not None:
-        combined = predicted_from_features(features, trained, cooccurrence, counts)
+        combined = predict_from_features(features, trained, cooccurrence, counts)
     combined[trained] = trust * cooccurrence + (1 - trust) * combined[trained]
     if content is None:
         return np.asarray(combined, dtype=np.float32)
     return np.asarray(np.hstack([combined, content]) / np.sqrt(2), dtype=np.float32)
 
 
-def predicted_from_features(
+def predict_from_features(
     features: sparse.csr_matrix,
     trained: IntArray,
     cooccurrence: Float64Array,
@@ -281,3 +206,207 @@ def _axes(trained_rows: sparse.csr_matrix, size: int) -> Array:
 def _unit_rows(rows: Array) -> Array:
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(norms > 0, norms, 1)
+
+
+class SparseRows:
+    """A sparse matrix on disk, in blocks of consecutive rows."""
+
+    def __init__(self, path: Path, n_columns: int) -> None:
+        """Without rows yet, to be written to a new file."""
+        self._file: IO[bytes] = path.open("w+b")
+        self._blocks: list[tuple[int, int]] = []
+        self.shape = (0, n_columns)
+
+    def append(self, rows: sparse.csr_matrix) -> None:
+        """Append rows with float32 values."""
+        for array, dtype in ((rows.indptr, "<i8"), (rows.indices, "<i4"), (rows.data, "<f4")):
+            self._file.write(np.ascontiguousarray(array, dtype=dtype).data)
+        self._blocks.append((rows.shape[0], rows.nnz))
+        self.shape = (self.shape[0] + rows.shape[0], self.shape[1])
+
+    def blocks(self) -> Iterator[sparse.csr_matrix]:
+        """The rows, as they were appended."""
+        self._file.seek(0)
+        for rows, values in self._blocks:
+            starts = np.fromfile(self._file, "<i8", rows + 1)
+            columns = np.fromfile(self._file, "<i4", values)
+            data = np.fromfile(self._file, "<f4", values)
+            index = starts.astype(np.int32) if values < 2**31 else starts
+            yield sparse.csr_matrix((data, columns, index), shape=(rows, self.shape[1]))
+
+
+def right_singular_vectors(
+    matrix: SparseRows, by_column: Float64Array, rank: int
+) -> tuple[Float64Array, Float64Array]:
+    """Largest singular values (rank,) and right singular vectors (rank, n) of a matrix (m, n) whose
+    columns are divided by `by_column` (n,).
+
+    The randomised subspace iteration of Halko, Martinsson and Tropp (2011), with the sizes, numbers
+    of iterations and random start of scikit-learn's `randomized_svd`, so that both agree but for
+    rounding (products are in float32) and signs: the largest entry of a vector is above 0. Only
+    matrices with a row for each column are in memory; scikit-learn would also need some with a row
+    for each row. Values beyond the rank of the matrix are 0, and so are their vectors.
+    """
+    m, n = matrix.shape
+    random = np.random.RandomState(0)
+    width = rank + _OVERSAMPLES
+    if m < n:
+        basis = np.zeros((n, width))
+        for block in matrix.blocks():
+            basis += block.T @ random.normal(size=(block.shape[0], width)).astype(np.float32)
+        basis /= by_column[:, None]
+    else:
+        basis = random.normal(size=(n, width))
+    for _ in range(7 if rank < 0.1 * min(m, n) else 4):
+        try:
+            # Several times faster than a QR decomposition, and exact enough between iterations.
+            basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ basis)).T
+        except np.linalg.LinAlgError:
+            basis, _ = np.linalg.qr(basis)
+        basis = _there_and_back(matrix, by_column, basis)
+    basis, _ = np.linalg.qr(basis)
+    gram = np.zeros((basis.shape[1], basis.shape[1]))
+    back = _there_and_back(matrix, by_column, basis, gram)
+    if m < n:
+        values, vectors = _largest(gram, rank)
+        directions = (basis @ vectors).T
+    else:
+        # With A V = Q R, the right singular vectors of Qᵀ A are those of R⁻ᵀ (Aᵀ A V)ᵀ.
+        roots, axes = _largest(gram, len(gram))
+        projected = (back @ (axes * _inverse(roots))).T
+        values, vectors = _largest(projected @ projected.T, rank)
+        directions = (vectors * _inverse(values)).T @ projected
+    signs = np.sign(directions[np.arange(rank), np.abs(directions).argmax(axis=1)])
+    return values, directions * np.where(signs == 0, 1, signs)[:, None]
+
+
+def _inverse(values: Float64Array) -> Float64Array:
+    """1 / x, and 0 for 0."""
+    return np.divide(1, values, out=np.zeros_like(values), where=values > 0)
+
+
+def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64Array]:
+    """Square roots of the largest eigenvalues, descending, 0 for rounding errors; eigenvectors."""
+    values, vectors = np.linalg.eigh(symmetric)
+    values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
+    if rank > len(values):
+        missing = rank - len(values)
+        values = np.pad(values, (0, missing))
+        vectors = np.pad(vectors, ((0, 0), (0, missing)))
+    values = np.where(values > _SMALL * max(values[0], 0), values, 0)
+    return np.sqrt(values), np.where(values > 0, vectors, 0)
+
+
+def _there_and_back(
+    matrix: SparseRows,
+    by_column: Float64Array,
+    basis: Float64Array,
+    gram: Float64Array | None = None,
+) -> Float64Array:
+    """AᵀA V for the matrix A with divided columns and a basis V; adds (A V)ᵀ(A V) to `gram`."""
+    scaled = (basis / by_column[:, None]).astype(np.float32)
+    back = np.zeros(basis.shape)
+    for block in matrix.blocks():
+        product = block @ scaled
+        if gram is not None:
+            gram += product.T @ product
+        back += block.T @ product
+    return back / by_column[:, None]
+
+
+def write_grown_states(
+    store: Path, folder: Path, new_shards: Iterable[int], known: EncodedFeatures
+) -> None:
+    """Write the item states of the store at `folder`, grown from `store` by `new_shards`.
+
+    With feature tables, new items and users have the vectors that a ridge regression of the old
+    ones on the features predicts, and old ones keep theirs. Without, new ones begin at the mean,
+    and items move towards what their users were shown besides as new training steps outweigh the
+    old.
+    """
+    from ucfrec.episodes.states import ItemStates  # needs torch
+
+    batches, old = [*read_training_steps(folder, new_shards)], ItemStates.load(store / ITEM_STATES)
+    users, items, rewards = (
+        np.concatenate([batch[name] for batch in batches])
+        for name in (schema.USER, schema.ITEM, schema.REWARD)
+    )
+    step_counts = np.bincount(items, minlength=len(known.item_counts))
+    old_counts = np.maximum(known.item_counts - step_counts, 0)
+    vectors = _extend_rows(old.embeddings.numpy(), known.items, old_counts)
+    if known.items is None and step_counts.any():
+        liking = np.clip((rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
+        _, rows = np.unique(users, return_inverse=True)
+        shape = (int(rows.max()) + 1, len(vectors))
+        shown = sparse.csr_matrix((EXPOSURE + liking, (rows, items)), shape=shape)
+        vectors = _fold_in(vectors, shown, old_counts, step_counts)
+    features = _extend_rows(old.user_features.numpy(), known.users, known.user_counts)
+    write_item_table(
+        folder / ITEM_STATES,
+        vectors.astype(np.float32),
+        features.astype(np.float32),
+        old.reward_low,
+        old.reward_high,
+        _number_tags(old.tags.numpy(), known.tags, len(vectors)),
+    )
+
+
+def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: IntArray) -> Array:
+    """(n, D): the old rows, and for others what their features predict, or the mean."""
+    trained = np.flatnonzero(counts[: len(old)])
+    mean = old[trained].mean(axis=0) if len(trained) else np.zeros(old.shape[1])
+    rows = np.tile(mean, (len(counts), 1)).astype(np.float64)
+    if features is not None and len(trained) and old.shape[1]:
+        rows += predict_from_features(features, trained, old[trained] - mean, counts[trained])
+        # Of an id without any feature nothing is predicted.
+        rows[np.diff(features.indptr) == 0] = mean
+    rows[: len(old)] = old
+    return rows
+
+
+def _fold_in(
+    vectors: Float64Array, shown: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
+) -> Float64Array:
+    """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD): that
+    of the items (users, n) shown, weighted by liking. New steps of an item weigh as much as their
+    number, against the number of old ones.
+    """
+    of_users = (shown @ vectors) / np.asarray(shown.sum(axis=1))
+    folded = shown.T @ (of_users - of_users.mean(axis=0))
+    norms = np.linalg.norm(vectors[old_counts > 0], axis=1)
+    lengths = np.linalg.norm(folded, axis=1, keepdims=True)
+    folded *= (norms.mean() if len(norms) else 1.0) / np.where(lengths > 0, lengths, 1.0)
+    share = (step_counts / (step_counts + old_counts + PRIOR_COUNT))[:, None]
+    return np.asarray((1 - share) * vectors + share * folded)
+
+
+def _number_tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
+    """(n_items, T) tags by the numbers of `old` (n_old, T); −1 for tags of new items that the store
+    lacks. `new_tags` (n_items, T') are numbered otherwise; T' is 0 without tables."""
+    tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
+    tags[: len(old)] = old
+    if not (old.shape[1] and new_tags.shape[1]):
+        return tags
+    # A new tag is the old one that most of the same items have.
+    sizes = int(new_tags.max()) + 1, int(old.max()) + 1
+    have_new, have_old = _incidence(new_tags[: len(old)], sizes[0]), _incidence(old, sizes[1])
+    both = (have_new.T @ have_old).toarray()
+    union = have_new.sum(axis=0).T + have_old.sum(axis=0) - both
+    share = np.asarray(both / np.maximum(union, 1))
+    best = share.argmax(axis=1)
+    same = {
+        tag: int(best[tag])
+        for tag in range(min(sizes[0], DISTINCT_TAGS + 1))
+        if share[tag, best[tag]] >= _ALIKE
+    }
+    for item in range(len(old), n_items):
+        shared = [same[tag] for tag in new_tags[item].tolist() if tag in same][: old.shape[1]]
+        tags[item, : len(shared)] = shared
+    return tags
+
+
+def _incidence(tags: IntArray, size: int) -> sparse.csr_matrix:
+    """(n, size) 1 where an item has a tag."""
+    rows, columns = np.nonzero(tags >= 0)
+    values = np.ones(len(rows))
+    return sparse.csr_matrix((values, (rows, tags[rows, columns])), shape=(len(tags), size))

@@ -14,8 +14,7 @@ from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_file, require_other_files
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import bind, explained
-from ucfrec.logs.engine import BATCH_ROWS, engine
+from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined
 from ucfrec.logs.tables import (
@@ -24,9 +23,9 @@ from ucfrec.logs.tables import (
     first_and_more,
     is_number,
     open_tables,
-    quoted,
+    quote_name,
 )
-from ucfrec.logs.typed import WANTED, typed_columns
+from ucfrec.logs.typed import WANTED, LogTables, type_columns
 
 FEEDBACK: Final = "feedback"
 """Column of the log: how many rows of feedback belong to the exposure."""
@@ -68,9 +67,8 @@ class Joined:
     with_feedback: int
     """Rows of the log with feedback."""
     matched: int
-    """Rows of feedback that belong to an exposure."""
     unmatched: int
-    """Rows of feedback that belong to none."""
+    """Rows of feedback that belong to an exposure, and to none."""
     columns: tuple[str, ...]
     """Columns of the feedback that the log has."""
 
@@ -126,7 +124,7 @@ def join_feedback(
     ):
         shown_tables = tuple(open_tables(connection, shown_files))
         tables = tuple(open_tables(connection, feedback_files, mapping.partitions))
-        with explained(connection, (*shown_tables, *tables), folder):
+        with explain_errors(connection, (*shown_tables, *tables), folder):
             further = _make_exposures(connection, shown_tables)
             columns = _make_feedback(connection, tables, mapping)
             connection.execute(
@@ -175,7 +173,7 @@ def _make_exposures(
                 f"{table.files[0]} has no column {', '.join(missing)}: it is not a file of "
                 "exposures; name those that serve --exposures or recommend --exposures wrote first"
             )
-    typed = typed_columns(connection, tables, _keys_of(LogMapping()), "0", "user")
+    typed = type_columns(LogTables(connection, tables, _keys_of(LogMapping()), "0", "user"))
     further: dict[str, _Further] = {}
     for table in tables:
         for key, name in _names_of(table).items():
@@ -197,11 +195,7 @@ def _make_exposures(
 
 
 def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -> str:
-    """SQL of the columns of exposures besides the keys, and of the rows that they are read from.
-
-    Args:
-        keys: the same table with the columns of the keys only.
-    """
+    """SQL of the columns of exposures besides the `keys` that a table has, and of its rows."""
     values, columns, texts = {schema.ARM: "''"}, [], []
     for key, name in _names_of(table).items():
         if _OTHERS.get(key) == "VARCHAR":
@@ -212,7 +206,7 @@ def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -
             columns.append(name)
             is_other = key in _OTHERS
             values[key if is_other else further[key].alias] = (
-                f"CAST({quoted(name)} AS {_OTHERS[key]})" if is_other else quoted(name)
+                f"CAST({quote_name(name)} AS {_OTHERS[key]})" if is_other else quote_name(name)
             )
     selects = ", ".join(f"{value} AS {name}" for name, value in values.items())
     return f"{selects} FROM {keys.with_texts(columns, texts).sql}"
@@ -233,7 +227,7 @@ def _make_feedback(
                 "their folder or as a pattern in quotes that the shell does not expand, and then "
                 "files of feedback"
             )
-    typed = typed_columns(connection, tables, _keys_of(mapping), "0", "user")
+    typed = type_columns(LogTables(connection, tables, _keys_of(mapping), "0", "user"))
     keys = {
         column.casefold()
         for table in tables
@@ -250,10 +244,12 @@ def _make_feedback(
         present = {
             n: names[key] for n, key in enumerate(map(str.casefold, columns)) if key in names
         }
-        values = [
-            f"{_cast_number(name, whole.columns[name])} AS {_value(n)}"
-            for n, name in present.items()
-        ]
+        values = []
+        for n, name in present.items():
+            column = quote_name(name)
+            if not _holds_feedback(whole.columns[name]):
+                column = f"CAST({column} AS VARCHAR)"  # it holds text of numbers, or nothing
+            values.append(f"CAST({column} AS DOUBLE) AS {_value(n)}")
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
         source = narrow.with_texts(present.values(), requests)
@@ -274,13 +270,8 @@ def _make_feedback(
 def _feedback_columns(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
 ) -> tuple[str, ...]:
-    """Columns of numbers and truth values, each once, with a note on those that are left out.
-
-    Args:
-        keys: names in lower case that are none of feedback, besides those of exposures.
-
-    Raises:
-        InputError: a column has numbers in one file, and something else in another.
+    """Columns of numbers and truth values, each once, with a note on those that are left out: not
+    `keys` (in lower case) nor columns of exposures. A column may not be numbers in one file only.
     """
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
@@ -304,7 +295,7 @@ def _feedback_columns(
         ((values, words, sample),) = connection.sql(
             "SELECT count(x), count(x) FILTER (n), min(x) FILTER (n) FROM (SELECT x, "
             "NOT coalesce(isfinite(TRY_CAST(x AS DOUBLE)), false) AS n FROM (SELECT "
-            f"trim(CAST({quoted(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
+            f"trim(CAST({quote_name(name)} AS VARCHAR)) AS x FROM {table.of([name]).sql}))"
         ).fetchall()
         found_words = f"{words:,} of {values:,} are not numbers (such as {sample!r:.60})"
         if words and key in columns:
@@ -330,12 +321,6 @@ def _value(n: int) -> str:
     return f"value_{n}"
 
 
-def _cast_number(name: str, kind: str) -> str:
-    """SQL of a column of feedback as DOUBLE; other types hold text of numbers or nothing."""
-    value = quoted(name) if _holds_feedback(kind) else f"CAST({quoted(name)} AS VARCHAR)"
-    return f"CAST({value} AS DOUBLE)"
-
-
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
     absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
@@ -352,7 +337,9 @@ def _write(
     values = {FEEDBACK: FEEDBACK, **{name: _value(n) for n, name in enumerate(columns)}}
     largest = "".join(f", max({_value(n)}) AS {_value(n)}" for n in range(len(columns)))
     again = {name.casefold() for name in values}
-    selects = [f"{c.alias} AS {quoted(c.name)}" for key, c in further.items() if key not in again]
+    selects = [
+        f"{c.alias} AS {quote_name(c.name)}" for key, c in further.items() if key not in again
+    ]
     for name, value in values.items():
         sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
         if earlier is not None and earlier.is_number:
@@ -361,9 +348,14 @@ def _write(
                 if name == FEEDBACK
                 else f"greatest({sql}, CAST(coalesce({earlier.alias}, 0) AS DOUBLE))"
             )
-        selects.append(f"{sql} AS {quoted(name)}")
+        selects.append(f"{sql} AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
-    user = "CAST(user_id AS BIGINT) AS user_id" if _are_users_numbers(connection) else "user_id"
+    ((whole,),) = connection.sql(
+        "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
+        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
+        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
+    ).fetchall()
+    user = "CAST(user_id AS BIGINT) AS user_id" if whole else "user_id"
     query = (
         f"SELECT {user}, * EXCLUDE ({', '.join(internal)}), {', '.join(selects)} FROM exposures "
         f"LEFT JOIN (SELECT m.row AS row, count(*) AS {FEEDBACK}{largest} FROM matches m "
@@ -375,16 +367,6 @@ def _write(
         with pq.ParquetWriter(scratch, batches.schema) as writer:
             for batch in batches:
                 writer.write_batch(batch)
-
-
-def _are_users_numbers(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Whether the feedback's users are numbers, and all exposures' are written as numbers are."""
-    ((whole,),) = connection.sql(
-        "SELECT (SELECT coalesce(any_value(typeof(user_id)) = 'BIGINT', false) FROM feedback) "
-        "AND (SELECT coalesce(bool_and(CAST(TRY_CAST(user_id AS BIGINT) AS VARCHAR) IS NOT "
-        "DISTINCT FROM CAST(user_id AS VARCHAR)), true) FROM exposures)"
-    ).fetchall()
-    return bool(whole)
 
 
 def _count(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
@@ -404,6 +386,12 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         f"(SELECT count(*) FROM feedback f SEMI JOIN exposures e ON {_SAME_KEY}), "
         f"coalesce(bool_and(timestamp % {_DAY_MS} = 0), false) FROM feedback"
     ).fetchall()
+    # As a number where no calendar has it.
+    first, last = (
+        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
+        f"CAST({time} AS VARCHAR), '(none)')"
+        for time in ("first", "last")
+    )
     reasons = []
     if requests and not equal:
         reasons.append(
@@ -415,11 +403,17 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         reasons.append(
             "none of its users was shown any of their items, check --column user_id and item_id"
         )
+    shown_at, given_at = (
+        connection.sql(
+            f"SELECT {first} || ' to ' || {last} FROM "
+            f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
+        ).fetchall()[0][0]
+        for rows in ("exposures", "feedback")
+    )
     reasons.append(
-        f"exposures are from {_time_range(connection, 'exposures')} and feedback from "
-        f"{_time_range(connection, 'feedback')} (UTC), where numbers are read as milliseconds: "
-        "seconds need --column timestamp='COLUMN * 1000', microseconds "
-        "--column timestamp='COLUMN / 1000', and later feedback a larger --within"
+        f"exposures are from {shown_at} and feedback from {given_at} (UTC), where "
+        "numbers are read as milliseconds: seconds need --column timestamp='COLUMN * 1000', "
+        "microseconds --column timestamp='COLUMN / 1000', and later feedback a larger --within"
     )
     if midnight:
         reasons.append(
@@ -428,17 +422,3 @@ def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str
         )
     rows = joined.unmatched
     return f"none of the {rows:,} rows of feedback matches an exposure; {'; '.join(reasons)}"
-
-
-def _time_range(connection: duckdb.DuckDBPyConnection, rows: str) -> str:
-    """The first and the last time of a table, in UTC; as a number where no calendar has it."""
-    first, last = (
-        f"coalesce(strftime(TRY(make_timestamp_ms({time})), '%Y-%m-%d %H:%M:%S'), "
-        f"CAST({time} AS VARCHAR), '(none)')"
-        for time in ("first", "last")
-    )
-    ((times,),) = connection.sql(
-        f"SELECT {first} || ' to ' || {last} FROM "
-        f"(SELECT min(timestamp) AS first, max(timestamp) AS last FROM {rows})"
-    ).fetchall()
-    return str(times)

@@ -1,17 +1,21 @@
-"""Column mappings of logs, written as data, and the datasets that supply them."""
+"""Column mappings of logs, written as data, and the datasets and releases that supply them."""
 
 import glob
+import hashlib
+import tarfile
 import warnings
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Final
+from pathlib import Path, PurePosixPath
+from textwrap import shorten
+from typing import Final, get_args
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.atomic import read_toml
+from ucfrec.files.atomic import atomic_folder, read_toml
 from ucfrec.files.remote import RECORDS
 from ucfrec.logs.expressions import Expression
 from ucfrec.settings import nearest
@@ -32,8 +36,7 @@ OPTIONAL_COLUMNS: Final = (
 )
 EARLIEST_MS: Final = 946_684_800_000
 """2000-01-01 UTC in ms; rows with an earlier time are dropped as clock errors."""
-SESSIONS: Final = (schema.SESSION_ID, "gap", "user")
-"""Ways in which rows form sessions."""
+SESSIONS: Final = get_args(schema.SessionBy)
 
 
 @dataclass(frozen=True)
@@ -119,11 +122,7 @@ class LogMapping:
 
     @property
     def earliest_ms(self) -> int:
-        """Milliseconds of `earliest`.
-
-        Raises:
-            InputError: it is not a time.
-        """
+        """Milliseconds of `earliest`, or InputError if it is not a time."""
         if self.earliest is None:
             return EARLIEST_MS
         try:
@@ -143,13 +142,18 @@ class LogMapping:
         columns = {**defaults.columns, **self.columns}
         return LogMapping(**values | {"columns": columns, "remembered": remembered})
 
+    def remember(self) -> dict[str, object]:
+        """What a store's record keeps of it, for `of_source`."""
+        values = {name: getattr(self, name) for name in ("time_format", "earliest", "where")}
+        return {
+            "mapping": {name: str(text) for name, text in self.columns.items()},
+            **{name: str(value) for name, value in values.items() if value is not None},
+            **({"partitions": True} if self.partitions else {}),
+        }
+
     @classmethod
     def of_source(cls, source: Source, origin: str) -> "LogMapping":
-        """What is remembered of the log that a store was made from, for later logs.
-
-        Args:
-            source: in the record of the store or the run.
-        """
+        """What the record of a store or run remembers of its log, for later logs."""
         columns = {name: Expression(text, origin) for name, text in source.mapping.items()}
         where = source.where and Expression(source.where, origin)
         return cls(
@@ -198,12 +202,8 @@ class Dataset:
     """Public data sets of this kind, by name."""
 
 
-def columns_given(assignments: Sequence[str]) -> dict[str, str]:
-    """Read `--column` arguments: "user_id=uid" is {"user_id": "uid"}.
-
-    Raises:
-        InputError: an argument has no "=".
-    """
+def read_columns(assignments: Sequence[str]) -> dict[str, str]:
+    """Read `--column` arguments, `NAME=COLUMN`: "user_id=uid" is {"user_id": "uid"}."""
     pairs: dict[str, str] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -259,11 +259,7 @@ def read_mapping(path: Path) -> LogMapping:
 
 
 def _require_keys(where: str, table: object, kind: type) -> None:
-    """Check that a table of a mapping file has the keys of a class.
-
-    Raises:
-        InputError: it is no table, or has an unknown key, or lacks one.
-    """
+    """Check that a table of a mapping file has the keys of a class, and no others."""
     if not isinstance(table, dict):
         raise InputError(f"{where}: write it in double brackets, with its keys in lines below")
     names = [part.name for part in fields(kind) if part.name != "remembered"]
@@ -284,24 +280,25 @@ def _beside(mapping: Path, file: str | Path) -> Path:
 
 
 def log_files(paths: Sequence[str | Path]) -> tuple[Path, ...]:
-    """List the log files among files, folders and globs, each once.
+    """List the log files among files, folders and globs (or a single one), each once.
 
-    A folder stands for all log files in it and its sub-folders, but for stores, runs, and those
-    whose names begin with a dot or an underscore.
-
-    Args:
-        paths: of files, folders and globs; or a single one.
-
-    Returns:
-        Files in the order of `paths`; those of one folder or glob by name.
-
-    Raises:
-        InputError: a path is missing, matches no log file, or is a file of another kind.
+    A folder stands for all log files in it and its sub-folders, by name, but for stores, runs, and
+    those whose names begin with a dot or an underscore. Raises InputError if a path is missing,
+    matches no log file, or is a file of another kind.
     """
     files: dict[Path, None] = {}
     # A text is a sequence of texts, too: its characters.
     for path in [paths] if isinstance(paths, str) else paths:
-        matches = _matches(Path(path))
+        named = Path(path)
+        if named.is_file() and not is_table(named):
+            raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; {_CONVERT}")
+        if named.exists():
+            matches = _tables(named)
+        elif glob.has_magic(str(path)):
+            globbed = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
+            matches = [table for m in globbed if m.name[:1] != "." for table in _tables(m)]
+        else:
+            raise InputError(f"{path} does not exist; check the path")
         if not matches:
             raise InputError(f"{path} matches no {' or '.join(SUFFIXES)} file; check the path")
         files |= dict.fromkeys(matches)
@@ -315,25 +312,9 @@ def table_name(file: Path) -> str:
     return next((p.name for p in file.parents if p.name.endswith(SUFFIXES)), file.name)
 
 
-def _matches(path: Path) -> list[Path]:
-    if path.is_dir():
-        return _tables(path)
-    if path.is_file():
-        if not is_table(path):
-            raise InputError(f"{path} is not a {' or '.join(SUFFIXES)} file; {_CONVERT}")
-        return [path]
-    if not glob.has_magic(str(path)):
-        raise InputError(f"{path} does not exist; check the path")
-    matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-    return [table for match in matches if match.name[:1] != "." for table in _tables(match)]
-
-
 def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
-    """The tables at a path, those of a folder and its sub-folders by name.
-
-    Args:
-        parents: the folders that it lies in, without links: a link may lead back to one of them.
-    """
+    """The tables at a path, those of a folder and its sub-folders by name; `parents` are the
+    folders that it lies in, without links, for a link may lead back to one of them."""
     if not path.is_dir():
         if path.name.lower().endswith(_OTHER_TABLES):
             warnings.warn(f"{path} is not read; {_CONVERT}", InputNote, stacklevel=4)
@@ -352,3 +333,80 @@ def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
 def is_table(path: Path) -> bool:
     """Whether `path` is a file with a suffix that `prepare` reads."""
     return path.is_file() and path.name.lower().endswith(SUFFIXES)
+
+
+def load_release(
+    adapter: str, dataset: Dataset, name: str, folder: Path, part: str | None = None
+) -> LogFiles:
+    """The logs of a release with their columns mapped, downloaded to `folder` if not there yet.
+
+    `part` is a key of `Release.parts`; None for the first. Raises InputError if there is no such
+    part, or the archive cannot be downloaded, has another checksum, or lacks the part.
+    """
+    release = dataset.releases[name]
+    part = next(iter(release.parts)) if part is None else part
+    if part not in release.parts:
+        raise InputError(f"{name} has no part {part!r}; it has {', '.join(release.parts)}")
+    path = _unpack(name, release, folder) / release.parts[part]
+    if not path.exists():
+        raise InputError(f"{path} is missing; delete {folder / name} and load it again")
+    files, mapping = dataset.resolve([path], LogMapping())
+    return LogFiles(files, mapping, adapter)
+
+
+def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
+    """Name of the adapter that has a release, or InputError."""
+    adapters = {release: key for key, dataset in datasets.items() for release in dataset.releases}
+    if name not in adapters:
+        raise InputError(f"no data set is called {name!r}; there are {', '.join(sorted(adapters))}")
+    return adapters[name]
+
+
+def _unpack(name: str, release: Release, folder: Path) -> Path:
+    """The folder with the files of a release."""
+    target = folder / name
+    if target.is_dir():
+        return target
+    archive = folder / PurePosixPath(release.url).name
+    if not archive.is_file():
+        _download(name, release, archive)
+    kind, _, stated = release.checksum.partition(":")
+    with archive.open("rb") as file:
+        checksum = hashlib.file_digest(file, kind).hexdigest()
+    if checksum != stated:
+        raise InputError(
+            f"{archive} has {kind} {checksum}, the release {stated}; it is damaged or another "
+            "version: delete it and load it again"
+        )
+    with atomic_folder(target) as scratch:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as content:
+                content.extractall(scratch)
+        else:
+            with tarfile.open(archive) as content:
+                # Names that lead elsewhere, links out of the folder and devices are refused.
+                content.extractall(scratch, filter="data")
+        if release.convert is not None:
+            release.convert(scratch)
+    return target
+
+
+def _download(name: str, release: Release, archive: Path) -> None:
+    by_hand = (
+        f"download {release.url} ({release.size / 1e6:,.0f} MB, see {release.homepage}) to "
+        f"{archive}, then repeat this"
+    )
+    try:
+        import pooch
+    except ModuleNotFoundError:
+        raise InputError(
+            f"downloading {name} needs pooch; install ucfrec[datasets], or {by_hand}"
+        ) from None
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        pooch.retrieve(release.url, release.checksum, archive.name, archive.parent)
+    except Exception as error:  # of several libraries, for names, connections, certificates, status
+        if "does not match the known hash" in str(error):
+            raise InputError(f"{release.url} has changed: {error}; {by_hand}") from None
+        reason = shorten(str(error) or type(error).__name__, 200, placeholder=" …")
+        raise InputError(f"{name} cannot be downloaded ({reason}); {by_hand}") from None

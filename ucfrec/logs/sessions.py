@@ -1,15 +1,47 @@
-"""Episodes of sorted rows: where sessions begin, how a split cuts them, which count."""
+"""Episodes of sorted rows: where sessions begin, how a split cuts them, and how a store gets them.
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final
+Users and items get their numbers here, and every episode is counted before any is written.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.logs.sorted_rows import SESSION, USER, SortedRows
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.episodes.writer import StoreWriter
+from ucfrec.errors import InputError
+from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
+from ucfrec.logs.rows import CODES, ITEM, SESSION, USER, SortedRows
+from ucfrec.logs.tables import glob_pattern, quote
+from ucfrec.logs.typed import TypedLog
+from ucfrec.progress import Progress
 
+FEW_VALUES: Final = 20
+"""Rewards with at most this many distinct values are counted by value, others in as many bins."""
+EPISODES: Final = "episodes"
+"""Table of the episodes: `episode` (number, from 0), `user_code`, `split`, `steps`,
+`begins_session` and `terminated`."""
+USED_USERS, USED_ITEMS = "used_users", "used_items"
+"""Tables of the users and items in the steps: id, `code`, `steps` and `train_count` (those of the
+training split); of users `longest`, the steps of their longest episode, and `ended`, whether their
+last one is terminated."""
+ITEMS_FILE: Final = "items.parquet"
+USERS_FILE: Final = "users.parquet"
+EPISODE_USERS: Final = "episode_users.parquet"
+ID_TABLES: Final = (
+    (schema.USER_ID, "users", USERS_FILE),
+    (schema.ITEM_ID, "items", ITEMS_FILE),
+)
+"""Id column, its DuckDB table of ids and numbers, and the file of that table in the store."""
 _BINS: Final = 2**16
 
 
@@ -18,7 +50,7 @@ class Cut:
     """How rows form episodes."""
 
     session_by: str
-    """One of `ucfrec.logs.mapping.SESSIONS`."""
+    """One of `ucfrec.schema.SessionBy`."""
     gap_ms: int
     """With "gap": a longer pause (ms) ends the session."""
     min_steps: int
@@ -36,7 +68,6 @@ class Episodes:
     rows: dict[str, Array]
     """(M,) or (M, size) columns of `SortedRows.file`."""
     lengths: IntArray
-    """(E,) steps."""
     users: IntArray
     """(E,) `USER`."""
     splits: IntArray
@@ -52,16 +83,10 @@ class Episodes:
 
 
 def split_bounds(rows: SortedRows, split: tuple[float, ...]) -> tuple[int, int]:
-    """Times (ms) at which the validation and the test split begin.
-
-    Args:
-        rows: at least one usable row.
-        split: three shares of the rows in order of time, or the two times (ms).
-    """
+    """Times (ms) at which validation and test begin, of shares of the rows or of two times."""
     if len(split) == 2:
         return int(split[0]), int(split[1])
-    places = (round(rows.count * split[0]), round(rows.count * (split[0] + split[1])))
-    begin, end = (_find_time(rows, place) for place in places)
+    begin, end = (_find_time(rows, round(rows.count * share)) for share in np.cumsum(split)[:2])
     return begin, end
 
 
@@ -120,3 +145,316 @@ def _cut_episodes(rows: dict[str, Array], cut: Cut, log_end: int) -> Episodes:
         terminated[fits],
         int(lengths[too_long].sum()),
     )
+
+
+class Moments:
+    """Number, mean and squared deviations of vectors of one size, in batches.
+
+    Batches are merged by the formula of Chan, Golub and LeVeque (1983), whose rounding errors do
+    not grow with the mean.
+    """
+
+    def __init__(self, size: int) -> None:
+        """Of no vectors yet."""
+        self.count = 0
+        self.mean = np.zeros(size)
+        self._deviations = np.zeros((size, size))
+
+    def add(self, *entries: Array) -> None:
+        """Add M vectors, given as (M,) numbers of each of their entries."""
+        batch = np.array(entries, dtype=np.float64)
+        if not batch.shape[1]:
+            return
+        mean = batch.mean(axis=1)
+        centred = batch - mean[:, None]
+        apart = mean - self.mean
+        total = self.count + batch.shape[1]
+        self._deviations += centred @ centred.T
+        self._deviations += np.outer(apart, apart) * (self.count * batch.shape[1] / total)
+        self.mean += apart * (batch.shape[1] / total)
+        self.count = total
+
+    @property
+    def covariance(self) -> Float64Array:
+        """(size, size) covariance of all vectors so far, not corrected for their number."""
+        return self._deviations / max(self.count, 1)
+
+
+@dataclass
+class StepCounts:
+    """Counts and statistics of the steps in episodes."""
+
+    item_steps: IntArray
+    item_train_steps: IntArray
+    """(items,) number of steps, and of training steps, that show each item, by code."""
+    steps: int = 0
+    first_ms: int = np.iinfo(np.int64).max
+    last_ms: int = 0
+    rewards: Moments = field(default_factory=lambda: Moments(1))
+    values: dict[float, int] = field(default_factory=dict)
+    """How often each reward occurred, until there are more than `FEW_VALUES` of them."""
+    lowest: float = np.inf
+    highest: float = -np.inf
+    returns: Moments = field(default_factory=lambda: Moments(2))
+    """Of training steps: rewards and number of steps from there to the end of the episode."""
+    long_rows: int = 0
+    """Rows of episodes that are dropped as too long."""
+    unknown_propensities: int = 0
+    not_above_0: int = 0
+    above_1: int = 0
+    """Numbers of propensities."""
+    lowest_propensity: float = 0.0
+    highest_propensity: float = 0.0
+
+    def add(self, episodes: Episodes) -> None:
+        """Count the steps of episodes."""
+        self.long_rows += episodes.long_rows
+        times, rewards = (episodes.rows[name] for name in (schema.TIMESTAMP, schema.REWARD))
+        if not len(times):
+            return
+        self.steps += len(times)
+        self.first_ms = min(self.first_ms, int(times.min()))
+        self.last_ms = max(self.last_ms, int(times.max()))
+        self.rewards.add(rewards)
+        self._count_values(rewards)
+        self.lowest = min(self.lowest, float(rewards.min()))
+        self.highest = max(self.highest, float(rewards.max()))
+        training = np.repeat(episodes.splits == 0, episodes.lengths)
+        ends = np.cumsum(episodes.lengths)
+        ahead = np.repeat(ends, episodes.lengths) - np.arange(len(rewards))
+        earned = np.append(0.0, np.cumsum(rewards))
+        return_to_go = np.repeat(earned[ends], episodes.lengths) - earned[:-1]
+        self.returns.add(return_to_go[training], ahead[training])
+        if ITEM in episodes.rows:
+            items, size = episodes.rows[ITEM], len(self.item_steps)
+            self.item_steps += np.bincount(items, minlength=size)
+            self.item_train_steps += np.bincount(items[training], minlength=size)
+        if schema.PROPENSITY in episodes.rows:
+            propensities = episodes.rows[schema.PROPENSITY]
+            self.unknown_propensities += int(np.count_nonzero(np.isnan(propensities)))
+            self.not_above_0 += int(np.count_nonzero(propensities <= 0))
+            self.above_1 += int(np.count_nonzero(propensities > 1))
+            lowest, highest = np.fmin.reduce(propensities), np.fmax.reduce(propensities)
+            self.lowest_propensity = float(np.fmin(self.lowest_propensity, lowest))
+            self.highest_propensity = float(np.fmax(self.highest_propensity, highest))
+
+    def _count_values(self, rewards: Array) -> None:
+        if len(self.values) > FEW_VALUES:
+            return
+        for value in self.values:
+            same = rewards == value
+            self.values[value] += int(np.count_nonzero(same))
+            rewards = rewards[~same]
+        values, counts = (part.tolist() for part in np.unique(rewards, return_counts=True))
+        self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
+
+
+def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
+    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
+
+    Raises InputError if no episode is left, none is in the training split, or a propensity is none.
+    """
+    log, connection = rows.log, rows.log.connection
+    has_items = log.key == schema.ITEM_ID
+    n_items = log.one("SELECT count(*) FROM item_codes")[0] if has_items else 0
+    counts = StepCounts(np.zeros(n_items, dtype=np.int64), np.zeros(n_items, dtype=np.int64))
+    names = ("user_code", "split", "steps", "begins_session", "terminated")
+    whole_numbers = pa.schema([(name, pa.int64()) for name in names])
+
+    def count() -> Iterator[pa.RecordBatch]:
+        for episodes in read_episodes(rows, cut):
+            counts.add(episodes)
+            columns = (
+                *(episodes.users, episodes.splits, episodes.lengths),
+                *(episodes.begins_session, episodes.terminated),
+            )
+            yield pa.record_batch([to_arrow(c) for c in columns], schema=whole_numbers)
+
+    connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
+    connection.execute(
+        f"CREATE TABLE {EPISODES} AS SELECT row_number() OVER () - 1 AS episode, user_code, split, "
+        "steps, begins_session = 1 AS begins_session, terminated = 1 AS terminated FROM counted"
+    )
+    connection.execute(
+        f"""
+        CREATE TABLE {USED_USERS} AS
+        SELECT {schema.USER_ID}, code, steps, train_count, longest, ended FROM user_codes JOIN (
+            SELECT user_code AS code, CAST(sum(steps) AS BIGINT) AS steps, max(steps) AS longest,
+                arg_max(terminated, episode) AS ended,
+                CAST(coalesce(sum(steps) FILTER (split = 0), 0) AS BIGINT) AS train_count
+            FROM {EPISODES} GROUP BY user_code
+        ) USING (code)
+        """
+    )
+    if has_items:
+        codes = np.flatnonzero(counts.item_steps)
+        columns = (codes, counts.item_steps[codes], counts.item_train_steps[codes])
+        used = pa.record_batch(list(map(to_arrow, columns)), ["code", "steps", "train_count"])
+        connection.register("used", used)
+        connection.execute(
+            f"CREATE TABLE {USED_ITEMS} AS SELECT {schema.ITEM_ID}, code, steps, train_count "
+            "FROM item_codes JOIN used USING (code)"
+        )
+    _require_usable(rows, cut, counts)
+    return counts
+
+
+def _require_usable(rows: SortedRows, cut: Cut, counts: StepCounts) -> None:
+    if not counts.steps:
+        raise InputError(
+            f"no session is left: none of the {rows.count} clean rows is in an episode of "
+            f"{cut.min_steps} steps or more; lower min_steps or widen the sessions"
+        )
+    if not rows.log.one(f"SELECT count(*) FROM {EPISODES} WHERE split = 0")[0]:
+        ends = datetime.fromtimestamp(cut.bounds[0] / 1000, UTC)
+        raise InputError(
+            f"no row is in the training split, before {ends:%Y-%m-%d %H:%M:%S} UTC: all are of "
+            "that time or later; log finer times, or choose a later split"
+        )
+    log, name = rows.log, schema.PROPENSITY
+    if counts.not_above_0:
+        lowest = f"{counts.lowest_propensity:.6g}"
+        raise InputError(
+            f"{log.name}: {name} is not above 0, down to {lowest}, in {counts.not_above_0:,} of "
+            f"{counts.steps:,} rows; of a logarithm give --column propensity='exp(propensity)'; "
+            f"if {lowest} means unknown, --column propensity='nullif(propensity, {lowest})'"
+        )
+    if counts.above_1 and log.key == schema.ITEM_ID:
+        raise InputError(
+            f"{log.name}: {name} is above 1, up to {counts.highest_propensity:.6g}, in "
+            f"{counts.above_1:,} of {counts.steps:,} rows; give the probability that the item was "
+            "shown: of a percentage with --column propensity='propensity / 100', or ignore the "
+            "column with --column propensity="
+        )
+
+
+def number_ids(
+    log: TypedLog, features: Mapping[str, Sequence[str]], store: Path | None, grows: bool
+) -> None:
+    """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`; after
+    `count_steps`.
+
+    Ids are those of the steps and of feature tables (by id column). Those of a `store` have its
+    numbers, and others none; if it `grows`, they follow and counts are added up.
+    """
+    for name, table, file in ID_TABLES:
+        if name not in log.columns:
+            continue
+        kind = log.id_type(name)
+        old = f"SELECT NULL::{kind} AS {name}, 0 AS number, 0 AS train_count WHERE false"
+        if store is not None:
+            # Ids may be integers in the store and text in the log, or vice versa: 07 is not 7.
+            cast = f"TRY_CAST({name} AS {kind})"
+            same = f"CAST({cast} AS VARCHAR) = CAST({name} AS VARCHAR)"
+            options = "file_row_number = true, hive_partitioning = false"
+            source = f"read_parquet({quote(glob_pattern(store / file))}, {options})"
+            old = (
+                f"SELECT CASE WHEN {same} THEN {cast} END AS {name}, file_row_number AS number, "
+                f"{'' if grows else '0 AS '}train_count FROM {source}"
+            )
+            if not grows:
+                log.connection.execute(f"CREATE TABLE {table} AS {old}")
+                continue
+        ids = [f"SELECT {name} FROM used_{table}"]
+        ids += [f"SELECT id FROM {feature_table}" for feature_table in features[name]]
+        log.connection.execute(f"""
+            CREATE TABLE {table} AS
+            WITH old AS ({old}),
+            new AS (({" UNION ".join(ids)}) EXCEPT SELECT {name} FROM old),
+            every AS (
+                SELECT {name}, number, train_count FROM old UNION ALL
+                SELECT {name}, (SELECT count(*) FROM old) + row_number() OVER (ORDER BY {name}) - 1,
+                    0 FROM new
+            )
+            SELECT {name}, number, a.train_count + coalesce(b.train_count, 0) AS train_count
+            FROM every AS a LEFT JOIN used_{table} AS b USING ({name})
+        """)
+
+
+def list_text_ids(store: Path | None) -> tuple[str, ...]:
+    """Id columns that are text in a store; none without one."""
+    if store is None:
+        return ()
+    return tuple(
+        name
+        for name, _, file in ID_TABLES
+        if (store / file).is_file()
+        if not pa.types.is_integer(pq.read_schema(store / file).field(name).type)
+    )
+
+
+def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
+    """Write `users.parquet` and `items.parquet`; returns a digest of each for the fingerprint."""
+    digests: dict[str, list[Any]] = {}
+    for name, table, file in ID_TABLES:
+        if name not in log.columns:
+            continue
+        _copy(log, f"SELECT * EXCLUDE number FROM {table} ORDER BY number", folder / file)
+        digest = hashlib.sha256()
+        query = f"SELECT {name} FROM {table} ORDER BY number"
+        for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+            digest.update("\n".join(map(str, batch.column(0).to_pylist())).encode())
+        digests[name] = [digest.hexdigest()]
+    return digests
+
+
+def write_episode_users(log: TypedLog, file: Path) -> None:
+    """Write the user of every episode, in the order of the store."""
+    source = f"{EPISODES} JOIN user_codes ON code = {USER}"
+    _copy(log, f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode", file)
+
+
+def _copy(log: TypedLog, query: str, file: Path) -> None:
+    # DuckDB's COPY cannot write here: its connection may open only the scratch folder.
+    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
+    with pq.ParquetWriter(file, reader.schema) as writer:
+        for batch in reader:
+            writer.write_batch(batch)
+
+
+def write_steps(
+    rows: SortedRows,
+    cut: Cut,
+    folder: Path,
+    display: Progress,
+    first_shard: int = 0,
+    fill: Mapping[str, float] = MappingProxyType({}),
+) -> StoreWriter:
+    """Write all steps to the store at `folder`, after `number_ids`; unknown users and items are −1.
+
+    `fill` has the step columns of the store, with what steps without a value have; others are left
+    out. Empty for those of the log.
+    """
+    log, writer = rows.log, StoreWriter(folder, first_shard=first_shard)
+    users = _read_numbers(log, "users", schema.USER_ID)
+    items = _read_numbers(log, "items", schema.ITEM_ID) if log.key == schema.ITEM_ID else users
+    for episodes in read_episodes(rows, cut):
+        columns, lengths = episodes.rows, episodes.lengths
+        if ITEM in columns:
+            columns[schema.ITEM] = items[columns[ITEM]]
+        if rows.observations is not None:
+            columns[schema.OBSERVATION] = rows.observations.of_rows(columns["row"])
+        names = [n for n in schema.STEP_DTYPES if n in columns and (n in fill or not fill)]
+        steps = {name: columns[name] for name in names}
+        count = int(lengths.sum())
+        steps |= {n: np.full(count, value) for n, value in fill.items() if n not in steps}
+        first = np.zeros(count, dtype=bool)
+        first[np.cumsum(lengths) - lengths] = True
+        values = {
+            schema.USER: users[episodes.users],
+            schema.SPLIT: episodes.splits,
+            schema.TERMINATED: episodes.terminated,
+        }
+        writer.append(steps, first, {n: np.repeat(v, lengths) for n, v in values.items()})
+        display.update(count)
+    return writer
+
+
+def _read_numbers(log: TypedLog, table: str, name: str) -> IntArray:
+    """Number in a table of each id by code; −1 for others, and for ids in no step."""
+    (size,) = log.one(f"SELECT count(*) FROM {CODES[name][0]}")
+    numbers = np.full(size, -1, dtype=np.int32)
+    query = f"SELECT code, CAST(number AS INTEGER) FROM used_{table} JOIN {table} USING ({name})"
+    for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+        numbers[to_numpy(batch.column(0))] = to_numpy(batch.column(1))
+    return numbers

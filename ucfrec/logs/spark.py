@@ -1,9 +1,10 @@
-"""Sort the rows of a log with Apache Spark, for logs that outgrow one machine.
+"""Read and sort the rows of a log with Apache Spark, for logs that outgrow one machine.
 
 Spark's workers read the files, evaluate the columns and the reward with DuckDB (`Task`), so that an
 expression means the same whatever sorts the rows, number the ids and sort: in the scratch folder
-the rows are what DuckDB's sort would give, and what follows is the same. Workers need ucfrec and
-the same paths to the logs and the scratch folder.
+the rows are what DuckDB's sort would give, and what follows is the same. Or each worker gets all
+rows of some users (`map_users`) as one Parquet file, which is read as any other on one machine.
+Workers need ucfrec and the same paths to the logs and the scratch folder.
 """
 
 import os
@@ -13,65 +14,67 @@ import signal
 import sys
 import threading
 import warnings
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from math import ceil
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
 
-import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.errors import InputError, one_line
-from ucfrec.logs.binding import explained
-from ucfrec.logs.engine import BATCH_ROWS, engine
-from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.sorted_rows import (
+from ucfrec.errors import InputError, InputNote, one_line
+from ucfrec.files.locks import scratch_folder
+from ucfrec.logs.engine import BATCH_ROWS, engine, explain_errors
+from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
+from ucfrec.logs.rows import (
     FAULT_COUNTS,
     FAULTY,
+    REASONS,
     SortedRows,
     check_sorted,
+    code_ids,
     code_tables,
-    coded_ids,
-    in_order,
-    with_faults,
+    mark_faults,
+    order_rows,
 )
+from ucfrec.logs.summary import NoRowsError, note_dropped, require_rows
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
     ROWS,
+    LogTables,
     TypedLog,
-    numbered_rows,
-    typed_columns,
-)
-from ucfrec.logs.vectors import (
-    observation_counts,
-    require_observations,
-    vector_counts,
-    vector_sizes,
-    vectors,
+    describe_log,
+    number_rows,
+    open_log_tables,
+    survey_vectors,
+    type_columns,
 )
 
 MEMORY: Final = "1GB"
 """Memory of DuckDB in a task."""
-_TYPES: Final = {"BIGINT": "bigint", "VARCHAR": "string"}
-_COLUMNS: Final = {
+PART_ROWS: Final = 1_000_000
+"""About so many rows are a part; a user's rows are never in two."""
+_TYPES: Final = {
+    "BIGINT": "bigint",
+    "VARCHAR": "string",
     schema.ACTION: "array<float>",
     schema.TIMESTAMP: "bigint",
     schema.OBSERVATION: "array<float>",
     schema.PROPENSITY: "float",
     schema.IS_RANDOM: "boolean",
 }
+"""DuckDB type of an id, or another log column, to Spark's type."""
 _SORTED: Final = "sorted"
-_COUNTS: Final = "file bigint, name string, size bigint, n bigint"
-_ROWS, _BAD = "rows", "bad"
 _REFUSED: Final = re.compile(r"ucfrec\.errors\.InputError: ([^\n]+)")
-Files = Sequence[tuple[str, Table]]
-"""Of each file, the SQL of its typed columns and the table that it is."""
+
+Work = Callable[[int, Path, LogMapping], int]
+"""Takes the number of a part, the file of its rows and their columns; returns a count. The rows
+have the columns of the schema and `reward`."""
 
 
 @dataclass(frozen=True)
@@ -85,177 +88,84 @@ class Task:
     more_files: tuple[Path, ...] = ()
     """Other files that the query reads."""
 
-    def run(self) -> Iterator[pa.RecordBatch]:
-        """The result, in order.
-
-        Raises:
-            InputError: the file, or a value in it, cannot be read.
-        """
-        folder = Path(gettempdir())
-        with (
-            engine((*self.table.files, *self.more_files), folder, MEMORY, threads=1) as connection,
-            explained(connection, (self.table,), folder),
-        ):
-            yield from connection.sql(self.query).to_arrow_reader(BATCH_ROWS)
-
 
 def run_tasks(tasks: Sequence[Task], batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
     """Results of the tasks whose places are in the only column of `batches`."""
-    for batch in batches:
-        for number in batch.column(0).to_pylist():
-            yield from tasks[number].run()
+    folder = Path(gettempdir())
+    for task in (tasks[place] for batch in batches for place in batch.column(0).to_pylist()):
+        files = (*task.table.files, *task.more_files)
+        with (
+            engine(files, folder, MEMORY, threads=1) as connection,
+            explain_errors(connection, (task.table,), folder),
+        ):
+            yield from connection.sql(task.query).to_arrow_reader(BATCH_ROWS)
 
 
 def sort_with_spark(
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    known_items: Path | None,
-    scratch: Path,
-    duplicates: str,
-    master: str,
+    tables: LogTables, known_items: Path | None, scratch: Path, duplicates: str, master: str
 ) -> SortedRows:
-    """Sort every row of a log with Spark, and load the sorted rows and the numbers of its ids.
+    """`sort_rows` with Spark, which loads the sorted rows and the numbers of ids.
 
-    Args:
-        connection: with the tables open; its engine is that of `ucfrec.logs.engine.engine`.
-        tables: of the log's files.
-        mapping: log columns to the files' columns.
-        reward: scalar SQL expression over the files' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
-        known_items: `items.parquet` of a store: rows with other items are dropped; None for all.
-        scratch: scratch folder, which every worker sees.
-        duplicates: key of `ucfrec.logs.kept.DUPLICATES`.
-        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
-
-    Returns:
-        What `ucfrec.logs.sorted_rows.sort_rows` returns.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, an observation is missing or not
-            finite, or Spark is missing or fails.
+    Every worker sees the folder `scratch`; `master` is Spark's, e.g. "local[*]" or
+    "spark://host:7077". Raises InputError also if Spark is missing or fails.
     """
-    with spark_session(master) as spark, spark_failures():
-        log_values = connection, tables, mapping, reward, session_by
-        log, rows = typed_with_spark(spark, *log_values, known_items, scratch)
+    with spark_session(master) as spark, explain_spark():
+        log, rows = _type_rows(spark, tables, known_items, scratch)
         rows.createOrReplaceTempView(FAULTY)
         for name, table in code_tables(log).items():
-            codes = _written(spark, spark.sql(coded_ids(name, FAULTY)), scratch / table)
+            codes = _save(spark, spark.sql(code_ids(name, FAULTY)), scratch / table)
             codes.createOrReplaceTempView(table)
-        _written(spark, spark.sql(in_order(log, FAULTY)), scratch / _SORTED)
+        _save(spark, spark.sql(order_rows(log, FAULTY)), scratch / _SORTED)
         counts = {row[0]: row[1] for row in spark.sql(FAULT_COUNTS).collect()}
     for table in code_tables(log).values():
-        _load(connection, scratch / table, table)
-    observations = _batches(scratch / FAULTY, log.batch_rows, ["row", schema.OBSERVATION])
-    batches = _batches(scratch / _SORTED, log.batch_rows)
+        parts = (batch for batch in _read_parts(scratch / table) if batch.num_rows)
+        columns = pq.read_schema(_list_parts(scratch / table)[0])
+        log.connection.register("loaded", pa.RecordBatchReader.from_batches(columns, parts))
+        log.connection.execute(f"CREATE TABLE {table} AS SELECT * FROM loaded")
+        log.connection.unregister("loaded")
+    names = ["row", schema.OBSERVATION]
+    observations = _read_parts(scratch / FAULTY, log.batch_rows, names)
+    batches = _read_parts(scratch / _SORTED, log.batch_rows)
     by_session = log.session_by == schema.SESSION_ID
     sorted_rows = check_sorted(log, counts, observations, batches, duplicates, scratch, by_session)
     shutil.rmtree(scratch / FAULTY)
     return sorted_rows
 
 
-def typed_with_spark(
-    spark: Any,
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    known_items: Path | None,
-    scratch: Path,
+def _type_rows(
+    spark: Any, tables: LogTables, known_items: Path | None, scratch: Path
 ) -> tuple[TypedLog, Any]:
-    """Read every row of a log; the arguments are those of `sort_with_spark`.
-
-    Returns:
-        The log, and a Spark frame of its rows as of `ucfrec.logs.sorted_rows.with_faults`, read
-        from files in the scratch folder.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, or an observation is missing or
-            not finite.
-    """
-    typed = typed_columns(connection, tables, mapping, reward, session_by)
-    with explained(connection, tables, scratch):
+    """The log, and a Spark frame of its rows as of `mark_faults`, read from files in `scratch`."""
+    typed = type_columns(tables)
+    with explain_errors(tables.connection, tables.tables, scratch):
         every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
-        connection.execute(f"CREATE VIEW {ROWS} AS {numbered_rows(every)}")
-    files = [
-        (values, replace(table, files=(file,)))
+        tables.connection.execute(f"CREATE VIEW {ROWS} AS {number_rows(every)}")
+    files = [replace(table, files=(file,)) for table in typed.tables for file in table.files]
+    rows_of_files = [
+        f"({number_rows([(values, replace(table, files=(file,)).sql)])})"
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
-    survey = _surveyed(spark, files, vectors(typed.names))
-    log = typed.log(connection, vector_sizes(survey.vectors), mapping)
-    require_observations(tables, survey.bad, sum(survey.rows))
-    tasks = _row_tasks(log, files, survey.rows, known_items)
-    return log, _written(spark, _run(spark, tasks, _schema(log)), scratch / FAULTY)
-
-
-@dataclass
-class _Survey:
-    """What must be known of all files before their rows are read."""
-
-    rows: list[int]
-    """Number of rows of each file."""
-    vectors: dict[str, Counter[int]]
-    """Vector column to the number of its vectors by size, missing ones excluded."""
-    bad: int = 0
-    """Number of observations that are missing or not finite."""
-
-
-def _surveyed(spark: Any, files: Files, names: Sequence[str]) -> _Survey:
-    """Count the rows of each file, and the vectors in the columns `names`."""
-    tasks = []
-    for number, (values, table) in enumerate(files):
-        rows = f"({numbered_rows([(values, table.sql)])})"
-        counts = {_ROWS: f"SELECT 0 AS size, count(*) AS n FROM {rows}"}
-        counts |= {name: vector_counts(name, rows) for name in names}
-        if schema.OBSERVATION in names:
-            counts[_BAD] = (
-                f"SELECT 0 AS size, n FROM ({observation_counts(rows)}) AS bad(n, of_rows)"
-            )
-        queries = (
-            f"SELECT {number}::BIGINT AS file, '{name}' AS name, size::BIGINT AS size, "
-            f"n::BIGINT AS n FROM ({query})"
-            for name, query in counts.items()
-        )
-        tasks.append(Task(table, " UNION ALL ".join(queries)))
-    survey = _Survey([0] * len(files), {name: Counter() for name in names})
-    for file, name, size, n in _run(spark, tasks, _COUNTS).collect():
-        if name == _ROWS:
-            survey.rows[file] += n
-        elif name == _BAD:
-            survey.bad += n
-        else:
-            survey.vectors[name][size] += n
-    return survey
-
-
-def _row_tasks(
-    log: TypedLog, files: Files, counts: Sequence[int], known_items: Path | None
-) -> list[Task]:
-    """Tasks that read the typed rows with faults of each file."""
-    more_files = () if known_items is None else (known_items,)
+    surveys = [
+        Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.names, rows)})")
+        for n, (file, rows) in enumerate(zip(files, rows_of_files, strict=True))
+    ]
+    columns = f"file bigint, {schema.ACTION} bigint, {schema.OBSERVATION} bigint, n bigint"
+    survey = _run(spark, surveys, f"{columns}, bad bigint").collect()
+    log = describe_log(tables, typed, [row[1:] for row in survey])
     tasks, rows_before = [], 0
-    for (values, table), n in zip(files, counts, strict=True):
-        rows = f"({numbered_rows([(values, table.sql)])})"
-        faulty = with_faults(log, rows, known_items)
+    for number, (file, rows) in enumerate(zip(files, rows_of_files, strict=True)):
+        faulty = mark_faults(log, rows, known_items)
         query = f"SELECT * REPLACE (row + {rows_before} AS row) FROM ({faulty})"
-        tasks.append(Task(table, query, more_files))
-        rows_before += n
-    return tasks
-
-
-def _schema(log: TypedLog) -> str:
-    """Spark's types of the rows of `_row_tasks`."""
-    ids = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
-    types = {n: _TYPES[log.id_type(n)] if n in ids else _COLUMNS[n] for n in log.columns}
-    types = {"row": "bigint", **types, schema.REWARD: "double"}
-    if schema.ACTION in types:
-        types["action_hash"] = "bigint"
-    types["fault"] = "smallint"
-    return ", ".join(f"{name} {kind}" for name, kind in types.items())
+        tasks.append(Task(file, query, () if known_items is None else (known_items,)))
+        rows_before += sum(row["n"] for row in survey if row["file"] == number)
+    types = {"row": "bigint"}
+    types |= {n: _TYPES[n if n in _TYPES else log.id_type(n)] for n in log.columns}
+    types |= {schema.REWARD: "double"}
+    types |= {"action_hash": "bigint"} if schema.ACTION in types else {}
+    types |= {"fault": "smallint"}
+    frame = _run(spark, tasks, ", ".join(f"{name} {kind}" for name, kind in types.items()))
+    return log, _save(spark, frame, scratch / FAULTY)
 
 
 def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
@@ -264,7 +174,7 @@ def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
     return numbers.mapInArrow(partial(run_tasks, tasks), columns)
 
 
-def _written(spark: Any, frame: Any, folder: Path) -> Any:
+def _save(spark: Any, frame: Any, folder: Path) -> Any:
     """Write a frame to Parquet files; returns it as read from them."""
     # Each is used several times, and Spark would compute it again each time.
     address = folder.absolute().as_uri()
@@ -272,35 +182,103 @@ def _written(spark: Any, frame: Any, folder: Path) -> Any:
     return spark.read.parquet(address)
 
 
-def _parts(folder: Path) -> list[Path]:
+def _list_parts(folder: Path) -> list[Path]:
     """The files that Spark wrote to a folder, in the order of their rows."""
     return sorted(folder.glob("part-*.parquet"), key=lambda p: (int(p.name.split("-")[1]), p.name))
 
 
-def _batches(
+def _read_parts(
     folder: Path, rows: int = BATCH_ROWS, columns: list[str] | None = None
 ) -> Iterator[pa.RecordBatch]:
-    for part in _parts(folder):
+    for part in _list_parts(folder):
         with pq.ParquetFile(part) as file:
             yield from file.iter_batches(rows, columns=columns, use_threads=False)
 
 
-def _load(connection: duckdb.DuckDBPyConnection, folder: Path, table: str) -> None:
-    """Create a table of the rows in a folder, in order."""
-    batches = (batch for batch in _batches(folder) if batch.num_rows)
-    reader = pa.RecordBatchReader.from_batches(pq.read_schema(_parts(folder)[0]), batches)
-    connection.register("loaded", reader)
-    connection.execute(f"CREATE TABLE {table} AS SELECT * FROM loaded")
-    connection.unregister("loaded")
+@dataclass(frozen=True)
+class UserLog:
+    """A log whose users are read in parts."""
+
+    paths: Sequence[str | Path]
+    """Log files, folders and globs, which every worker sees."""
+    mapping: LogMapping
+    reward: str
+    """Scalar SQL expression over the files' columns."""
+    session_by: str | None
+    """As of `LogTables`."""
+    known_items: Path | None = None
+    """`items.parquet` of a store or run: rows with other items are left out; None for all."""
+
+
+def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[int]:
+    """Give each part of the users of a log to a worker, for `work`; returns the counts of the parts
+    that have a usable row, users in sorted order. Warns of the rows that are left out.
+
+    Every worker sees the parent `folder` of a scratch folder. Raises InputError if the log cannot
+    be used, no row is left, or Spark is missing or fails.
+    """
+    # Workers have a working folder of their own.
+    files = [file.absolute() for file in log_files(source.paths)]
+    known_items = source.known_items and source.known_items.absolute()
+    with (
+        scratch_folder(folder.absolute(), "users") as scratch,
+        engine(files, scratch) as connection,
+        spark_session(master) as spark,
+        explain_spark(),
+    ):
+        tables = open_log_tables(
+            connection, files, source.mapping, source.reward, source.session_by
+        )
+        log, rows = _type_rows(spark, tables, known_items, scratch)
+        log.require_items()
+        faults = {row[0]: row[1] for row in rows.groupBy("fault").count().collect()}
+        dropped = {reason: faults.get(number, 0) for number, reason in enumerate(REASONS, 1)}
+        require_rows(log, faults.get(0, 0), dropped)
+        note_dropped(log.name, dropped, sum(faults.values()))
+        parts = max(spark.sparkContext.defaultParallelism, ceil(faults[0] / PART_ROWS))
+        users = rows.where("fault = 0").repartitionByRange(parts, schema.USER_ID)
+        users = users.sortWithinPartitions("row").drop("fault", "row")
+        plain = {n: n if n in log.columns else "" for n in (*KEY_COLUMNS, *OPTIONAL_COLUMNS)}
+        mapping = LogMapping(plain, earliest=tables.mapping.earliest)
+        work_on_part = partial(_work_on_part, work, mapping, log.name)
+        done = users.mapInArrow(work_on_part, "part bigint, count bigint")
+        counts = [count for _, count in sorted(map(tuple, done.collect()))]
+        require_rows(log, len(counts), dropped)
+        return counts
+
+
+def _work_on_part(
+    work: Work, mapping: LogMapping, name: str, batches: Iterator[pa.RecordBatch]
+) -> Iterator[pa.RecordBatch]:
+    """Run `work` on the rows of a part; nothing if none is usable."""
+    from pyspark import TaskContext
+
+    context = TaskContext.get()
+    assert context is not None
+    with scratch_folder(Path(gettempdir()), "part") as folder:
+        file, first = folder / "rows.parquet", next(batches, None)
+        if first is None:
+            return
+        with pq.ParquetWriter(file, first.schema) as writer:
+            writer.write_batch(first)
+            for batch in batches:
+                writer.write_batch(batch)
+        try:
+            with warnings.catch_warnings():
+                # `map_users` says it of all parts.
+                warnings.simplefilter("ignore", InputNote)
+                count = work(context.partitionId(), file, mapping)
+        except NoRowsError:
+            return
+        except InputError as error:
+            raise InputError(str(error).replace(str(file), name)) from None
+    yield pa.record_batch({"part": [context.partitionId()], "count": [count]})
 
 
 @contextmanager
 def spark_session(master: str) -> Iterator[Any]:
     """A session of Spark of its own; its cluster connection is kept if the program had one before.
-
-    Raises:
-        InputError: pyspark or Java is missing, or the master does not answer.
-    """
+    Raises InputError if pyspark or Java is missing, or the master does not answer."""
     try:
         from pyspark.errors import PySparkException
         from pyspark.sql import SparkSession
@@ -334,12 +312,8 @@ def spark_session(master: str) -> Iterator[Any]:
 
 
 @contextmanager
-def spark_failures() -> Iterator[None]:
-    """Turn errors of Spark that occur in the block into `InputError`.
-
-    Raises:
-        InputError: a worker refused the log, or Spark failed.
-    """
+def explain_spark() -> Iterator[None]:
+    """Turn errors of Spark that occur in the block, and refusals of workers, into `InputError`."""
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 

@@ -1,40 +1,67 @@
-"""Report on what `prepare` read, dropped and kept, and warnings that a log's owner would want."""
+"""Report on what was read of a log, dropped and kept, and warnings that its owner would want."""
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, Final
 
 import duckdb
+import numpy as np
 
 from ucfrec import schema
+from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.long_sessions import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
-from ucfrec.logs.binding import bind
-from ucfrec.logs.kept import CLOCK_HINT, DUPLICATES, REASONS
-from ucfrec.logs.measures import USED_USERS, StepCounts, measure_distributions, report_steps
-from ucfrec.logs.sessions import Cut
-from ucfrec.logs.sorted_rows import SortedRows
-from ucfrec.logs.tables import Table, first_and_more, quoted, text
+from ucfrec.logs.engine import bind
+from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
+from ucfrec.logs.rows import DUPLICATES, REASONS, SortedRows, mix_bits
+from ucfrec.logs.sessions import (
+    EPISODES,
+    FEW_VALUES,
+    USED_ITEMS,
+    USED_USERS,
+    Cut,
+    Moments,
+    StepCounts,
+    read_episodes,
+)
+from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
 CONFLICT: Final = "duplicates with a different reward from the kept row"
 """Describes `conflicting_duplicates` of the report."""
+SAMPLE_ROWS: Final = 100_000
+"""Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
+used whole."""
+QUANTILES: Final = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
+MANY: Final = 0.2
+"""Share of the rows from which on what happens to them is worth a warning."""
+FEW_IDS: Final = 20
+MOST_UNKNOWN: Final = 0.9
+"""Share of the users or items of a log, if they are `FEW_IDS` or more, from which on it is worth a
+warning that they are unknown."""
+_NAMED: Final = 5
+"""Users of the longest sessions that are named."""
+_CLOCK_HINT: Final = (
+    "is the time in milliseconds? Seconds are read with --column timestamp='COLUMN * 1000', "
+    "microseconds with 'COLUMN / 1000', nanoseconds with 'COLUMN / 1000000', times such as "
+    "20260131 with --time-format; for older times, say --earliest 1990-01-01, or earliest in the "
+    "mapping"
+)
+_REMEDIES: Final = {
+    "null_key": "fill it in, or map another column",
+    "clock_out_of_range": _CLOCK_HINT,
+    "vector_not_finite": "correct the actions",
+    "unknown_item": "bring the run up to date, or leave those rows out",
+    "duplicate": "log finer times, or remove the repetitions",
+}
 
-
-def require_variety(rows: SortedRows) -> None:
-    """Check that the usable rows do not all have the same reward.
-
-    Raises:
-        InputError: all rewards are equal.
-    """
-    if rows.lowest == rows.highest:
-        raise InputError(
-            f"{rows.log.name}: all {rows.count} rewards equal {rows.lowest:g}, so there is "
-            "nothing to learn; choose another reward expression"
-        )
+Distribution = dict[str, Any]
+"""`counts` (N), either `values` (N) or bin `edges` (N + 1; a bin includes its left edge but not its
+right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 
 
 def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, Any]:
@@ -42,8 +69,18 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
 
     Times are in ms, `reward_statistics` in units of the reward.
     """
-    return {
-        "files": [origin(file) for table in rows.log.tables for file in table.files],
+    log = rows.log
+    splits = {name: {"episodes": 0, "steps": 0} for name in schema.SPLITS}
+    for split, episodes, steps in log.connection.sql(
+        f"SELECT split, count(*), CAST(sum(steps) AS BIGINT) FROM {EPISODES} GROUP BY split"
+    ).fetchall():
+        splits[schema.SPLITS[split]] = {"episodes": episodes, "steps": steps}
+    sessions, unfinished = log.one(
+        f"SELECT count(*) FILTER (begins_session), count(*) FILTER (NOT terminated) FROM {EPISODES}"
+    )
+    users, censored = log.one(f"SELECT count(*), count(*) FILTER (NOT ended) FROM {USED_USERS}")
+    report: dict[str, Any] = {
+        "files": [origin(file) for table in log.tables for file in table.files],
         "rows_read": rows.read,
         "dropped": {
             **rows.dropped,
@@ -56,14 +93,117 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
         "session_by": cut.session_by,
         "session_gap_ms": cut.gap_ms if cut.session_by == "gap" else None,
         "split_times_ms": list(cut.bounds),
-        "summary": measure_distributions(rows, cut, counts),
-        **report_steps(rows, counts),
+        "summary": _measure_distributions(rows, cut, counts),
+        "steps": counts.steps,
+        "episodes": sum(split["episodes"] for split in splits.values()),
+        "sessions": sessions,
+        "sessions_cut": unfinished - censored,
+        "sessions_censored": censored,
+        "return_length_share": _explain_returns(counts.returns),
+        "users": users,
+        "splits": splits,
+        "time_range_ms": [counts.first_ms, counts.last_ms],
+        "reward_statistics": {
+            "mean": float(counts.rewards.mean[0]),
+            "std": float(np.sqrt(counts.rewards.covariance[0, 0])),
+            "min": counts.lowest,
+            "max": counts.highest,
+        },
     }
+    if log.key == schema.ITEM_ID:
+        report["items"] = int(np.count_nonzero(counts.item_steps))
+    if schema.PROPENSITY in log.columns:
+        report["unknown_propensities"] = counts.unknown_propensities
+    return report
+
+
+def _explain_returns(returns: Moments) -> float | None:
+    """Share of the variance of training returns-to-go that the number of steps left explains.
+
+    Of the whole rest of the session; None if either does not vary.
+    """
+    (return_to_go, both), (_, ahead) = returns.covariance
+    # What is left of the rounding errors of equal returns is not variance.
+    if return_to_go <= 1e-24 * returns.mean[0] ** 2 or not ahead:
+        return None
+    return float(both**2 / (return_to_go * ahead))
+
+
+def _measure_distributions(
+    rows: SortedRows, cut: Cut, counts: StepCounts
+) -> dict[str, Distribution]:
+    """`session_lengths`: episodes by length in steps (each piece of a session that a split cuts
+    counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last bin
+    include the values beyond them. `item_popularity` (logs with items only): items by the number of
+    steps that show them, in bins of doubling width; items that only feature tables list have 0."""
+    connection = rows.log.connection
+    result = {"session_lengths": _bin_counts(connection, f"SELECT steps FROM {EPISODES}")}
+    if len(counts.values) <= FEW_VALUES:
+        values = np.array(sorted(counts.values))
+        n_steps = np.array([counts.values[value] for value in values])
+        result["rewards"] = {
+            "values": values.tolist(),
+            "counts": n_steps.tolist(),
+            "quantiles": _weigh_quantiles(values, n_steps),
+        }
+    else:
+        result["rewards"] = _bin_rewards(rows, cut, counts)
+    if rows.log.key == schema.ITEM_ID:
+        shown = f"SELECT coalesce(steps, 0) FROM items LEFT JOIN {USED_ITEMS} USING (item_id)"
+        result["item_popularity"] = _bin_counts(connection, shown)
+    return result
+
+
+def _bin_counts(connection: duckdb.DuckDBPyConnection, query: str) -> Distribution:
+    """Distribution of integers ≥ 0, the only column of a query, in bins 0, 1, 2–3, 4–7, …"""
+    rows = connection.sql(
+        f"SELECT value, count(*) FROM ({query}) AS of_query(value) GROUP BY value ORDER BY value"
+    ).fetchall()
+    values, counts = np.array(rows).T
+    edges = [0, *(2**power for power in range(int(values[-1]).bit_length() + 1))]
+    edges = edges[1:] if values[0] > 0 else edges
+    binned, _ = np.histogram(values, edges, weights=counts)
+    return {
+        "edges": edges,
+        "counts": binned.astype(np.int64).tolist(),
+        "quantiles": _weigh_quantiles(values, counts),
+    }
+
+
+def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution:
+    """Distribution of rewards of many values."""
+    every, sample = max(1, round(counts.steps / SAMPLE_ROWS)), []
+    for episodes in read_episodes(rows, cut):
+        rewards, times = (episodes.rows[name] for name in (schema.REWARD, schema.TIMESTAMP))
+        # By hash, so that the order of rows in the files does not matter.
+        keys = np.repeat(episodes.users, episodes.lengths).astype(np.uint64) << np.uint64(41)
+        sample.append(rewards[mix_bits(keys + times.astype(np.uint64)) % np.uint64(every) == 0])
+    ordered = np.sort(np.concatenate(sample))
+    quantiles = _weigh_quantiles(ordered, np.ones(len(ordered), dtype=np.int64))
+    ends = list(quantiles.values())
+    low, high = ends[1], ends[-2]
+    if not low < high:
+        low, high = counts.lowest, counts.highest
+    edges = np.linspace(low, high, FEW_VALUES + 1)
+    within = np.array([-np.inf, *edges[1:-1], np.inf])
+    filled = sum(np.histogram(e.rows[schema.REWARD], within)[0] for e in read_episodes(rows, cut))
+    return {
+        "edges": edges.tolist(),
+        "counts": np.asarray(filled).tolist(),
+        "quantiles": quantiles,
+    }
+
+
+def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:
+    """Quantiles, each one of the ascending values, of which there are `counts`."""
+    cumulative = np.cumsum(counts)
+    ranks = np.ceil(np.array(QUANTILES) * cumulative[-1]).clip(min=1)
+    chosen = values[np.searchsorted(cumulative, ranks)].tolist()
+    return {f"{share:g}": value for share, value in zip(QUANTILES, chosen, strict=True)}
 
 
 def format_report(report: Mapping[str, Any]) -> str:
     """The report of `prepare` as a text table with one count per line."""
-    reward = report["reward_statistics"]
     lines = [("rows read", f"{report['rows_read']:,} from {len(report['files'])} file(s)")]
     for reason, rows in report["dropped"].items():
         if rows:
@@ -73,8 +213,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {rule}"
         lines.append(("  conflicting duplicates", conflicts))
     if report["equal_times"]:
-        text = f"{report['equal_times']:,} (in no order that could be learned)"
-        lines.append(("  at equal times", text))
+        tied = f"{report['equal_times']:,} (in no order that could be learned)"
+        lines.append(("  at equal times", tied))
     lines += [
         ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
         ("steps kept", f"{report['steps']:,}"),
@@ -83,22 +223,26 @@ def format_report(report: Mapping[str, Any]) -> str:
     if "items" in report:
         lines.append(("items", f"{report['items']:,}"))
     if report.get("unknown_propensities"):
-        text = f"{report['unknown_propensities']:,}  missing, NaN or infinite"
-        lines.append(("  unknown propensity", text))
+        unknown = f"{report['unknown_propensities']:,}  missing, NaN or infinite"
+        lines.append(("  unknown propensity", unknown))
     lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
     if report["sessions_cut"]:
         lines.append(("  cut at a split", f"{report['sessions_cut']:,}"))
     if report.get("sessions_censored"):
-        text = f"{report['sessions_censored']:,}  may have gone on after the log ended"
-        lines.append(("  censored", text))
+        censored = f"{report['sessions_censored']:,}  may have gone on after the log ended"
+        lines.append(("  censored", censored))
     lines += [
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
     ]
     lines.append(("times (UTC)", " to ".join(_clock(t) for t in report["time_range_ms"])))
-    if report.get("return_length_share") is not None:
-        lines.append(("return-to-go", _returns_to_go(report)))
-    figures = ", ".join(f"{name} {value:.4g}" for name, value in reward.items())
+    if (share := report.get("return_length_share")) is not None:
+        ahead = f"{share:.0%} of its variance is the number of steps left"
+        if report["session_by"] == "user":
+            ahead += ", which is random where sessions are users: policies learn the next step's"
+        lines.append(("return-to-go", ahead))
+    statistics = report["reward_statistics"].items()
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in statistics)
     lines.append(("reward", f"{one_line(report['reward'])}: {figures}"))
     width = max(len(name) for name, _ in lines) + 2
     return "\n".join(f"{name:<{width}}{value}".rstrip() for name, value in lines)
@@ -115,50 +259,114 @@ def format_summary(report: Mapping[str, Any]) -> str:
     )
 
 
-def _returns_to_go(report: Mapping[str, Any]) -> str:
-    text = f"{report['return_length_share']:.0%} of its variance is the number of steps left"
-    if report["session_by"] != "user":
-        return text
-    return f"{text}, which is random where sessions are users: policies learn the next step's"
-
-
 def _clock(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-_NAMED: Final = 5
-"""Users of the longest sessions that are named."""
-MANY: Final = 0.2
-"""Share of the rows from which on what happens to them is worth a warning."""
-_REMEDIES: Final = {
-    "null_key": "fill it in, or map another column",
-    "clock_out_of_range": CLOCK_HINT,
-    "vector_not_finite": "correct the actions",
-    "unknown_item": "bring the run up to date, or leave those rows out",
-    "duplicate": "log finer times, or remove the repetitions",
-}
+class NoRowsError(InputError):
+    """No row of a log can be used."""
+
+
+def require_rows(
+    log: TypedLog, count: int, dropped: Mapping[str, int], grown: Path | None = None
+) -> None:
+    """Raise NoRowsError if no row is left, of a log that is perhaps added to a store, `grown`,
+    whose end is the earliest time."""
+    if count:
+        return
+    n_wanted, late = sum(dropped.values()) - dropped["left_out"], dropped["clock_out_of_range"]
+    if grown is not None and late and late == n_wanted:
+        (latest,) = log.one(f"SELECT max({schema.TIMESTAMP}) FROM {ROWS}")
+        # Times before 2000 or in the future have another cause, such as seconds for milliseconds.
+        if EARLIEST_MS <= latest < log.earliest_ms:
+            raise NoRowsError(
+                f"{log.name}: all {n_wanted:,} rows are not newer than {grown}, whose last row is "
+                f"of {_clock(log.earliest_ms - 1)} UTC; give newer logs"
+            )
+    reasons = "; ".join(f"{n} rows: {REASONS[reason]}" for reason, n in dropped.items() if n)
+    hint = f"; {_CLOCK_HINT}" if late else ""
+    raise NoRowsError(
+        f"{log.name}: no row is left ({reasons}{hint}); correct the mapping or the log"
+    )
+
+
+def require_variety(rows: SortedRows) -> None:
+    """Raise InputError if all usable rows have the same reward."""
+    if rows.lowest == rows.highest:
+        raise InputError(
+            f"{rows.log.name}: all {rows.count} rewards equal {rows.lowest:g}, so there is "
+            "nothing to learn; choose another reward expression"
+        )
+
+
+def note_dropped(
+    name: str,
+    dropped: Mapping[str, int],
+    n_read: int,
+    fine: Collection[str] = ("duplicate", "left_out"),
+) -> None:
+    """Warn of the rows that are left out, with their numbers and reasons, unless all are `fine`;
+    `name` is that of the data, or empty."""
+    counts = {reason: n for reason, n in dropped.items() if n}
+    if not counts.keys() - {*fine}:
+        return
+    reasons = "; ".join(f"{n:,}: {REASONS.get(reason, reason)}" for reason, n in counts.items())
+    hint = f"; {_CLOCK_HINT}" if "clock_out_of_range" in counts else ""
+    total = f"{sum(counts.values()):,} of {n_read:,} rows were excluded ({reasons}{hint})"
+    warnings.warn(f"{name}: {total}" if name else total, InputNote, stacklevel=3)
+
+
+def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: str) -> None:
+    """Warn where nearly all of many users or items of a log are not among those of, say, a store
+    (`known_ids`), as if written in another way."""
+    if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
+        return
+    ids = column.removesuffix("_id") + "s"
+    warnings.warn(
+        f"{name}: {unknown:,} of {total:,} {ids} are not among those {known_ids}; if they "
+        f"should be, compare how {column} is written",
+        InputNote,
+        stacklevel=3,
+    )
 
 
 def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None:
-    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions.
-
-    Args:
-        rows: of the log; its connection is free.
-        where: condition of the rows that are wanted at all.
-    """
+    """Warn of more than a fifth of the rows dropped for one reason, and of undefined conditions
+    (`where`)."""
+    log = rows.log
     if where is not None and rows.dropped["left_out"]:
-        note_undefined(rows.log.connection, rows.log.tables, where)
+        note_undefined(log.connection, log.tables, where)
     n_wanted = rows.read - rows.dropped["left_out"]
     for reason, n in rows.dropped.items():
         if n <= MANY * n_wanted or reason == "left_out":
             continue
-        share = f"{n:,} of {n_wanted:,} rows ({n / n_wanted:.0%}) are dropped"
+        why = f"{REASONS[reason]}; {_REMEDIES.get(reason)}"
         if reason == "reward_not_finite":
-            why = _missing(rows.log, reward, where or "true")
-            _note(rows, f"{share}: the reward {reward} is {why}")
-            continue
-        which = _missing_key(rows.log) if reason == "null_key" else ""
-        _note(rows, f"{share}: {REASONS[reason]}{which}; {_REMEDIES[reason]}")
+            why = f"the reward {reward} is {_explain_missing(log, reward, where or 'true')}"
+        elif reason == "null_key":
+            names = [schema.USER_ID, log.key, schema.TIMESTAMP]
+            names += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
+            aggregates = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
+            counts = zip(names, log.one(f"SELECT {aggregates} FROM {ROWS}"), strict=True)
+            missing = ", ".join(f"{name} in {count:,}" for name, count in counts if count)
+            why = f"{REASONS[reason]} ({missing}); {_REMEDIES[reason]}"
+        _note(rows, f"{n:,} of {n_wanted:,} rows ({n / n_wanted:.0%}) are dropped: {why}")
+
+
+def _explain_missing(log: TypedLog, reward: str, where: str) -> str:
+    """Why the reward is undefined, and what to do."""
+    counts: dict[str, int] = {}
+    for table in log.tables:
+        bound = bind(log.connection, table, "for the reward", reward)
+        aggregates = ["count(*)", *(f"count(*) - count({quote_name(n)})" for n in bound.columns)]
+        undefined = f"TRY(CAST({bound.sql} AS DOUBLE)) IS NULL AND ({where}\n)"
+        (_, *nulls) = log.one(f"SELECT {', '.join(aggregates)} FROM {table.sql} WHERE {undefined}")
+        for name, n in zip(bound.columns, nulls, strict=True):
+            counts[name] = counts.get(name, 0) + n
+    most = max(counts, key=lambda name: counts[name], default=None)
+    if most is None or not counts[most]:
+        return "undefined there (NaN, infinite, or a division by zero); give a default by coalesce"
+    return f"null because {most} is, in {counts[most]:,} rows; give a default: coalesce({most}, 0)"
 
 
 def note_undefined(
@@ -168,9 +376,9 @@ def note_undefined(
     undefined = rows = 0
     for table in tables:
         bound = bind(connection, table, "for --where", where)
-        columns_asked = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
+        aggregates = f"count(*) FILTER (TRY({bound.sql}) IS NULL), count(*)"
         source = table.of(bound.columns).sql
-        ((some, every),) = connection.sql(f"SELECT {columns_asked} FROM {source}").fetchall()
+        ((some, every),) = connection.sql(f"SELECT {aggregates} FROM {source}").fetchall()
         undefined, rows = undefined + some, rows + every
     if undefined:
         warnings.warn(
@@ -183,12 +391,10 @@ def note_undefined(
         )
 
 
-def note_equal_times(rows: SortedRows, time: str) -> None:
-    """Warn of a log in which many rows share their user and time.
-
-    Args:
-        time: expression over the columns of the files that gives the times.
-    """
+def note_oddities(rows: SortedRows, report: Mapping[str, Any], mapping: LogMapping) -> None:
+    """Warn of many equal times, of one item only, and of sessions as long as those of bots."""
+    time = mapping.columns.get(schema.TIMESTAMP, schema.TIMESTAMP)
+    user = mapping.columns.get(schema.USER_ID, schema.USER_ID)
     if rows.tied > MANY * rows.count:
         _note(
             rows,
@@ -197,15 +403,27 @@ def note_equal_times(rows: SortedRows, time: str) -> None:
             f'place on a page: --column "timestamp={time} + position" for milliseconds, --column '
             f'"timestamp={time} + to_milliseconds(position)" for dates',
         )
-
-
-def note_one_item(rows: SortedRows, report: Mapping[str, Any]) -> None:
-    """Warn of a log that shows the same item everywhere."""
     if report.get("items") == 1:
         _note(
             rows,
             f"all {report['steps']:,} rows show the same item, so there is nothing to choose "
             "between; check --column item_id and --where",
+        )
+    median = report["summary"]["session_lengths"]["quantiles"]["0.5"]
+    longest = rows.log.connection.sql(
+        f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
+        f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"
+    ).fetchall()
+    if longest:
+        bots = ", ".join(f"{name} ({steps:,} rows)" for name, steps in longest)
+        users = ", ".join(str(n) if isinstance(n, int) else quote(str(n)) for n, _ in longest)
+        if not re.fullmatch(r"[\w' ,:@.-]*", users):
+            users = "…"  # what a shell would take for a program is not proposed
+        _note(
+            rows,
+            f"the median session has {median:,} row{'s' * (median > 1)}, but these users have "
+            f"sessions of more than {LONG} times that, as bots have: {bots}; leave them out with "
+            f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
         )
 
 
@@ -221,65 +439,5 @@ def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:
         )
 
 
-def note_bots(rows: SortedRows, report: Mapping[str, Any], user: str) -> None:
-    """Warn of sessions that are much longer than most.
-
-    Args:
-        rows: of the log; its connection is free.
-        user: expression over the columns of the files that gives the users.
-    """
-    median = report["summary"]["session_lengths"]["quantiles"]["0.5"]
-    users_found = rows.log.connection.sql(
-        f"SELECT {schema.USER_ID}, longest FROM {USED_USERS} WHERE longest > {LONG * median} "
-        f"ORDER BY longest DESC, code DESC LIMIT {_NAMED}"
-    ).fetchall()
-    if not users_found:
-        return
-    bots = ", ".join(f"{name} ({steps:,} rows)" for name, steps in users_found)
-    users = ", ".join(str(n) if isinstance(n, int) else text(str(n)) for n, _ in users_found)
-    if not re.fullmatch(r"[\w' ,:@.-]*", users):
-        users = "…"  # what a shell would take for a program is not proposed
-    _note(
-        rows,
-        f"the median session has {median:,} row{'s' * (median > 1)}, but these users have sessions "
-        f"of more than {LONG} times that, as bots have: {bots}; leave them out with "
-        f'--where "{user} NOT IN ({users})" or --max-session {LONG * median}',
-    )
-
-
 def _note(rows: SortedRows, message: str) -> None:
     warnings.warn(f"{rows.log.name}: {message}", InputNote, stacklevel=3)
-
-
-def _missing_key(log: TypedLog) -> str:
-    names = [schema.USER_ID, log.key, schema.TIMESTAMP]
-    names += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
-    columns_asked = ", ".join(f"count(*) FILTER ({name} IS NULL)" for name in names)
-    counts = log.one(f"SELECT {columns_asked} FROM {ROWS}")
-    users_found = [f"{name} in {n:,}" for name, n in zip(names, counts, strict=True) if n]
-    return f" ({', '.join(users_found)})"
-
-
-def _missing(log: TypedLog, reward: str, where: str) -> str:
-    """Why the reward is undefined, and what to do."""
-    counts: dict[str, int] = {}
-    for table in log.tables:
-        bound = bind(log.connection, table, "for the reward", reward)
-        for name, n in _null_counts(log, table, bound.sql, bound.columns, where).items():
-            counts[name] = counts.get(name, 0) + n
-    most = max(counts, key=lambda name: counts[name], default=None)
-    if most is None or not counts[most]:
-        return "undefined there (NaN, infinite, or a division by zero); give a default by coalesce"
-    return f"null because {most} is, in {counts[most]:,} rows; give a default: coalesce({most}, 0)"
-
-
-def _null_counts(
-    log: TypedLog, table: Table, sql: str, columns: tuple[str, ...], where: str
-) -> dict[str, int]:
-    if not columns:
-        return {}
-    undefined = f"TRY(CAST({sql} AS DOUBLE)) IS NULL"
-    columns_asked = ", ".join(f"count(*) FILTER ({quoted(name)} IS NULL)" for name in columns)
-    query = f"SELECT {columns_asked} FROM {table.sql} WHERE {undefined} AND ({where}\n)"
-    (row,) = log.connection.sql(query).fetchall()
-    return dict(zip(columns, row, strict=True))

@@ -90,7 +90,7 @@ class Table:
 
     def text_of(self, name: str) -> str:
         """SQL of the text of a column; that of a CSV file is what the file says: 007 is not 7."""
-        return f"CAST({quoted(name if self.columnar else raw_name(name))} AS VARCHAR)"
+        return f"CAST({quote_name(name if self.columnar else raw_name(name))} AS VARCHAR)"
 
     @property
     def sql(self) -> str:
@@ -99,13 +99,21 @@ class Table:
         selected = [*kinds, *folders] if self.selected is None else self.selected
         values = []
         for name in (name for name in selected if name in kinds):
-            column, kind = quoted(name), kinds[name]
+            column, kind = quote_name(name), kinds[name]
             if name in self.raw and kind != "VARCHAR":
                 column = f"CAST({column} AS {kind})"
-            values.append(f"{_value_of(column, kind)} AS {quoted(name)}")
-        values += [f"{quoted(name)} AS {quoted(raw_name(name))}" for name in self.raw]
+            if kind in ("FLOAT", "DOUBLE"):
+                # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would
+                # exclude `isnan` here, as the extremes that a Parquet file states show no NaN.
+                column = f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
+            elif kind == NOTHING:
+                column = "NULL"
+            elif (wider := _wider_type(kind)) != kind:
+                column = f"CAST({column} AS {wider})"
+            values.append(f"{column} AS {quote_name(name)}")
+        values += [f"{quote_name(name)} AS {quote_name(raw_name(name))}" for name in self.raw]
         values += [
-            f"{_folder_value(name, folders[name])} AS {quoted(name)}"
+            f"{_folder_value(name, folders[name])} AS {quote_name(name)}"
             for name in selected
             if name in folders
         ]
@@ -114,14 +122,14 @@ class Table:
     @property
     def source(self) -> str:
         """SQL call of the DuckDB table function that reads the files."""
-        files = ", ".join(text(glob_pattern(file)) for file in self.files)
+        files = ", ".join(quote(glob_pattern(file)) for file in self.files)
         options = "hive_partitioning = false"
         if self.partitions:
-            options += f", filename = {text(_FILE)}"
+            options += f", filename = {quote(_FILE)}"
         if self.columnar:
             return f"read_parquet([{files}], {options})"
         types = ", ".join(
-            f"{text(name)}: {text('VARCHAR' if name in self.raw or kind == NOTHING else kind)}"
+            f"{quote(name)}: {quote('VARCHAR' if name in self.raw or kind == NOTHING else kind)}"
             for name, kind in self.types
         )
         # DuckDB would take quotes for text if the first rows have none, and sometimes leave out
@@ -139,31 +147,17 @@ def raw_name(name: str) -> str:
 def _folder_value(name: str, kind: str = "VARCHAR") -> str:
     """SQL of the value of a column in the name of a folder."""
     pattern = f"(?:^|[/\\\\]){re.escape(name)}=([^/\\\\]*)[/\\\\]"
-    value = f"url_decode(regexp_extract({quoted(_FILE)}, {text(pattern)}, 1))"
-    return f"CAST(nullif({value}, {text(_NO_VALUE)}) AS {kind})"
+    value = f"url_decode(regexp_extract({quote_name(_FILE)}, {quote(pattern)}, 1))"
+    return f"CAST(nullif({value}, {quote(_NO_VALUE)}) AS {kind})"
 
 
 def _wider_type(kind: str) -> str:
-    """The DuckDB type that expressions compute with, given that of a column.
-
-    DuckDB multiplies two columns of 8 bits in 8 bits, and takes unsigned numbers from each other
-    without a sign: where that overflows, a reward would be undefined.
-    """
+    """The DuckDB type that expressions compute with: DuckDB multiplies columns of 8 bits in 8 bits,
+    and subtracts unsigned numbers without a sign; where that overflows, a reward would be
+    undefined."""
     if kind == "UBIGINT":
         return "HUGEINT"
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
-
-
-def _value_of(column: str, kind: str) -> str:
-    """SQL of a quoted column of a DuckDB type, as expressions compute with it."""
-    if kind in ("FLOAT", "DOUBLE"):
-        # To DuckDB, NaN is greater than every number: `score > 0.5` would hold. It would exclude
-        # `isnan` here, because the extremes that a Parquet file states show no NaN.
-        return f"CASE WHEN isfinite({column}) OR isinf({column}) THEN {column} END"
-    if kind == NOTHING:
-        return "NULL"
-    wider = _wider_type(kind)
-    return column if wider == kind else f"CAST({column} AS {wider})"
 
 
 def glob_pattern(file: Path) -> str:
@@ -171,12 +165,12 @@ def glob_pattern(file: Path) -> str:
     return _MAGIC.sub(r"[\g<0>]", str(file))
 
 
-def text(value: str) -> str:
+def quote(value: str) -> str:
     """`value` as a SQL string literal."""
     return "'" + value.replace("'", "''") + "'"
 
 
-def quoted(name: str) -> str:
+def quote_name(name: str) -> str:
     """`name` as a SQL identifier."""
     return '"' + name.replace('"', '""') + '"'
 
@@ -201,7 +195,7 @@ def is_vector(kind: str) -> bool:
     return _NUMBERS.fullmatch(kind) is not None
 
 
-def as_timestamp(sql: str, kind: str) -> str | None:
+def cast_timestamp(sql: str, kind: str) -> str | None:
     """SQL of the TIMESTAMP in UTC that a date or time of a DuckDB type means; None for others."""
     if kind == "DATE" or kind.startswith("TIMESTAMP"):
         # DuckDB casts TIMESTAMPTZ_NS only by way of TIMESTAMPTZ.
@@ -215,17 +209,11 @@ def open_tables(
 ) -> list[Table]:
     """Read the columns of every file and group consecutive files with equal columns.
 
-    Files without rows are excluded, if others have some.
+    Files without rows are excluded, if others have some. With `partitions`, names of folders such
+    as `date=2026-08-01` give columns.
 
-    Args:
-        partitions: read columns from the names of folders, such as `date=2026-08-01`.
-
-    Returns:
-        Tables in the order of `files`.
-
-    Raises:
-        InputError: a file is truncated or not of the kind that its suffix says, no file has a row,
-            or a file has another value in a column than its folder says.
+    Raises InputError if a file is truncated or not of the kind that its suffix says, no file has a
+    row, or a file has another value in a column than its folder says.
     """
     tables: list[Table] = []
     for file in files:
@@ -244,7 +232,14 @@ def open_tables(
         raise InputError(
             f"{first_and_more(files)} is empty (0 rows); remove it from the input or fetch it again"
         )
-    return _type_partitions(tables)
+    # Columns of folders are whole numbers, if the names of all folders are.
+    whole = re.compile(rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}")
+    values = [pair for table in tables for file in table.files for pair in _folder_values(file)]
+    words = {name for name, value in values if not whole.fullmatch(value)}
+    for n, table in enumerate(tables):
+        kinds = ((name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions)
+        tables[n] = replace(table, partitions=tuple(kinds))
+    return tables
 
 
 def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tuple[str, str], ...]:
@@ -257,7 +252,7 @@ def _partitions(connection: duckdb.DuckDBPyConnection, table: Table) -> tuple[tu
         if column is None:
             continue
         source = replace(table, partitions=((name, "VARCHAR"),)).source
-        value = f"CAST({quoted(column)} AS VARCHAR)"
+        value = f"CAST({quote_name(column)} AS VARCHAR)"
         differing = connection.sql(
             f"SELECT {value} FROM {source} WHERE {value} IS DISTINCT FROM {_folder_value(name)} "
             "LIMIT 1"
@@ -274,18 +269,6 @@ def _folder_values(file: Path) -> list[tuple[str, str]]:
     """Names and values of the folders of a file that are called NAME=VALUE."""
     pairs = [part.partition("=") for part in file.parts[:-1] if "=" in part.strip("=")]
     return [(name, value) for name, _, value in pairs]
-
-
-def _type_partitions(tables: list[Table]) -> list[Table]:
-    """Make columns of folders whole numbers, if the names of all folders are."""
-    whole = re.compile(rf"0|-?[1-9]\d{{0,17}}|{_NO_VALUE}")
-    values = [pair for table in tables for file in table.files for pair in _folder_values(file)]
-    words = {name for name, value in values if not whole.fullmatch(value)}
-    types = [
-        [(name, "VARCHAR" if name in words else "BIGINT") for name, _ in table.partitions]
-        for table in tables
-    ]
-    return [replace(t, partitions=tuple(p)) for t, p in zip(tables, types, strict=True)]
 
 
 def _columns(
@@ -307,7 +290,7 @@ def _columns(
     try:
         types = connection.sql(f"DESCRIBE SELECT * FROM {source}").fetchall()
         if is_parquet:
-            metadata = f"parquet_file_metadata({text(glob_pattern(file))})"
+            metadata = f"parquet_file_metadata({quote(glob_pattern(file))})"
             ((rows,),) = connection.sql(f"SELECT num_rows FROM {metadata}").fetchall()
             require_plausible_rows(file, rows)
         first_row = connection.sql(f"SELECT 1 FROM {source} LIMIT 1").fetchall()
@@ -325,7 +308,11 @@ def _columns(
         _require_header(file, names)
     if not first_row:
         return None
-    _require_distinct(file, names)
+    # DuckDB calls the second of two columns `x` `x_1`.
+    folded = {name.casefold() for name in names}
+    second = [n for n in names if n.endswith("_1") and n[:-2].casefold() in folded]
+    for name in set(second).difference(_written_names(file) if second else ()):
+        raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
     return columns if is_parquet else _types_of_all_rows(connection, file, columns)
 
 
@@ -368,14 +355,6 @@ def _written_names(file: Path) -> list[str]:
         return [name.strip(" \"'\r\n") for name in re.split(r"[,;\t|]", lines.readline())]
 
 
-def _require_distinct(file: Path, columns: Sequence[str]) -> None:
-    """Refuse a file with two columns of one name; DuckDB calls the second of `x` `x_1`."""
-    folded = {name.casefold() for name in columns}
-    second = [n for n in columns if n.endswith("_1") and n[:-2].casefold() in folded]
-    for name in set(second).difference(_written_names(file) if second else ()):
-        raise InputError(f"{file} has more than one column {name[:-2]}; rename or remove one")
-
-
 def _types_of_all_rows(
     connection: duckdb.DuckDBPyConnection, file: Path, types: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
@@ -390,19 +369,19 @@ def _types_of_all_rows(
     # A column without a value is text; most columns of text have one in the first rows.
     words = [name for name, kind in types if kind == "VARCHAR"]
     counts = _first_row(
-        connection, Table((file,), types), [f"count({quoted(n)})" for n in words], 1000
+        connection, Table((file,), types), [f"count({quote_name(n)})" for n in words], 1000
     )
     words = [name for name, count in zip(words, counts, strict=False) if not count]
     changes: list[tuple[str, str, str]] = [
-        (name, NOTHING, f"count({quoted(name)}) = 0") for name in words
+        (name, NOTHING, f"count({quote_name(name)}) = 0") for name in words
     ]
     for name, kind in types:
-        column = quoted(name)
+        column = quote_name(name)
         if kind in _EXACT:
             differs = f"TRY_CAST({column} AS {_EXACT[kind]}) <> TRY_CAST({column} AS {kind})"
             changes.append((name, _EXACT[kind], f"bool_or({differs})"))
         if kind == "DATE" or kind.startswith("TIMESTAMP"):
-            iso = f"regexp_full_match(trim({column}), {text(ISO_TIME)})"
+            iso = f"regexp_full_match(trim({column}), {quote(ISO_TIME)})"
             changes.append((name, "VARCHAR", f"bool_or(NOT {iso})"))
         if kind == "BIGINT":
             changes.append((name, "VARCHAR", f"bool_or(regexp_full_match({column}, '-?0\\d+'))"))

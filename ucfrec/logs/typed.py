@@ -1,44 +1,96 @@
-"""A log as one relation of typed rows: its files, its columns, its reward."""
+"""A log as one relation of typed rows: its columns, its vectors, its times, its reward."""
 
+import re
 import warnings
+from calendar import month_name
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import duckdb
 
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs.binding import Bound, bind, explained, wrong_type
-from ucfrec.logs.engine import rows_of_batch
+from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, settle_mapping, wrong_type
 from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
 from ucfrec.logs.tables import (
+    ISO_TIME,
     MAX_FLOAT,
     NOTHING,
     Table,
-    as_timestamp,
+    cast_timestamp,
     first_and_more,
     is_integer,
     is_number,
     is_vector,
-    quoted,
+    open_tables,
+    quote,
+    quote_name,
     raw_name,
-)
-from ucfrec.logs.times import text_time
-from ucfrec.logs.vectors import (
-    observation_counts,
-    require_observations,
-    vector_counts,
-    vector_sizes,
-    vectors,
 )
 
 ROWS: Final = "read"
 """Relation of `TypedLog`."""
 WANTED: Final = "wanted"
 """Its column of whether a row fulfils the condition of `LogMapping.where`, if there is one."""
+_VECTORS: Final = (schema.ACTION, schema.OBSERVATION)
+_BATCH_BYTES: Final = 2**25
+_IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
+"""SQL of whether a text `x` is as the integer that it means is written."""
+_IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
+_TYPES: Final = {
+    **dict.fromkeys(_IDS, "VARCHAR"),
+    schema.TIMESTAMP: "BIGINT",
+    schema.ACTION: "FLOAT[]",
+    schema.OBSERVATION: "FLOAT[]",
+    schema.PROPENSITY: "FLOAT",
+    schema.IS_RANDOM: "BOOLEAN",
+}
+_DAY_OR_MONTH_FIRST: Final = r"(\d{1,2})[./-](\d{1,2})[./-](\d{4})((?:[T,]|\s).*)?"
+_OF_DAY: Final = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
+
+
+@dataclass(frozen=True)
+class LogTables:
+    """The tables of a log, and what their columns mean."""
+
+    connection: duckdb.DuckDBPyConnection
+    tables: tuple[Table, ...]
+    mapping: LogMapping
+    reward: str
+    """Scalar SQL expression over the files' columns."""
+    session_by: str | None
+    """"session_id", "gap" or "user"; None for session_id if the log has it, else gap."""
+
+
+def open_log_tables(
+    connection: duckdb.DuckDBPyConnection,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    reward: str,
+    session_by: str | None,
+) -> LogTables:
+    """Open the files of a log, and settle which of the remembered columns they have."""
+    tables = tuple(open_tables(connection, files, mapping.partitions))
+    mapping, reward = settle_mapping(connection, tables, mapping, reward)
+    return LogTables(connection, tables, mapping, reward, session_by)
+
+
+@dataclass(frozen=True)
+class TypedColumns:
+    """SQL of the typed columns of a log."""
+
+    names: tuple[str, ...]
+    """Log columns that the files have, `user_id` first."""
+    selects: tuple[str, ...]
+    """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
+    tables: tuple[Table, ...]
+    """The tables with no other columns than these values need."""
+    session_by: str
+    """"session_id", "gap" or "user"."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +121,9 @@ class TypedLog:
 
     @property
     def batch_rows(self) -> int:
-        """Rows of a batch of its rows."""
-        return rows_of_batch(sum(self.vector_size.values()))
+        """Rows of a batch of its rows, fewer if they are long."""
+        row_bytes = 64 + 4 * sum(self.vector_size.values())
+        return min(BATCH_ROWS, max(_BATCH_BYTES // row_bytes, 1))
 
     @property
     def name(self) -> str:
@@ -86,120 +139,117 @@ class TypedLog:
         row: tuple[Any, ...] = self.connection.sql(sql).fetchall()[0]
         return row
 
-
-@dataclass(frozen=True)
-class TypedColumns:
-    """SQL of the typed columns of a log."""
-
-    names: tuple[str, ...]
-    """Log columns that the files have, `user_id` first."""
-    selects: tuple[str, ...]
-    """For each table of the log, the values of these columns and of `reward`, as after SELECT."""
-    tables: tuple[Table, ...]
-    """The tables with no other columns than these values need."""
-    session_by: str
-    """"session_id", "gap" or "user"."""
-
-    def log(
-        self,
-        connection: duckdb.DuckDBPyConnection,
-        vector_size: dict[str, int],
-        mapping: LogMapping,
-    ) -> TypedLog:
-        """The log of these columns, whose rows `connection` has."""
-        how = self.session_by, mapping.earliest_ms, mapping.where is not None
-        return TypedLog(connection, self.tables, self.names, vector_size, *how)
+    def require_items(self) -> None:
+        """Raise InputError if its actions are vectors."""
+        if self.key != schema.ITEM_ID:
+            raise InputError(f"{self.name}: its actions are vectors; map item_id instead")
 
 
-def typed_columns(
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    as_text: Collection[str] = (),
-) -> TypedColumns:
-    """Resolve the columns and the reward of a log; the arguments are those of `typed_log`.
+def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
+    """Resolve the columns and the reward of a log; `as_text` are ids that are text even if all of
+    them are integers.
 
-    Optional columns that only some of the files have are excluded, with an `InputNote`.
-
-    Raises:
-        InputError: a column is missing or of an unsupported type, or an expression cannot be used.
+    Optional columns that only some of the files have are excluded, with an `InputNote`. Raises
+    InputError if a column is missing or of an unsupported type, or an expression cannot be used.
     """
-    columns = _present(tables, mapping, session_by)
-    _note_partial(tables, {*columns, *mapping.columns})
-    selects = [_select(connection, table, mapping, columns, reward) for table in tables]
+    columns = _list_present(log)
+    _note_partial(log.tables, {*columns, *log.mapping.columns})
+    selects = [_select(log, table, columns) for table in log.tables]
     for name in _IDS:
         if name in columns:
-            _unify_ids(connection, selects, name, name in as_text)
+            _unify_ids(log.connection, selects, name, name in as_text)
     return TypedColumns(
         columns,
-        tuple(", ".join(f"{s} AS {name}" for name, (s, _) in x.values.items()) for x in selects),
-        tuple(select.table for select in selects),
-        session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
+        tuple(", ".join(f"{s} AS {n}" for n, (s, _) in values.items()) for _, values in selects),
+        tuple(table for table, _ in selects),
+        log.session_by or (schema.SESSION_ID if schema.SESSION_ID in columns else "gap"),
     )
 
 
-def numbered_rows(selects: Iterable[tuple[str, str]]) -> str:
-    """SQL of typed rows with `row`, their position from 1.
-
-    Args:
-        selects: for each table, values as of `TypedColumns.selects` and the SQL of the table.
-    """
+def number_rows(selects: Iterable[tuple[str, str]]) -> str:
+    """SQL of typed rows with `row`, their position from 1; for each table, values as of
+    `TypedColumns.selects` and the SQL of the table."""
     union = " UNION ALL ".join(f"SELECT {values} FROM {table}" for values, table in selects)
     return f"SELECT row_number() OVER () AS row, * FROM ({union})"
 
 
-def typed_log(
-    connection: duckdb.DuckDBPyConnection,
-    tables: tuple[Table, ...],
-    mapping: LogMapping,
-    reward: str,
-    session_by: str | None,
-    folder: Path,
-    as_text: Collection[str] = (),
-) -> TypedLog:
-    """Create `read` from tables that are open.
-
-    Args:
-        tables: of the log's files.
-        mapping: log columns to the files' columns.
-        reward: scalar SQL expression over the files' columns.
-        session_by: "session_id", "gap" or "user"; None for session_id if the log has it, else gap.
-        folder: folder named when its disk is full.
-        as_text: id columns that are text even if all of them are integers.
-
-    Raises:
-        InputError: a file, column or type makes the log unusable, or an observation is missing or
-            not finite.
-    """
-    typed = typed_columns(connection, tables, mapping, reward, session_by, as_text)
-    with explained(connection, tables, folder):
+def open_log(log: LogTables, folder: Path, as_text: Collection[str] = ()) -> TypedLog:
+    """Create `read` from the tables of a log; see `type_columns` and `describe_log`."""
+    typed = type_columns(log, as_text)
+    with explain_errors(log.connection, log.tables, folder):
         # Columns of Parquet files are read as often as they are needed; text is parsed once.
-        columnar = all(table.columnar for table in tables)
-        rows = numbered_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
-        connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
-        counts = {
-            name: dict(connection.sql(vector_counts(name, ROWS)).fetchall())
-            for name in vectors(typed.names)
-        }
-        bad, n_rows = 0, 0
-        if schema.OBSERVATION in counts:
-            bad, n_rows = connection.sql(observation_counts(ROWS)).fetchall()[0]
-    sizes = vector_sizes(counts)
-    require_observations(tables, bad, n_rows)
-    return typed.log(connection, sizes, mapping)
+        columnar = all(table.columnar for table in log.tables)
+        rows = number_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
+        log.connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
+        survey = []
+        if {*_VECTORS} & {*typed.names}:
+            survey = log.connection.sql(survey_vectors(typed.names, ROWS)).fetchall()
+    return describe_log(log, typed, survey)
 
 
-def _present(
-    tables: Sequence[Table], mapping: LogMapping, session_by: str | None
-) -> tuple[str, ...]:
+def survey_vectors(columns: Collection[str], rows: str) -> str:
+    """SQL of the sizes of `action` and `observation` in rows of a log with some columns, the number
+    `n` of rows with these, and how many of them have no finite observation."""
+    sizes = (f"CAST({f'len({v})' if v in columns else 'NULL'} AS BIGINT) AS {v}" for v in _VECTORS)
+    bad = f"count_if({not_finite(schema.OBSERVATION)})" if schema.OBSERVATION in columns else "0"
+    aggregates = f"count(*) AS n, CAST({bad} AS BIGINT) AS bad"
+    return f"SELECT {', '.join(sizes)}, {aggregates} FROM {rows} GROUP BY ALL"
+
+
+def describe_log(
+    log: LogTables, typed: TypedColumns, survey: Sequence[tuple[int | None, ...]]
+) -> TypedLog:
+    """The log of typed columns, whose rows its connection has; `survey` as of `survey_vectors`,
+    empty without vectors.
+
+    Raises InputError if a column has vectors of unequal or no size, or an observation is not
+    finite.
+    """
+    sizes: dict[str, int] = {}
+    for name in (name for name in _VECTORS if name in typed.names):
+        counts: Counter[int] = Counter()
+        for *row_sizes, n, _ in survey:
+            if (size := row_sizes[_VECTORS.index(name)]) is not None:
+                counts[size] += n or 0
+        ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+        if len(ordered) > 1:
+            lengths = ", ".join(f"{n} rows of {size}" for size, n in ordered[:4])
+            raise InputError(f"{name} has lists of unequal length: {lengths}; make them equal")
+        if not ordered or ordered[0][0] == 0:
+            raise InputError(
+                f"{name} is empty in every row; map another column or --column {name}="
+            )
+        sizes[name] = ordered[0][0]
+    if bad := sum(row[-1] or 0 for row in survey):
+        raise InputError(
+            f"{log.tables[0].files[0]}: {schema.OBSERVATION} is missing or holds NaN or infinity "
+            f"in {bad:,} of {sum(row[-2] or 0 for row in survey):,} rows; fill them in, leave "
+            f"those rows out, or ignore the column with --column {schema.OBSERVATION}="
+        )
+    return TypedLog(
+        log.connection,
+        typed.tables,
+        typed.names,
+        sizes,
+        typed.session_by,
+        log.mapping.earliest_ms,
+        log.mapping.where is not None,
+    )
+
+
+def not_finite(vector: str) -> str:
+    """SQL that says whether a vector is missing or has a number that is not finite."""
+    finite = f"list_bool_and([coalesce(isfinite(v), false) FOR v IN {vector}])"
+    return f"{vector} IS NULL OR NOT {finite}"
+
+
+def _list_present(log: LogTables) -> tuple[str, ...]:
     """Log columns that every file has, and the required ones, which `bind` reports if missing."""
-    mapped = {name for name, value in mapping.columns.items() if value}
-    everywhere = set.intersection(*({c.casefold() for c in t.columns} for t in tables))
-    present = mapped | (everywhere - mapping.columns.keys())
-    if session_by == schema.SESSION_ID:
-        present.add(session_by)
+    mapped = {name for name, value in log.mapping.columns.items() if value}
+    names = [{column.casefold() for column in table.columns} for table in log.tables]
+    present = mapped | (names[0].intersection(*names) - log.mapping.columns.keys())
+    if log.session_by == schema.SESSION_ID:
+        present.add(log.session_by)
     vectors_only = schema.ACTION in present and schema.ITEM_ID not in present
     key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
     optional = (name for name in OPTIONAL_COLUMNS if name in present)
@@ -207,11 +257,7 @@ def _present(
 
 
 def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
-    """Warn of optional columns that some files have and others do not.
-
-    Args:
-        excluded: columns that every file has, and those that the mapping names.
-    """
+    """Warn of optional columns, but those excluded, that only some files have."""
     count = sum(len(table.files) for table in tables)
     for name in [name for name in OPTIONAL_COLUMNS if name not in excluded]:
         having = [t for t in tables if name in {column.casefold() for column in t.columns}]
@@ -225,23 +271,13 @@ def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
             )
 
 
-@dataclass(frozen=True)
-class _Select:
-    """The typed columns of one table."""
-
-    table: Table
-    """With the columns that are read."""
-    values: dict[str, tuple[str, str]]
-    """Log column to its (SQL, DuckDB type)."""
+_Values = dict[str, tuple[str, str]]
+"""Log column to its (SQL, DuckDB type)."""
 
 
-def _select(
-    connection: duckdb.DuckDBPyConnection,
-    table: Table,
-    mapping: LogMapping,
-    columns: tuple[str, ...],
-    reward: str,
-) -> _Select:
+def _select(log: LogTables, table: Table, columns: tuple[str, ...]) -> tuple[Table, _Values]:
+    """A table with the columns that are read, and the typed values of these."""
+    connection, mapping = log.connection, log.mapping
     texts = {name: mapping.columns.get(name) or name for name in columns}
     bound = {
         name: bind(connection, table, f"for {name}; map it with --column {name}=...", expression)
@@ -255,14 +291,14 @@ def _select(
         if name in _IDS or (name == schema.TIMESTAMP and mapping.time_format)
     }
     for name, column in raw.items():
-        bound[name] = Bound(quoted(raw_name(column)), "VARCHAR", (), False)
-    table, reward_value = _bind_reward(connection, table, reward)
-    if not (is_number(reward_value.kind) or reward_value.kind in ("BOOLEAN", NOTHING)):
+        bound[name] = Bound(quote_name(raw_name(column)), "VARCHAR", (), False)
+    table, reward = _bind_reward(connection, table, log.reward)
+    if not (is_number(reward.kind) or reward.kind in ("BOOLEAN", NOTHING)):
         remedy = "use a number or truth value, such as try_cast(COLUMN AS DOUBLE) or COLUMN = 'yes'"
-        raise wrong_type(table, "reward", reward, reward_value.kind, remedy)
+        raise wrong_type(table, "reward", log.reward, reward.kind, remedy)
     # An error in one row (division by zero, a cast) makes only that row's reward undefined.
-    extra = {schema.REWARD: (f"TRY(CAST({reward_value.sql} AS DOUBLE))", "DOUBLE")}
-    sources = [*bound.values(), reward_value]
+    extra = {schema.REWARD: (f"TRY(CAST({reward.sql} AS DOUBLE))", "DOUBLE")}
+    sources = [*bound.values(), reward]
     if mapping.where is not None:
         condition = bind(connection, table, "for --where", mapping.where)
         if condition.kind != "BOOLEAN":
@@ -275,7 +311,7 @@ def _select(
         name: _cast_value(connection, narrow, name, texts[name], value, mapping.time_format)
         for name, value in bound.items()
     }
-    return _Select(narrow, {**values, **extra})
+    return narrow, {**values, **extra}
 
 
 def _bind_reward(
@@ -292,26 +328,13 @@ def _bind_reward(
         texts = [n for n, kind in table.types if kind == "VARCHAR" and n.casefold() in names]
         if not texts:
             raise
-        counts = ", ".join(f"count({quoted(name)})" for name in texts)
+        counts = ", ".join(f"count({quote_name(name)})" for name in texts)
         (row,) = connection.sql(f"SELECT {counts} FROM {table.of(texts).sql}").fetchall()
         empty = {name: NOTHING for name, count in zip(texts, row, strict=True) if not count}
         if not empty:
             raise
         table = replace(table, types=tuple((dict(table.types) | empty).items()))
         return table, bind(connection, table, "for the reward", reward)
-
-
-_IS_INTEGER: Final = "CAST(TRY_CAST(x AS BIGINT) AS VARCHAR) IS NOT DISTINCT FROM x"
-"""SQL of whether a text `x` is as the integer that it means is written."""
-_IDS: Final = (schema.USER_ID, schema.ITEM_ID, schema.SESSION_ID)
-_TYPES: Final = {
-    **dict.fromkeys(_IDS, "VARCHAR"),
-    schema.TIMESTAMP: "BIGINT",
-    schema.ACTION: "FLOAT[]",
-    schema.OBSERVATION: "FLOAT[]",
-    schema.PROPENSITY: "FLOAT",
-    schema.IS_RANDOM: "BOOLEAN",
-}
 
 
 def _cast_value(
@@ -339,8 +362,8 @@ def _cast_value(
         if is_number(kind):
             sql, kind = f"CAST(TRY_CAST({sql} AS BIGINT) AS VARCHAR)", "VARCHAR"
         if kind == "VARCHAR":
-            return text_time(connection, table, sql, expression, time_format), "BIGINT"
-        if time := as_timestamp(sql, kind):
+            return cast_text_time(connection, table, sql, expression, time_format), "BIGINT"
+        if time := cast_timestamp(sql, kind):
             return f"TRY(epoch_ms({time}))", "BIGINT"
         remedy = "use milliseconds, a date or a timestamp, e.g. --column timestamp='seconds * 1000'"
     elif name in (schema.ACTION, schema.OBSERVATION):
@@ -364,29 +387,34 @@ def _cast_value(
 
 
 def _unify_ids(
-    connection: duckdb.DuckDBPyConnection, selects: list[_Select], name: str, as_text: bool
+    connection: duckdb.DuckDBPyConnection,
+    selects: list[tuple[Table, _Values]],
+    name: str,
+    as_text: bool,
 ) -> None:
     """Cast ids to BIGINT if every file has integers that fit, else or with `as_text` to text.
 
-    Text of a CSV file is an integer only if it is written as the integer is: 007, 7.0 and 1e1 are
-    not. Ids that are written as 7 and as 7.0 are two ids, with a note.
+    Text of a CSV file is an integer only if written as the integer is: 007, 7.0 and 1e1 are not.
+    Ids that are written as 7 and as 7.0 are two ids, with a note.
     """
     whole, some_whole, with_decimals = True, False, None
-    for select in selects:
-        sql, kind = select.values[name]
-        csv_type = _csv_type(select.table, sql)
+    for table, values in selects:
+        sql, kind = values[name]
+        # The type that DuckDB inferred for a column of a CSV file, whose text is read.
+        raw = (column for column in table.raw if quote_name(raw_name(column)) == sql)
+        csv_type = next((dict(table.types)[column] for column in raw), None)
         all_integers = is_integer(kind) and kind not in ("UBIGINT", "HUGEINT", "UHUGEINT")
         if csv_type is not None:
-            with explained(connection, (select.table,), select.table.files[0].parent):
+            with explain_errors(connection, (table,), table.files[0].parent):
                 ((any_integer, all_integers),) = connection.sql(
                     f"SELECT coalesce(bool_or({_IS_INTEGER}), false), "
                     f"coalesce(bool_and({_IS_INTEGER}), true) "
-                    f"FROM (SELECT {sql} AS x FROM {select.table.sql}) WHERE x IS NOT NULL"
+                    f"FROM (SELECT {sql} AS x FROM {table.sql}) WHERE x IS NOT NULL"
                 ).fetchall()
             some_whole |= is_integer(csv_type) or (csv_type == "DOUBLE" and any_integer)
         some_whole |= is_integer(kind)
         if (csv_type or kind) == "DOUBLE":
-            with_decimals = with_decimals or select.table
+            with_decimals = with_decimals or table
         whole &= kind == NOTHING or all_integers
     whole &= not as_text
     if not whole and some_whole and with_decimals is not None:
@@ -396,14 +424,119 @@ def _unify_ids(
             InputNote,
             stacklevel=5,
         )
-    for select in selects:
-        sql, _ = select.values[name]
+    for _, values in selects:
+        sql, _ = values[name]
         # Text without a character is missing, as in a CSV file.
         typed = f"CAST({sql} AS BIGINT)" if whole else f"nullif(CAST({sql} AS VARCHAR), '')"
-        select.values[name] = (typed, "")
+        values[name] = (typed, "")
 
 
-def _csv_type(table: Table, sql: str) -> str | None:
-    """The type that DuckDB inferred for a column whose text is read; None for other columns."""
-    kinds = dict(table.types)
-    return next((kinds[name] for name in table.raw if quoted(raw_name(name)) == sql), None)
+class _Survey(NamedTuple):
+    """Of the text in a column of one file: how many are what, and the largest parts of dates."""
+
+    filled: int
+    numbers: int
+    iso: int
+    """Times that begin with the year."""
+    dated: int
+    """Times that begin with the day or the month; the next three are of these."""
+    first: int | None
+    second: int | None
+    example: str | None
+    strange: str | None
+    """Text that is none of these."""
+
+
+def cast_text_time(
+    connection: duckdb.DuckDBPyConnection,
+    table: Table,
+    sql: str,
+    column: str,
+    time_format: str | None,
+) -> str:
+    """SQL of the milliseconds since 1970 (UTC) that a column of text means, NULL where it is none.
+
+    `time_format` is that of `strptime`, in which all times are written; None for numbers, ISO 8601,
+    and dates whose order of day and month every file settles. Times without a zone are UTC. Raises
+    InputError if none of the text is a time, or the order is not settled.
+    """
+    if time_format is not None:
+        return (
+            f"epoch_ms(TRY(CAST(try_strptime(trim({sql}), {quote(time_format)}) AS TIMESTAMPTZ)))"
+        )
+    with explain_errors(connection, (table,), table.files[0].parent):
+        surveys = [_survey(connection, replace(table, files=(f,)), sql) for f in table.files]
+    numbers, iso = any(s.numbers for s in surveys), any(s.iso for s in surveys)
+    dated = [(file, s) for file, s in zip(table.files, surveys, strict=True) if s.dated]
+    where = f"{table.files[0]}: timestamp ({column})"
+    if dated:
+        if numbers or iso:
+            raise InputError(
+                f"{where} has times of several kinds; say how they are written with "
+                "--time-format, or map an expression"
+            )
+        orders = {_order(file, survey) for file, survey in dated}
+        if len(orders) > 1:
+            raise InputError(
+                f"{where} has the day first in some files and the month in others; prepare "
+                "them apart, each with its --time-format"
+            )
+        (order,) = orders
+        start = quote("^" + _DAY_OR_MONTH_FIRST + "$")
+        plain = rf"trim(regexp_replace(trim({sql}), {start}, '\1/\2/\3 \4'))"
+        # A comma or T before the time of day.
+        plain = rf"regexp_replace({plain}, '\s+[T,]?\s*', ' ')"
+        formats = ", ".join(quote(f"{order}/%Y{of_day}") for of_day in _OF_DAY)
+        return f"epoch_ms(try_strptime({plain}, [{formats}]))"
+    if not (numbers or iso) and any(s.filled for s in surveys):
+        strange = min(s.strange for s in surveys if s.strange is not None)
+        raise InputError(
+            f"{where} is {strange!r:.60}, no ISO 8601 time nor milliseconds; say how it is "
+            "written with --time-format, e.g. '%d %b %Y %H:%M'"
+        )
+    number = f"TRY_CAST(round(TRY_CAST({sql} AS DOUBLE)) AS BIGINT)"
+    plain = f"replace(replace(replace(trim({sql}), '/', '-'), ',', '.'), 'UTC', 'Z')"
+    # DuckDB reads no zone after a blank.
+    plain = f"regexp_replace({plain}, '\\s+(Z|[+-]\\d{{2}}(:?\\d{{2}})?)$', '\\1')"
+    time = f"TRY(epoch_ms(TRY_CAST({plain} AS TIMESTAMPTZ)::TIMESTAMP))"
+    if not iso:
+        return number
+    return f"coalesce({time}, {number})" if numbers else time
+
+
+def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _Survey:
+    iso = f"regexp_full_match(x, {quote(ISO_TIME)})"
+    dated = f"regexp_full_match(x, {quote(_DAY_OR_MONTH_FIRST)})"
+    number = "TRY_CAST(x AS DOUBLE) IS NOT NULL"
+    first, second = (
+        f"TRY_CAST(regexp_extract(x, {quote('^' + _DAY_OR_MONTH_FIRST + '$')}, {n}) AS INTEGER)"
+        for n in (1, 2)
+    )
+    (row,) = connection.sql(
+        f"SELECT count(x), count(*) FILTER ({number}), count(*) FILTER ({iso}), "
+        f"count(*) FILTER ({dated}), "
+        f"max({first}), max({second}), min(CASE WHEN {dated} THEN x END), "
+        f"min(CASE WHEN NOT ({number} OR {iso} OR {dated}) THEN x END) "
+        f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"
+    ).fetchall()
+    return _Survey._make(row)
+
+
+def _order(file: Path, survey: _Survey) -> str:
+    """How day and month follow each other in a file: "%d/%m" or "%m/%d"."""
+    days = (survey.first or 0) > 12, (survey.second or 0) > 12
+    if days[0] != days[1]:
+        return "%d/%m" if days[0] else "%m/%d"
+    where, example = f"{file}: timestamp is {survey.example!r:.40}", str(survey.example)
+    if all(days):
+        raise InputError(
+            f"{where}, and neither day/month nor month/day reads every row; say how times are "
+            "written with --time-format"
+        )
+    first, second = (int(number) for number in re.findall(r"\d+", example)[:2])
+    sign = example.lstrip("0123456789")[:1]
+    raise InputError(
+        f"{where}: {first} {month_name[second]} or {second} {month_name[first]}? No row settles "
+        f"it; add --time-format '%d{sign}%m{sign}%Y …' or '%m{sign}%d{sign}%Y …' with the time of "
+        "day, e.g. %H:%M:%S"
+    )

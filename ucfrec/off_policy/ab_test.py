@@ -14,12 +14,11 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.binding import explained
-from ucfrec.logs.engine import engine
+from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
-from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quoted
-from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_mean
+from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quote_name
+from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 
 _NORMAL: Final = 1.959964
 LEVEL: Final = 0.95
@@ -226,11 +225,11 @@ def _sum_by_user(
         rows = " UNION ALL BY NAME ".join(
             f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
             f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
-            f"CAST({quoted(column)} AS DOUBLE) AS value "
+            f"CAST({quote_name(column)} AS DOUBLE) AS value "
             f"FROM {table.with_texts([column], (schema.USER_ID, schema.ARM)).sql}"
             for table in tables
         )
-        with explained(connection, tables, folder):
+        with explain_errors(connection, tables, folder):
             connection.execute(
                 "CREATE TABLE groups AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "

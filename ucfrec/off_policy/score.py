@@ -23,10 +23,11 @@ from ucfrec.episodes.sessions import seen_before
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.ids import EPISODE_USERS
-from ucfrec.logs.kept import mixed, note_unknown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.logs.rows import mix_bits
+from ucfrec.logs.sessions import EPISODE_USERS
+from ucfrec.logs.summary import note_unknown
 from ucfrec.progress import progress
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -391,5 +392,5 @@ def hash_rows(users: Array, items: Array, times: Array) -> KeyArray:
     """(N,) hash of each row's numbers of user and item, and its time (ms)."""
     keys = np.zeros(len(users), dtype=np.uint64)
     for values in (users, items, times):
-        keys = mixed(keys ^ values.astype(np.int64).view(np.uint64))
+        keys = mix_bits(keys ^ values.astype(np.int64).view(np.uint64))
     return keys

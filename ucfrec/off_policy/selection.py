@@ -20,7 +20,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.intervals import Resamples, resample
+from ucfrec.off_policy.estimators import Resamples, resample
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport

@@ -1,4 +1,4 @@
-"""Base of all sequence policies: configuration, normalisation, action loss, token embedding."""
+"""Base of all sequence policies: configuration, normalisation, action loss."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -17,7 +17,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
-from ucfrec.policies.layers import embedding, some_padding
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
@@ -279,42 +278,6 @@ def require_items(name: str, sizes: Mapping[str, int]) -> None:
         )
 
 
-class TokenEmbedding(nn.Module):
-    """Tokens of returns-to-go, states and actions (Appendix G.3).
-
-    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
-    """
-
-    def __init__(self, config: PolicyConfig, state_size: int) -> None:
-        super().__init__()
-        self.embed_return: nn.Module = nn.Linear(1, config.dim)
-        self.embed_state = nn.Linear(state_size, config.dim)
-        self.embed_timestep = embedding(config.max_timestep, config.dim)
-        self.norm = nn.LayerNorm(config.dim)
-
-    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tokens of returns-to-go, states and actions, (B, K, d) each.
-
-        Args:
-            windows: normalised.
-            actions: (B, K, d) embedded actions.
-        """
-        time, returns, states = self._parts(windows)
-        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
-
-    def stacked(self, windows: Windows, actions: Tensor) -> Tensor:
-        """The same as one tensor (3, B, K, d), with fewer operations."""
-        time, returns, states = self._parts(windows)
-        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
-
-    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
-        """Embedded time, returns-to-go and states, (B, K, d) each."""
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        return time, returns, self.embed_state(windows.states)
-
-
 def require_heads(config: PolicyConfig, heads: int) -> None:
     """Check that the number of attention heads divides the model's width.
 
@@ -329,7 +292,51 @@ def require_heads(config: PolicyConfig, heads: int) -> None:
     )
 
 
-def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
-    batch, length, dim = returns.shape
-    return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)
+def some_padding(mask: Tensor) -> Tensor | None:
+    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all.
+
+    A graph that is exported holds for every padding.
+    """
+    on_cpu = mask.device.type == "cpu" and not torch.compiler.is_compiling()
+    return None if on_cpu and bool(mask.all()) else mask
+
+
+def draw_normal(weight: Tensor, std: float = 1.0) -> Tensor:
+    """Fill `weight` from N(0, std²), unless it has no memory, as where sizes are compared with
+    those of a file: torch would import its compiler, which takes longer than torch itself."""
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
+    return weight
+
+
+def embedding(rows: int, size: int) -> nn.Embedding:
+    """`nn.Embedding(rows, size)`, with `draw_normal`."""
+    return nn.Embedding(rows, size, _weight=draw_normal(torch.empty(rows, size)))
+
+
+def init_linear(module: nn.Module) -> None:
+    """Initialise all linear layers as GPT-2 does: weights from N(0, 0.02²), biases 0."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            draw_normal(layer.weight, std=0.02)
+            nn.init.zeros_(layer.bias)
+
+
+def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
+    """Outputs (B, K, d) of a network for left-padded inputs, whatever the padding before a session.
+
+    The network runs with the padding moved behind the steps.
+
+    Args:
+        network: with `batch_first=True`.
+        inputs: (B, K, c).
+        mask: (B, K) bool, false at padding.
+    """
+    length = mask.shape[1]
+    padding = (~mask).sum(1, keepdim=True)
+    places = torch.arange(length, device=mask.device)
+
+    def rolled(x: Tensor, by: Tensor) -> Tensor:
+        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
+
+    return rolled(network(rolled(inputs, padding))[0], -padding)

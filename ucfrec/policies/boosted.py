@@ -16,9 +16,9 @@ from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewar
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
-from ucfrec.policies.popular import PRIOR
+from ucfrec.policies.baselines import PRIOR
 from ucfrec.settings import settings_table
-from ucfrec.user_model.trees import LEAVES, TREES, BoostedTrees
+from ucfrec.user_model.session_end import LEAVES, TREES, fit_trees
 
 _MAX_ROWS: Final = 300_000
 _AT_ONCE: Final = 4096
@@ -99,12 +99,12 @@ class BoostedPolicy(SequencePolicy):
             if len(steps) > _MAX_ROWS:
                 sample = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
                 steps = np.sort(sample)
-            trees = BoostedTrees.fit(*self._rows(train, steps), seed)
-            self.base.copy_(trees.base)
-            count = len(trees.leaves)
-            self.leaves[:count] = trees.leaves
-            self.split_inputs[:, :count] = trees.inputs.T
-            self.split_thresholds[:, :count] = trees.thresholds.T
+            trees = fit_trees(*self._rows(train, steps), seed)
+            self.base.copy_(trees["base"])
+            count = len(trees["leaves"])
+            self.leaves[:count] = trees["leaves"]
+            self.split_inputs[:, :count] = trees["inputs"].T
+            self.split_thresholds[:, :count] = trees["thresholds"].T
 
         return solve
 

@@ -109,7 +109,7 @@ def _check_padding(policy: SequencePolicy, train: EpisodeStore) -> None:
         _refuse(
             policy,
             "depends on how much padding is before a session; leave steps out where windows.mask "
-            "is false (for a recurrent network: ucfrec.policies.layers.recurrent)",
+            "is false (for a recurrent network: ucfrec.policies.base.recurrent)",
         )
 
 

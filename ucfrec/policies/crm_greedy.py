@@ -109,7 +109,7 @@ class CRMGreedyPolicy(SequencePolicy):
         if not isinstance(model, ItemRewardModel):
             return self._errors(windows)[:, -1].mean()
         states, items = windows.states[:, -1], windows.actions[:, -1]
-        predicted = model.expected(model.score(states, Shown.before_last(windows), None, items))
+        predicted = model.expect(model.score(states, Shown.before_last(windows), None, items))
         return ((windows.rewards[:, -1] - predicted) / model.reward_std).square().mean()
 
     def act(self, windows: Windows) -> Tensor:

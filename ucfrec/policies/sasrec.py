@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import Layers, SequencePolicy, require_items
+from ucfrec.policies.base import Layers, SequencePolicy, embedding, require_items
 from ucfrec.policies.dt import Block, DTConfig, rows_through
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.layers import Dropout, embedding, visible_tokens
+from ucfrec.policies.ucf import Dropout, visible_tokens
 from ucfrec.settings import Share, settings_table
 
 

@@ -1,6 +1,9 @@
-"""UCF's hybrid causal architecture (paper section 3.2)."""
+"""UCF's hybrid causal architecture (paper section 3.2), and the layers that it shares with others.
 
-from collections.abc import Callable, Mapping
+Dropout, attention and convolution cost less here than PyTorch's on a CPU.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Final
 
 import torch
@@ -15,18 +18,19 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
-    TokenEmbedding,
-    interleave,
+    embedding,
     require_heads,
+    some_padding,
 )
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.layers import ConvStream, Dropout, convolved, some_padding
 from ucfrec.settings import Share, Weight, settings_table
 
 _FEW: Final = 32
 """Windows up to which calling an operation costs more than its arithmetic."""
 EPSILON: Final = 1e-8
 """Added inside the logarithm of Eq. 5 (Table 7)."""
+_LEVELS = 2**16
+"""Values of the random 16-bit numbers that decide what a CPU drops."""
 
 
 @settings_table("policy")
@@ -119,7 +123,7 @@ class UCFPolicy(SequencePolicy):
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
         tokens = self.embed(windows, self.head.embed(windows.actions))
         streams = (self.return_stream, self.state_stream, self.action_stream)
-        returns, states, actions = convolved(streams, tokens, windows.mask)
+        returns, states, actions = convolve_streams(streams, tokens, windows.mask)
         # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
         # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
         of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
@@ -222,6 +226,177 @@ class SupervisedAttention(nn.Module):
         shares = self.dropout(attention).unbind(1)
         mixed = torch.cat([share @ value for share, value in zip(shares, values, strict=True)], -1)
         return self.out(mixed), attention
+
+
+class Dropout(nn.Dropout):
+    """Sets a share p of the values to 0 and divides the others by 1 − p.
+
+    On a CPU, p is rounded to a multiple of 2⁻¹⁶: four values share one 64-bit draw, which takes a
+    fifth of the time of one draw each.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Values of any shape, unchanged in evaluation mode."""
+        if not self.training or self.p == 0:
+            return input
+        if input.device.type != "cpu":
+            return F.dropout(input, self.p)
+        return input * draw_mask(input.shape, self.p)
+
+    def add(self, residual: Tensor, input: Tensor) -> Tensor:
+        """`residual` + this dropout of `input`, both of the same shape, in one pass."""
+        if not self.training or self.p == 0 or input.device.type != "cpu":
+            dropped: Tensor = self(input)
+            return residual + dropped
+        return torch.addcmul(residual, input, draw_mask(input.shape, self.p))
+
+
+def draw_mask(shape: torch.Size, p: float) -> Tensor:
+    """Independent draws, float32 on the CPU: 0 with probability p, otherwise 1 / (1 − p).
+
+    Args:
+        p: from 0 to 1, rounded to a multiple of 2⁻¹⁶.
+    """
+    dropped = round(p * _LEVELS)
+    if dropped == _LEVELS:
+        return torch.zeros(shape)
+    mask = torch.empty(shape)
+    draws = torch.empty(-(-mask.numel() // 4), dtype=torch.int64).random_(-(2**63), None)
+    levels = draws.view(torch.int16)[: mask.numel()].view(shape)
+    torch.ge(levels, dropped - _LEVELS // 2, out=mask)
+    return mask.mul_(_LEVELS / (_LEVELS - dropped))
+
+
+class TokenEmbedding(nn.Module):
+    """Tokens of returns-to-go, states and actions (Appendix G.3).
+
+    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
+    """
+
+    def __init__(self, config: PolicyConfig, state_size: int) -> None:
+        super().__init__()
+        self.embed_return: nn.Module = nn.Linear(1, config.dim)
+        self.embed_state = nn.Linear(state_size, config.dim)
+        self.embed_timestep = embedding(config.max_timestep, config.dim)
+        self.norm = nn.LayerNorm(config.dim)
+
+    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tokens of returns-to-go, states and actions, (B, K, d) each.
+
+        Args:
+            windows: normalised.
+            actions: (B, K, d) embedded actions.
+        """
+        time, returns, states = self._parts(windows)
+        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+
+    def stacked(self, windows: Windows, actions: Tensor) -> Tensor:
+        """The same as one tensor (3, B, K, d), with fewer operations."""
+        time, returns, states = self._parts(windows)
+        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
+
+    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
+        """Embedded time, returns-to-go and states, (B, K, d) each."""
+        last = self.embed_timestep.num_embeddings - 1
+        time = self.embed_timestep(windows.timesteps.clamp(max=last))
+        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        return time, returns, self.embed_state(windows.states)
+
+
+def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
+    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
+    batch, length, dim = returns.shape
+    return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)
+
+
+class CausalDepthwise(nn.Conv1d):
+    """A depthwise convolution over the last 3 steps: the output at t depends on t − 2 to t.
+
+    It has the weights of `nn.Conv1d(dim, dim, 3, groups=dim)`. Adding three shifted products needs
+    no transposed copies, which cost more than the convolution itself.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__(dim, dim, kernel_size=3, groups=dim)
+
+    def forward(self, input: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Map (B, K, d) to (B, K, d).
+
+        Args:
+            mask: (B, K) bool, false at steps that count as zeros; None if all count.
+        """
+        steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)
+        taps = self.weight[:, 0].T.contiguous()  # strided factors take three times as long
+        return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _ShiftedProducts(torch.autograd.Function):
+    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from x (B, K, d), w (3, d) and b (d,)."""
+
+    @staticmethod
+    def forward(ctx: Any, steps: Tensor, taps: Tensor, bias: Tensor) -> Any:
+        ctx.save_for_backward(steps, taps)
+        out = torch.addcmul(bias, steps, taps[2])
+        for back in (1, 2):
+            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        steps, taps = ctx.saved_tensors
+        of_steps, of_taps = gradient * taps[2], torch.empty_like(taps)
+        of_taps[2] = (gradient * steps).sum((0, 1))
+        for back in (1, 2):
+            later, earlier = gradient[:, back:], steps[:, :-back]
+            of_steps[:, :-back].addcmul_(later, taps[2 - back])
+            of_taps[2 - back] = (later * earlier).sum((0, 1))
+        return of_steps, of_taps, gradient.sum((0, 1))
+
+
+class ConvStream(nn.Module):
+    """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
+
+    def __init__(self, dim: int, blocks: int, dropout: float) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_ConvBlock(dim, dropout) for _ in range(blocks))
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
+        for block in self.blocks:
+            tokens = block(tokens, mask)
+        return tokens
+
+
+class _ConvBlock(nn.Module):
+    def __init__(self, dim: int, dropout: float) -> None:
+        super().__init__()
+        self.depthwise = CausalDepthwise(dim)
+        self.pointwise = nn.Linear(dim, dim)
+        self.dropout = Dropout(dropout)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        local = self.depthwise(tokens, mask)
+        return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
+
+
+def convolve_streams(
+    streams: Iterable[nn.Module], tokens: Iterable[Tensor], mask: Tensor
+) -> list[Tensor]:
+    """The tokens (B, K, d) of each modality through its stream; steps outside `mask` count as 0."""
+    padded = some_padding(mask)
+    return [stream(values, padded) for stream, values in zip(streams, tokens, strict=True)]
+
+
+def visible_tokens(valid: Tensor) -> Tensor:
+    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
+
+    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
+    """
+    length = valid.shape[1]
+    earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
+    diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
+    return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
 
 
 def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:

@@ -24,15 +24,15 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.ranking_table import require_one_catalogue
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
-from ucfrec.logs.kept import DAY_MS
 from ucfrec.logs.mapping import LogFiles
+from ucfrec.logs.rows import DAY_MS
 from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
@@ -40,25 +40,23 @@ from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,
-    files_given,
-    histories_given,
-    in_words_of_python,
-    logs_given,
+    open_files,
+    prepare_store,
+    read_histories,
+    read_logs,
+    read_split,
     require_logs,
-    split_given,
-    store_given,
+    use_words_of_python,
 )
-from ucfrec.python_api.run_folders import Scratch, kept_beside
+from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
 from ucfrec.recommending.recommend import recommend
 from ucfrec.recommending.similar import similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
-from ucfrec.results.table import Evaluation, Ranking, ResultTable
+from ucfrec.results.rows import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
-from ucfrec.runs.refit import refit_within
-from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
@@ -74,7 +72,7 @@ _checked: Final = check_arguments(
         **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
         **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
-        "split": split_given,
+        "split": read_split,
         "histories": require_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
         "rule": require_kind("a DecisionRule", DecisionRule),
         "options": require_kind("EstimateOptions", EstimateOptions),
@@ -86,6 +84,10 @@ _checked: Final = check_arguments(
 
 class Recommender:
     """A policy that recommends items, trained from logs.
+
+    Its methods raise `InputError` if it is not trained yet, or if data or an argument cannot be
+    used. Several have the arguments `rule`, the decision rule, None for the run's own, and
+    `mapping`, of the columns of logs: what it leaves open is as in the training log.
 
     Example::
 
@@ -105,9 +107,6 @@ class Recommender:
             settings: as for `ucfrec train --set`: `{"train.steps": 200}`,
                 `{"train": {"steps": 200}}` or `["train.steps=200"]`.
             seed: of everything random.
-
-        Raises:
-            InputError: the policy or a setting is unknown or out of range.
         """
         self.policy, self.settings, self.seed = policy, settings, seed
         self.config = resolve_config(policy, None, settings, seed)
@@ -140,25 +139,24 @@ class Recommender:
         """Change arguments of the constructor, or settings as `train__steps=200`, before `fit`.
 
         Another policy keeps the settings that it has too.
-
-        Raises:
-            InputError: a policy or setting is unknown or out of range; nothing is changed then.
         """
-        own = {name: params.pop(name) for name in _OWN if name in params}
-        given = {name: own.get(name, getattr(self, name)) for name in _OWN}
-        if "settings" not in own and given["policy"] != self.policy:
-            known = {f"policy.{each.name}" for each in fields(policy_class(given["policy"]).Config)}
-            given["settings"] = {
-                name: value
-                for name, value in settings_given(self.settings).items()
-                if name in known or not name.startswith("policy.")
-            }
+        policy, seed = params.pop("policy", self.policy), params.pop("seed", self.seed)
+        settings = params.pop("settings", None)
+        if settings is None:
+            settings = self.settings
+            if policy != self.policy:
+                names = {f"policy.{field.name}" for field in fields(policy_class(policy).Config)}
+                settings = {
+                    name: value
+                    for name, value in settings_given(settings).items()
+                    if name in names or not name.startswith("policy.")
+                }
         if params:
-            new = {name.replace("__", ".", 1): value for name, value in params.items()}
+            changes = {name.replace("__", ".", 1): value for name, value in params.items()}
             # Texts `table.field=value` come first, so that the new values count.
-            given["settings"] = settings_given(given["settings"]) | new
-        self.config = resolve_config(given["policy"], None, given["settings"], given["seed"])
-        self.policy, self.settings, self.seed = (given[name] for name in _OWN)
+            settings = settings_given(settings) | changes
+        self.config = resolve_config(policy, None, settings, seed)
+        self.policy, self.settings, self.seed = policy, settings, seed
         return self
 
     @_checked
@@ -204,42 +202,36 @@ class Recommender:
 
         Returns:
             This recommender, trained.
-
-        Raises:
-            InputError: the data or its options cannot be used, or `out` is another run.
         """
-        names = ("reward", "session_by", "gap_minutes", "split", "dataset")
-        values = (reward, session_by, gap_minutes, split, dataset)
-        options = {n: v for n, v in zip(names, values, strict=True) if v is not None}
-        with ExitStack() as scratch:
+        options = {
+            "reward": reward,
+            "session_by": session_by,
+            "gap_minutes": gap_minutes,
+            "split": split,
+            "dataset": dataset,
+        }
+        options = {name: value for name, value in options.items() if value is not None}
+        with ExitStack() as stack:
             # Whoever fits next removes what is left, should this process be killed.
-            own = None if out is None else Path(out).absolute()
-            parent = Path(tempfile.gettempdir()) if own is None else own.parent
-            folder = scratch.enter_context(scratch_folder(parent, "run"))
-            store = store_given(data, mapping, folder, options)
-            if own is not None and store.path.parent == folder:
-                store = kept_beside(own, store)
-            out = folder / "run" if own is None else own
+            parent = Path(tempfile.gettempdir()) if out is None else Path(out).absolute().parent
+            folder = stack.enter_context(scratch_folder(parent, "run"))
+            run = folder / "run" if out is None else Path(out).absolute()
+            store = prepare_store(data, mapping, folder, options)
+            if out is not None and store.path.parent == folder:
+                store = keep_beside(run, store)
             watchers = Callbacks(on_step, on_validation)
-            record = train_screened(store, out, self.config, screen, callbacks=watchers)
-            if warning := record.learned_nothing(read_metrics(out / "policy")):
-                with in_words_of_python():
+            record = train_policy(store, run, self.config, screen, refit, watchers)
+            if warning := record.learned_nothing(read_metrics(run / "policy")):
+                with use_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            if refit:
-                refit_within(store, out)
-            write_card(out)
-            trained = TrainedPolicy.load(out)
-            kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
-        self._trained, self._scratch = trained, kept
+            trained = TrainedPolicy.load(run)
+            scratch = Scratch(stack.pop_all()) if any(folder.iterdir()) else None
+        self._trained, self._scratch = trained, scratch
         return self
 
     @property
     def run(self) -> Path:
-        """The run folder.
-
-        Raises:
-            InputError: the recommender is not trained, or its folder is gone.
-        """
+        """The run folder."""
         folder = self.trained.folder
         if not folder.is_dir():
             raise InputError(
@@ -250,16 +242,12 @@ class Recommender:
 
     @property
     def trained(self) -> TrainedPolicy:
-        """The policy with the lowest validation loss.
-
-        Raises:
-            InputError: the recommender is not trained; call `fit` first.
-        """
+        """The policy with the lowest validation loss."""
         if self._trained is None:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
         return self._trained
 
-    def _evaluated(self, logs: Logs | None) -> TrainedPolicy:
+    def _load_for(self, logs: Logs | None) -> TrainedPolicy:
         """The policy that logs can evaluate: the test split, the weights before a refit."""
         run, trained = self.run, self.trained
         if logs is not None or trained.record.refit_of is None:
@@ -300,7 +288,6 @@ class Recommender:
             skip_unknown: ignore rows of items that are not in the training data, and such
                 candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
-            rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on
                 the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
@@ -311,16 +298,11 @@ class Recommender:
             the items that are left, nats), `propensity` (probability of the item at its position,
             given those before it), `request_id`: k rows per user in the order shown, users in
             sorted order; fewer rows if fewer items remain, as with less than k candidates.
-
-        Raises:
-            InputError: the recommender is not trained, an argument is wrong, a column is missing or
-                of a wrong type, no row can be used, a user has no rows, or an item or candidate
-                is not in the training data.
         """
         trained = self.trained
         frames = recommend(
             trained,
-            histories_given(trained, histories, mapping, users),
+            read_histories(trained, histories, mapping, users),
             k,
             rule=rule,
             seed=seed,
@@ -329,7 +311,7 @@ class Recommender:
             skip_unknown=skip_unknown,
             new_session=new_session,
         )
-        with in_words_of_python():
+        with use_words_of_python():
             return pd.concat(frames, ignore_index=True)
 
     @_checked
@@ -342,9 +324,6 @@ class Recommender:
 
         Returns:
             `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
-
-        Raises:
-            InputError: the recommender is not trained, or an item is not in the training data.
         """
         return similar_items(self.trained, items, k)
 
@@ -367,24 +346,18 @@ class Recommender:
             logs: later logs, as for `fit`; None for the test split of the store.
             k: items recommended at each step.
             others: policies trained on the same store, ranked beside this one; or only one.
-            rule: the decision rule of this policy; None for the run's own.
             filter_seen: exclude items that the user has seen before a step.
             liked: truth value over the column reward, such as "reward >= 4"; None for at least 60%
                 of the way from the lowest training reward to the highest.
             seed: of the bootstrap over users and of the random baseline.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
-
-        Raises:
-            InputError: the recommender is not trained, the logs cannot be used, or another policy
-                has another catalogue.
         """
         beside = require_list("others", others, "a Recommender", Recommender)
-        trained, *rest = (policy._evaluated(logs) for policy in (self, *beside))
+        trained, *rest = (policy._load_for(logs) for policy in (self, *beside))
         require_one_catalogue([trained, *rest])
         candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
         with (
-            logs_given(trained, logs, mapping, keep_unknown=False) as logged,
-            in_words_of_python(),
+            read_logs(trained, logs, mapping, keep_unknown=False) as logged,
+            use_words_of_python(),
         ):
             return rank_policies(
                 candidates,
@@ -414,16 +387,11 @@ class Recommender:
 
         Args:
             logs: logs with propensities, as for `fit`; None for the test split of the store.
-            rule: the decision rule; None for the run's own.
             options: what is estimated, and how.
             seed: of the folds and the bootstrap.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
-
-        Raises:
-            InputError: the recommender is not trained, or the logs cannot be used.
         """
-        trained = self._evaluated(logs)
-        with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
+        trained = self._load_for(logs)
+        with read_logs(trained, logs, mapping, keep_unknown=True) as logged:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
@@ -448,12 +416,8 @@ class Recommender:
         Args:
             environment: name of a simulator, such as "synthetic-taobao", or an `Environment`.
             episodes: number of episodes of each policy.
-            rule: the decision rule; None for the run's own.
             behaviors: built-in policies of the simulator to evaluate beside it, such as "random".
             seed: of the episodes.
-
-        Raises:
-            InputError: the recommender is not trained, or the environment does not fit it.
         """
         trained = self.trained
         beside = require_list("behaviors", behaviors, "the name of a behavior", str)
@@ -480,19 +444,14 @@ class Recommender:
 
         Args:
             logs: as for `fit`.
-            rule: the decision rule; None for the run's own.
             filter_seen: exclude items that the user was shown before, as `recommend` does by
                 default: for logs of what it showed.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
             One row per logged step; see `ucfrec.off_policy.score.score`.
-
-        Raises:
-            InputError: the recommender is not trained, or the logs cannot be used.
         """
-        trained = self._evaluated(logs)
-        with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
+        trained = self._load_for(logs)
+        with read_logs(trained, logs, mapping, keep_unknown=False) as logged:
             return pd.concat(score(trained, logged, rule, filter_seen), ignore_index=True)
 
     @_checked
@@ -516,20 +475,15 @@ class Recommender:
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
             filter_seen: compare them where items that the user was shown before are excluded.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and
             the verdict on both.
-
-        Raises:
-            InputError: the recommender is not trained, its store is gone, or the logs cannot be
-                used.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
         options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
-        given = files_given(self.trained, logs, mapping)
-        with given as (files, columns, frame), in_words_of_python(frame):
+        given = open_files(self.trained, logs, mapping)
+        with given as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)
         write_card(Path(out))
         return self.load(out)
@@ -543,13 +497,8 @@ class Recommender:
         Args:
             folder: folder to make.
             k: items that the graph chooses; None for 100, or all if there are fewer.
-            rule: the decision rule; None for the run's own.
-
-        Raises:
-            InputError: the extra `export` is not installed, the policy cannot be exported, or the
-                folder exists.
         """
-        with in_words_of_python():
+        with use_words_of_python():
             return export(self.trained, Path(folder), rule=rule, k=k)
 
     @_checked
@@ -568,9 +517,6 @@ class Recommender:
 
         Returns:
             The file.
-
-        Raises:
-            InputError: the recommender is not trained, or a file or result cannot be used.
         """
         what = "what evaluate or ope returned, or files of it"
         kinds = (Evaluation, OffPolicyReport, Path, str)
@@ -584,17 +530,13 @@ class Recommender:
                     result.save(files[-1])
                 else:
                     files.append(Path(result))
-            with in_words_of_python():
+            with use_words_of_python():
                 write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
     @_checked
     def save(self, folder: Path | str) -> None:
-        """Copy the run to a new folder, which `load` and the command line can read.
-
-        Raises:
-            InputError: the folder exists, or the recommender is not trained.
-        """
+        """Copy the run to a new folder, which `load` and the command line can read."""
         run = self.run
         with atomic_folder(Path(folder)) as scratch:
             shutil.copytree(run, scratch, dirs_exist_ok=True)
@@ -602,11 +544,7 @@ class Recommender:
     @classmethod
     @_checked
     def load(cls, run: Path | str) -> Self:
-        """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`.
-
-        Raises:
-            InputError: the folder is not a run folder, or has no checkpoint yet.
-        """
+        """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`."""
         policy = cls()
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config

@@ -18,8 +18,8 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
-from ucfrec.logs.kept import kept_in_order
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
+from ucfrec.logs.rows import choose_rows
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -95,7 +95,7 @@ class Histories:
         }
         if by_id:
             table["session"] = sessions[0]
-        order = kept_in_order(table, duplicates)
+        order = choose_rows(table, duplicates)
         rewards, users, items, times, *sessions = (values[order] for values in columns)
         same_user = users[1:] == users[:-1]
         owner = np.concatenate([[0], np.cumsum(~same_user)])

@@ -18,7 +18,7 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.sessions import Sessions
 from ucfrec.errors import InputError
-from ucfrec.logs.kept import mixed
+from ucfrec.logs.rows import mix_bits
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -214,7 +214,7 @@ def _choose_best(
     none = torch.isneginf(total)
     if none.any():
         scores[none[:, 0]] = 0.0
-    items, propensities = rule.ranked(scores, k, draws)
+    items, propensities = rule.rank_items(scores, k, draws)
     values = scores.gather(1, items) - total
     return items, values.masked_fill(none, -torch.inf), propensities
 
@@ -316,7 +316,7 @@ def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
     )
     step = np.uint64(0x9E3779B97F4A7C15)
     with np.errstate(over="ignore"):
-        key = of_users + mixed(of_requests) - step
-        state = mixed(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
-        state = mixed(state + np.arange(count, dtype=np.uint64) * step)
+        key = of_users + mix_bits(of_requests) - step
+        state = mix_bits(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
+        state = mix_bits(state + np.arange(count, dtype=np.uint64) * step)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)

@@ -27,7 +27,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array
 from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.errors import InputError
-from ucfrec.logs.kept import DAY_MS, kept_in_order
+from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.later_logs import reward_of
@@ -275,7 +275,7 @@ class HistoryReader:
             if {*map(len, observed)} == {self.observation_size}:
                 columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
-        order = kept_in_order(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
+        order = choose_rows(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
         observations = None
         if self.observation_size:
             last = self._observation(rows, int(order[-1]))

@@ -11,8 +11,7 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.errors import InputError
-from ucfrec.logs.binding import bind, explained
-from ucfrec.logs.engine import engine_in_memory
+from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.tables import is_number
@@ -85,7 +84,7 @@ class RowRewards:
             described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
             table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
             try:
-                with explained(connection, (table,), source):
+                with explain_errors(connection, (table,), source):
                     sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
                     query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
                     values = [row[0] for row in connection.sql(query).fetchall()]

@@ -15,7 +15,7 @@ from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark_users import GivenLog, by_users
+from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import Histories, session_by
 from ucfrec.recommending.recommend import recommend
@@ -62,7 +62,7 @@ def recommend_with_spark(
     trained.item_scorer(rule)
     require_whole("k", k)
     columns = columns_used(trained, mapping)
-    log = GivenLog(files, columns, reward_of(trained), session_by(trained))
+    log = UserLog(files, columns, reward_of(trained), session_by(trained))
     with ExitStack() as stack:
         folders = [out] if exposures is None else [out, exposures]
         parts = [stack.enter_context(atomic_folder(folder)).absolute() for folder in folders]
@@ -78,12 +78,12 @@ def recommend_with_spark(
         exposed = None if exposures is None else parts[1]
         run = RunOnWorkers.of(trained, checkpoint)
         part = _RecommendPart(run, parts[0], exposed, memory_limit, rule.hash, recommended)
-        return sum(by_users(log, parts[0].parent, master, part))
+        return sum(map_users(log, parts[0].parent, master, part))
 
 
 @dataclass(frozen=True)
 class _RecommendPart:
-    """Recommends to the users of a part, see `ucfrec.logs.spark_users.Work`."""
+    """Recommends to the users of a part, see `ucfrec.logs.spark.Work`."""
 
     run: RunOnWorkers
     out: Path

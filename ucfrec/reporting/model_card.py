@@ -19,8 +19,7 @@ from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.provenance import config_hash, shorten_paths
 from ucfrec.reporting.tables import Table, format_value, markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.table import Ranking
+from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
 
@@ -282,5 +281,5 @@ def tabulate_user_model(record: RunRecord) -> Table | None:
         rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
-    body = [(name, [format_value(value)]) for name, value in rows.items()]
-    return Table("User model, on held-out rows", "", ["value"], body)
+    body = [(name, [value]) for name, value in rows.items()]
+    return Table.from_values("User model, on held-out rows", ["value"], body)

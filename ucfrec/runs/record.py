@@ -18,10 +18,9 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import ValueEstimate
-from ucfrec.choosing.logged import Evidence
+from ucfrec.choosing.choice import Evidence, ValueEstimate
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -32,6 +31,7 @@ from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import SessionEndReport
 
@@ -214,7 +214,7 @@ class RunRecord(TrainingRecord):
     """The same as seen from the run; None on another drive of Windows."""
     reward: Text
     """The expression that computed the rewards."""
-    session_by: Text | None
+    session_by: SessionBy | None
     session_gap_ms: Count | None
     observation_size: Count
     train_episodes: Count

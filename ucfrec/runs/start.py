@@ -215,10 +215,9 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
         InputError: the policy does not support the actions of `train`.
     """
     torch.manual_seed(config.seed)
-    base = train.without_augmentation()
     policy = policy_class(config.policy_name)(config.policy, policy_sizes(train))
-    _set_statistics(policy, base, config)
-    policy.start_from(base)
+    _set_statistics(policy, train, config)
+    policy.start_from(train)
     return policy
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 from ucfrec_control.data.distractor import CLEAN
 

@@ -1,18 +1,21 @@
 """`ucfrec-control benchmark`: every method on the zoo files; resumes."""
 
-import argparse
 from collections.abc import Sequence
+from typing import Annotated
 
-from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
-from ucfrec.commands.options import option
+from ucfrec.benchmark.tables import (
+    average_seeds,
+    difference_table,
+    score_table,
+    select_best_target,
+)
+from ucfrec.commands.options import Names
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
 from ucfrec_control.benchmark.plan import chosen_rates, score_cells
-from ucfrec_control.commands.options import control_grid_options, list_cells
+from ucfrec_control.commands.options import SuiteOptions
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
 UCF = "ucf"
@@ -23,34 +26,26 @@ _SHOWN = (
 )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `benchmark`."""
-    text = (
-        "every method (main), ways to pursue reward, all trained for as long as DT or LSDT "
-        "(equal-time), or a sweep over UCF's settings"
-    )
-    option(parser, "--table", list(TABLES), text, default=MAIN)
-    control_grid_options(parser)
+class Benchmark(SuiteOptions):
+    """`ucfrec-control benchmark`."""
 
+    table: Annotated[str, Names(lambda: tuple(TABLES), closed=True)] = MAIN
+    """Every method (main), ways to pursue reward, all trained for as long as DT or LSDT
+    (equal-time), or a sweep over UCF's settings"""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control benchmark`."""
-    table, budget = options.table, budget_of(options.table, options.budget)
-    rows = rows_of(
-        options,
-        SCORES,
-        [table],
-        lambda: list_cells(
-            options,
-            budget,
-            lambda data, own: score_cells(data, options.out, own, table, options.methods),
-        ),
-        SCORE_MEASUREMENT,
-        f"benchmark {table}",
-    )
-    with rows_explained(options):
-        print_scores(rows, table)
-    print(f"\nrows: {results_given(options)}")
+    def execute(self) -> None:
+        """Run `ucfrec-control benchmark`."""
+        table = self.table
+        rows = self.make_suite_rows(
+            SCORES,
+            table,
+            SCORE_MEASUREMENT,
+            lambda data, out, budget, methods: score_cells(data, out, budget, table, methods),
+            f"benchmark {table}",
+        )
+        with self.explain_rows():
+            print_scores(rows, table)
+        print(f"\nrows: {self.rows_file}")
 
 
 def print_scores(rows: Sequence[ResultRow], table: str) -> None:
@@ -68,7 +63,7 @@ def print_scores(rows: Sequence[ResultRow], table: str) -> None:
 
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     print(format_rows([dict.fromkeys(_SHOWN) | row.as_line() for row in rows], _SHOWN))
-    if len(rows) > len(rows := of_best_target(rows)):
+    if len(rows) > len(rows := select_best_target(rows)):
         print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
         if lines := score_table(rows, checkpoint):
@@ -81,7 +76,7 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     by, values = ("task", "method"), ("score", "validation_loss")
     columns = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
-    print(format_rows(over_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
+    print(format_rows(average_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
     reference = UCF if table == MAIN or not last else last[0].method
     for name in values:
         if lines := difference_table(last, reference, name):

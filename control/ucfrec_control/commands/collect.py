@@ -1,40 +1,48 @@
 """`ucfrec-control collect`: datasets from SAC, which resumes, or from a saved agent."""
 
-import argparse
 from pathlib import Path
+from typing import Annotated, Any
 
-from ucfrec.commands.grid_options import seed_given
-from ucfrec.commands.options import option
+from ucfrec.commands.options import SEED, Table
 from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
 from ucfrec_control.data.collect import SHOWN, CollectConfig, collect, collect_agent
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `collect`."""
-    option(parser, "--env", str, "Gymnasium environment, e.g. Hopper-v5", required=True)
-    option(parser, "--out", Path, "folder for the datasets", "FOLDER", required=True)
-    option(parser, "--steps", 1_000_000, "of training")
-    option(parser, "--every", 10_000, "steps between evaluations")
-    option(parser, "--fraction", float, "of the expert's return, for medium (1/3)", default=1 / 3)
-    option(parser, "--size", 1_000_000, "steps of medium and of expert")
-    option(parser, "--seed", seed_given, "of training and episodes (default: 0)", default=0)
-    text = "record this agent, saved by Stable-Baselines3, instead of training one; pickled parts"
-    option(parser, "--agent", Path, f"{text} of the file are not read", "ZIP")
-    text = "standard deviation of the noise on the agent's actions, in halves of their range"
-    option(parser, "--noise", 0.0, text)
+class Collect(Table):
+    """`ucfrec-control collect`."""
 
+    env: str
+    """Gymnasium environment, e.g. Hopper-v5."""
+    out: Annotated[Path, "FOLDER"]
+    """Folder of the files."""
+    steps: int = 1_000_000
+    """Of training."""
+    every: int = 10_000
+    """Steps between evaluations."""
+    fraction: float = 1 / 3
+    """Of the expert's return, for medium."""
+    size: int = 1_000_000
+    """Steps of medium and of expert."""
+    seed: Annotated[int, SEED] = 0
+    """Of everything random."""
+    agent: Annotated[Path | None, "ZIP"] = None
+    """Record this agent, saved by Stable-Baselines3, instead of training one; pickled parts of the
+    file are not read"""
+    noise: float = 0.0
+    """Standard deviation of the noise on the agent's actions, in halves of their range."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control collect`."""
-    if options.agent is not None:
-        acting = {"noise": options.noise, "size": options.size, "seed": options.seed}
-        rows = [collect_agent(options.agent, options.env, options.out, **acting)]
-    elif options.noise:
-        raise InputError("--noise is for the actions of an --agent")
-    else:
-        names = ("steps", "every", "fraction", "size")
-        config = CollectConfig(**{name: getattr(options, name) for name in names})
-        rows = collect(options.env, options.out, options.seed, config)
-    print(format_rows(rows, SHOWN))
-    print(f"\nfiles: {options.out}")
+    def execute(self) -> None:
+        """Run `ucfrec-control collect`."""
+        if self.agent is not None:
+            acting: dict[str, Any] = {"noise": self.noise, "size": self.size, "seed": self.seed}
+            rows = [collect_agent(self.agent, self.env, self.out, **acting)]
+        elif self.noise:
+            raise InputError("--noise is for the actions of an --agent")
+        else:
+            config = CollectConfig(
+                steps=self.steps, every=self.every, fraction=self.fraction, size=self.size
+            )
+            rows = collect(self.env, self.out, self.seed, config)
+        print(format_rows(rows, SHOWN))
+        print(f"\nfiles: {self.out}")

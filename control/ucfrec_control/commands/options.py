@@ -2,14 +2,16 @@
 
 import argparse
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, Literal
 
-from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.commands.grid_options import budget_options, grid_options
-from ucfrec.commands.options import option
+from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.commands.benchmark import GridOptions
+from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, one_line
+from ucfrec.results.rows import ResultRow
+from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import set_contexts
 from ucfrec_control.data.d4rl import read_d4rl
@@ -18,13 +20,7 @@ from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.environments import note_unknown
 from ucfrec_control.environments.scores import find_task
 
-BUDGETS: Final = {
-    "small": "a quick look: policies have not learned all they can",
-    "medium": "averaged weights, 10 times the windows; about 20 core hours for the main table",
-    "full": "the steps, seeds and episodes of the papers",
-}
-"""What the budgets are, by name."""
-MAX_RETURN = "max"
+MAX_RETURN: Final = "max"
 """`--target` for the largest return that the policy expects in each state."""
 
 
@@ -45,13 +41,6 @@ def target_given(text: str) -> float | None:
     return value
 
 
-def source_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name a dataset to read."""
-    option(parser, "source", str, "HDF5 file, Minari identifier, or folder of one", "SOURCE")
-    option(parser, "--env", str, "environment of the data, if the file does not name it")
-    option(parser, "--download", False, "let Minari fetch the dataset")
-
-
 def context_given(text: str) -> tuple[str, int]:
     """The value of `--context`.
 
@@ -64,63 +53,108 @@ def context_given(text: str) -> tuple[str, int]:
     return method, int(steps)
 
 
-def control_grid_options(parser: argparse.ArgumentParser, whole: bool = True) -> None:
-    """Add the options for what a benchmark measures, and where its data, runs and rows are.
+class SourceOptions(Table):
+    """A dataset to read."""
 
-    Args:
-        whole: whether files, methods and the seed of the evaluation can be chosen.
-    """
-    option(parser, "--data", Path, "folder of the HDF5 files", "FOLDER")
-    option(
-        parser,
-        "--context",
-        context_given,
-        "steps of history of a method; repeatable (default: the budget's)",
-        "METHOD=STEPS",
-        dest="contexts",
-        action="append",
-        default=[],
-    )
-    if whole:
-        budget_options(parser, "--file", "--seeds", BUDGETS)
-    else:
-        option(parser, "--budget", list(BUDGETS), "(default: small)", default="small")
-        text = "training seeds (default: set by --budget)"
-        option(parser, "--seeds", int, text, "N", dest="training_seeds")
-        parser.set_defaults(tasks=[], evaluation_seed=None)
-    grid_options(parser, "runs/control", 1)
+    source: Annotated[str, ARGUMENT, "SOURCE"]
+    """HDF5 file, Minari identifier, or folder of one."""
+    env: str | None = None
+    """Environment of the data, if the file does not name it."""
+    download: bool = False
+    """Let Minari fetch the dataset."""
+
+    def read_source(self) -> Trajectories:
+        """Read the dataset.
+
+        Raises:
+            InputError: it is missing, damaged, of another format, or of other sizes than `--env`
+                has.
+        """
+        if self.env is not None:
+            note_unknown(self.env)
+        if is_minari(self.source):
+            return read_minari(self.source, self.env, self.download)
+        return read_d4rl(Path(self.source), self.env)
 
 
-def list_cells(
-    options: argparse.Namespace, budget: Budget, cells: Callable[[Path, Budget], Iterator[Cell]]
-) -> Iterator[Cell]:
-    """The cells of the folder of the data and of `budget` with the files, seeds and contexts of the
-    options.
+class ControlGridOptions(GridOptions):
+    """The data of a benchmark, how much of it is measured, and where its rows are."""
 
-    Raises:
-        InputError: no folder is given, or `--seeds` is below 1.
-    """
-    if options.data is None:
-        raise InputError(
-            "name the folder of the HDF5 files with --data, or give --show-only for the rows that "
-            "are there"
+    data: Annotated[Path | None, "FOLDER"] = None
+    """Folder of the HDF5 files."""
+    context: Annotated[Sequence[tuple[str, int]], context_given, "METHOD=STEPS"] = ()
+    """Steps of history of a method; repeatable (default: the budget's)"""
+    budget: Literal["small", "medium", "full"] = "small"
+    """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
+    times the windows; about 20 core hours for the main table), full (the steps, seeds and episodes
+    of the papers)"""
+    seeds: Annotated[int | None, "N"] = None
+    """Training seeds of every method, from 0 (default: set by --budget)"""
+    out: Path = Path("runs/control")
+    """Folder for logs, stores, runs and result rows; resumed."""
+    workers: int = 1
+    """Parallel processes, one thread each."""
+
+    def require_data(self) -> Path:
+        """The folder of the HDF5 files.
+
+        Raises:
+            InputError: no folder is given.
+        """
+        if self.data is None:
+            raise InputError(
+                "name the folder of the HDF5 files with --data, or give --show-only for the rows "
+                "that are there"
+            )
+        return self.data
+
+    def narrow_budget(
+        self, budget: Budget, files: Sequence[str] = (), evaluation_seed: int | None = None
+    ) -> Budget:
+        """`budget` with the seeds and contexts of the options.
+
+        Raises:
+            InputError: `--seeds` is below 1.
+        """
+        budget = budget.narrow(files, self.seeds, evaluation_seed=evaluation_seed)
+        return set_contexts(budget, dict(self.context))
+
+
+class SuiteOptions(ControlGridOptions):
+    """Options that select what a suite measures."""
+
+    file: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this file; repeatable (default: all of the budget)"""
+    method: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this method; repeatable (default: all of the budget)"""
+    evaluation_seed: Annotated[int | None, SEED, "SEED"] = None
+    """Seed of the evaluated episodes; the same for every training seed (default: set by
+    --budget)"""
+
+    def make_suite_rows(
+        self,
+        suite: str,
+        table: str,
+        how: Measurement,
+        list_cells: Callable[[Path, Path, Budget, Sequence[str]], Iterable[Cell]],
+        describe: str = "",
+    ) -> list[ResultRow]:
+        """The rows that a command shows, as `GridOptions.make_rows`.
+
+        Args:
+            table: the one that is measured and shown; "" for all of the suite.
+            list_cells: lists the cells of data, folder, budget and methods.
+        """
+        budget = budget_of(table or suite, self.budget)
+        budget = self.narrow_budget(budget, self.file, self.evaluation_seed)
+        tables = [table] if table else []
+        return self.make_rows(
+            suite,
+            tables,
+            lambda: list_cells(self.require_data(), self.out, budget, self.method),
+            how,
+            describe,
         )
-    seed = options.evaluation_seed
-    narrow = budget.narrowed(options.tasks, options.training_seeds, evaluation_seed=seed)
-    return cells(options.data, set_contexts(narrow, dict(options.contexts)))
-
-
-def read_source(options: argparse.Namespace) -> Trajectories:
-    """Read the dataset that the options of `source_options` name.
-
-    Raises:
-        InputError: it is missing, damaged, of another format, or of other sizes than `--env` has.
-    """
-    if options.env is not None:
-        note_unknown(options.env)
-    if is_minari(options.source):
-        return read_minari(options.source, options.env, options.download)
-    return read_d4rl(Path(options.source), options.env)
 
 
 def describe_source(trajectories: Trajectories) -> str:

@@ -1,23 +1,20 @@
 """`ucfrec-control reproduce`: one table or figure of the paper; resumes."""
 
-import argparse
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
-from ucfrec.commands.options import option
+from ucfrec.commands.options import ARGUMENT, Names
 from ucfrec.errors import InputError
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import latest, read_rows
+from ucfrec.results.rows import ResultRow, latest, read_rows
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT, SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.plan import robustness_cells, score_cells
 from ucfrec_control.commands.benchmark import print_scores
-from ucfrec_control.commands.options import control_grid_options, list_cells
+from ucfrec_control.commands.options import ControlGridOptions
 from ucfrec_control.commands.robustness import print_robustness
 from ucfrec_control.data.distractor import CLEAN
 
@@ -82,51 +79,46 @@ PARTS: Final[Mapping[str, Part]] = {
 is a diagram of the method."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `reproduce`."""
-    option(parser, "part", list(PARTS), "table or figure of the paper")
-    control_grid_options(parser, whole=False)
+class Reproduce(ControlGridOptions):
+    """`ucfrec-control reproduce`."""
 
+    part: Annotated[str, ARGUMENT, Names(lambda: tuple(PARTS), closed=True)]
+    """Table or figure of the paper."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control reproduce`."""
-    # matplotlib takes half a second to import
-    from ucfrec_control.figures.figures import make_figures, make_row_figures
+    def execute(self) -> None:
+        """Run `ucfrec-control reproduce`."""
+        # matplotlib takes half a second to import
+        from ucfrec_control.figures.figures import make_figures, make_row_figures
 
-    part, results = PARTS[options.part], results_given(options)
-    cells: list[Cell] = []
-    if options.show_only:
-        if part.of_runs:
-            raise InputError(f"{options.part} is drawn from its runs; leave --show-only out")
-        of_budget = [
-            row
-            for row in latest(read_rows(results))
-            if row.conditions.get("budget") == options.budget
-        ]
-        rows = [row for row in of_budget if part.has(row)]
-        if not rows:
-            raise InputError(
-                f"{results} has no rows of {options.part} with budget {options.budget}; name a "
-                "file that has them with --results"
-            )
-    else:
-        cells += list_cells(
-            options,
-            part.budget(options.budget),
-            lambda data, budget: part.cells(data, options.out, budget),
-        )
-        how = ROBUSTNESS_MEASUREMENT if part.table == ROBUSTNESS else SCORE_MEASUREMENT
-        rows = rows_of(options, "", (), lambda: cells, how, f"reproduce {options.part}")
-    pictures = options.out / options.part
-    with rows_explained(options):
-        if part.table == ROBUSTNESS:
-            print_robustness(rows)
+        part, results = PARTS[self.part], self.rows_file
+        if self.show_only and part.of_runs:
+            raise InputError(f"{self.part} is drawn from its runs; leave --show-only out")
+        robust = part.table == ROBUSTNESS
+        budget = self.narrow_budget(part.budget(self.budget))
+        cells: list[Cell] = []
+        if self.show_only:
+            kept = latest(read_rows(results))
+            of_budget = [row for row in kept if row.conditions.get("budget") == self.budget]
+            rows = [row for row in of_budget if part.has(row)]
+            if not rows:
+                raise InputError(
+                    f"{results} has no rows of {self.part} with budget {self.budget}; name a "
+                    "file that has them with --results"
+                )
         else:
-            print_scores(rows, part.table)
-        if part.of_runs:
-            runs = [cell.run for cell in cells if cell.run is not None]
-            files, _ = make_figures(runs, [], pictures)
-        else:
-            files = make_row_figures(rows, pictures)
-    print("\n".join(["", *map(str, files)]))
-    print(f"\nrows: {results}")
+            cells += part.cells(self.require_data(), self.out, budget)
+            how = ROBUSTNESS_MEASUREMENT if robust else SCORE_MEASUREMENT
+            rows = self.make_rows("", (), lambda: cells, how, f"reproduce {self.part}")
+        pictures = self.out / self.part
+        with self.explain_rows():
+            if robust:
+                print_robustness(rows)
+            else:
+                print_scores(rows, part.table)
+            if part.of_runs:
+                runs = [cell.run for cell in cells if cell.run is not None]
+                files, _ = make_figures(runs, [], pictures)
+            else:
+                files = make_row_figures(rows, pictures)
+        print("\n".join(["", *map(str, files)]))
+        print(f"\nrows: {results}")

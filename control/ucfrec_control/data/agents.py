@@ -21,7 +21,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec_control.data.d4rl import first_line

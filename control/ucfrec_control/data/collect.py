@@ -13,8 +13,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
-from ucfrec.acting.rollout import Actor, Step, rollout
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json

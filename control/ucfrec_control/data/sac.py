@@ -15,7 +15,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from pydantic import Field
 
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file

@@ -14,10 +14,9 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.provenance import config_hash, provenance
-from ucfrec.results.row import ResultRow
-from ucfrec.results.statistics import summary
+from ucfrec.results.rows import ResultRow
+from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
 from ucfrec.runs.screened import without_columns
 from ucfrec.runs.start import training_views

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from ucfrec.benchmark.cells import Method, augmented_ucf
+from ucfrec.benchmark.cells import Method, make_augmented_ucf
 
 PLAIN: Final = ("policy.exposure=false", "rule.choose=false")
 """Settings of a policy without the shared components: the best item at the largest training
@@ -62,26 +62,26 @@ METHODS: Final[Mapping[str, Method]] = {
     **{name: _extend(method, PLAIN, False) for name, method in PEERS.items()},
     **{f"{name}+shared": _extend(method, SHARED, False) for name, method in PEERS.items()},
     **PAPER,
-    "ucf-plain": augmented_ucf(*PLAIN, vectors=False),
+    "ucf-plain": make_augmented_ucf(*PLAIN, vectors=False),
     "ucf-wo-count": Method("ucf"),
     "ucf-wo-arch": Method("dt", ("augment.copies=1", *SHARED)),
-    "ucf": augmented_ucf(),
+    "ucf": make_augmented_ucf(),
 }
 """Methods by their name in the tables. A policy's name stands for it as its authors have it,
 `+shared` for it with `SHARED`. UCF has these components by default, `ucf-plain` lacks them.
 `ucf-wo-count` and `ucf-wo-arch` are Table 3's ablations of `ucf`."""
 COMPONENTS: Final[Mapping[str, Method]] = {
-    "ucf-wo-exposure": augmented_ucf("policy.exposure=false", vectors=False),
-    "ucf-wo-reward-weight": augmented_ucf(
+    "ucf-wo-exposure": make_augmented_ucf("policy.exposure=false", vectors=False),
+    "ucf-wo-reward-weight": make_augmented_ucf(
         "rule.reward_weights=[0]", "rule.lookaheads=[0]", vectors=False
     ),
-    "ucf-wo-lookahead": augmented_ucf("rule.lookaheads=[0]", vectors=False),
-    "ucf-wo-policy": augmented_ucf("rule.policy_weights=[0]", vectors=False),
-    "ucf-wo-rule": augmented_ucf("rule.choose=false", vectors=False),
-    "ucf-weights": augmented_ucf("policy.advantage_weights=true"),
-    "ucf-max-return": augmented_ucf("policy.max_return=true"),
+    "ucf-wo-lookahead": make_augmented_ucf("rule.lookaheads=[0]", vectors=False),
+    "ucf-wo-policy": make_augmented_ucf("rule.policy_weights=[0]", vectors=False),
+    "ucf-wo-rule": make_augmented_ucf("rule.choose=false", vectors=False),
+    "ucf-weights": make_augmented_ucf("policy.advantage_weights=true"),
+    "ucf-max-return": make_augmented_ucf("policy.max_return=true"),
     "ucf-actions": Method("ucf", ("augment.actions=2",), vectors=False),
-    "ucf-both": augmented_ucf("augment.actions=2", vectors=False),
+    "ucf-both": make_augmented_ucf("augment.actions=2", vectors=False),
 }
 """UCF without one of the shared components, or with another one, by their name in the table
 `shared`. `ucf-wo-policy` has policy weight 0 wherever it looks ahead."""

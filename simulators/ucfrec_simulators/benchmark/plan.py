@@ -8,8 +8,7 @@ from itertools import product
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Cell, Method, Task, augmented_ucf
-from ucfrec.benchmark.plan import Plan, folder_name
+from ucfrec.benchmark.cells import Budget, Cell, Method, Plan, Task, folder_name, make_augmented_ucf
 from ucfrec.benchmark.suite import BenchmarkRequest
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_simulators import sardine
@@ -85,7 +84,7 @@ class RecommendationCells:
     def _main(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
         if log == 0:
-            yield from self._plan.built_in("main", task, METHODS)
+            yield from self._plan.list_built_in("main", task, METHODS)
         yield from self._list_trained("main", METHODS, task, log)
 
     def _sweeps(self, task: Task, log: int) -> Iterator[Cell]:
@@ -96,7 +95,7 @@ class RecommendationCells:
             **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
             **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
         }
-        methods = {f"ucf, {name}": augmented_ucf(s) for name, s in sweeps.items()}
+        methods = {f"ucf, {name}": make_augmented_ucf(s) for name, s in sweeps.items()}
         yield from self._list_trained("sweeps", {**methods, **PAPER}, task, log)
 
     def _distractor(self, task: Task, log: int) -> Iterator[Cell]:
@@ -123,14 +122,14 @@ class RecommendationCells:
         for quantile, variant in product(DISTRACTOR_TARGETS, both):
             evaluation = replace(self._budget.evaluation, target_quantile=quantile)
             conditions = {"quantiles": f"{quantile:g}"}
-            yield from self._plan.trained(
+            yield from self._plan.list_trained(
                 "distractor", variant, DISTRACTOR_METHODS, evaluation, conditions
             )
 
     def _list_trained(
         self, table: str, methods: Mapping[str, Method], task: Task, log: int
     ) -> Iterator[Cell]:
-        return self._plan.trained(table, task, methods, conditions={"quantiles": "rule"})
+        return self._plan.list_trained(table, task, methods, conditions={"quantiles": "rule"})
 
     def _task(self, name: str, log: int) -> Task:
         if (name, log) not in self._tasks:

@@ -11,7 +11,7 @@ import pyarrow as pa
 from ucfrec.benchmark.cells import Task
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin

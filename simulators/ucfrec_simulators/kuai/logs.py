@@ -12,7 +12,7 @@ from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import engine
-from ucfrec.logs.tables import glob_pattern, text
+from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.schema import SESSION_ID
 from ucfrec_simulators.kuai.environment import ExitRule, KuaiEnv
 
@@ -29,7 +29,7 @@ def window(files: Sequence[Path], time: str, where: str) -> pa.Table:
     Raises:
         InputError: no row is in the window.
     """
-    names = ", ".join(text(glob_pattern(file)) for file in files)
+    names = ", ".join(quote(glob_pattern(file)) for file in files)
     reader = "read_parquet" if files[0].suffix == ".parquet" else "read_csv"
     key = f"{USER}, {VIDEO}, {time}"
     with engine(files, Path(gettempdir())) as connection:

@@ -19,8 +19,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from ucfrec.acting.rollout import Actor, Step, rollout
-from ucfrec.acting.uniform import Memoryless, Uniform
+from ucfrec.acting.rollout import Actor, Memoryless, Step, Uniform, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors

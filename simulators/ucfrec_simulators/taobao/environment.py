@@ -9,8 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actor
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Actor, Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec_simulators.behaviors import Blend, Rule, SessionMixture, repeat_action

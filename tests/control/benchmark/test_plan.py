@@ -13,7 +13,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import read_rows
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of

@@ -19,13 +19,11 @@ from tests.support.control_files import (
 from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Evaluation, opened
-from ucfrec.counterfactual.measured_reward import MeasurementConfig
-from ucfrec.counterfactual.screening import ScreeningConfig, screen
+from ucfrec.benchmark.cells import Budget, Evaluation, open_store
+from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import training_views
@@ -37,6 +35,7 @@ from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.distractor import DISTRACTORS, add_distractor
 from ucfrec_control.figures.figures import make_figures
 from ucfrec_control.training.evaluate import evaluate_run
+from ucfrec_control.training.screening import ScreeningConfig, screen_states
 from ucfrec_control.training.train import train_control
 
 
@@ -110,14 +109,14 @@ def begin(
     monkeypatch.setattr(plan, "DISTRACTORS", kinds)
     write_hdf5(tmp_path / f"{MADE}.hdf5", screenable())
     # Begun here, where screening may be made quick, and gone on with by the command.
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
     runs, stages = {}, SharedStages(tmp_path / "stages")
     for cell in plan.robustness_cells(tmp_path, out, budget):
         assert cell.run is not None
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
             train_control(
-                opened(cell), cell.run, cell.config, screening=cell.screening, shared=stages
+                open_store(cell), cell.run, cell.config, screening=cell.screening, shared=stages
             )
     return runs
 
@@ -179,7 +178,7 @@ def test_training_with_screening_records_and_resumes(
 ) -> None:
     # Predictors this small reach no larger share of the reward.
     config = replace(QUICK, hidden=8, min_reward_r2=0.5)
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: config)
+    monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: config)
     store, run = tmp_path / "store", tmp_path / "run"
     control("prepare", write_hdf5(tmp_path / "hopper.hdf5", screenable()), "--out", store)
     command = ("train", store, "--out", run, "--policy", "bc", "--screen", "copies")
@@ -201,6 +200,6 @@ def test_the_distractor_is_flagged_and_no_true_dimension(tmp_path: Path) -> None
     read = read_d4rl(data_folder("control") / "hopper_medium-zoo.hdf5")
     store = add_distractor(read.write_store(tmp_path / "clean"), tmp_path / "store")
     config = ScreeningConfig(hidden=128, shared_steps=700, own_steps=250, max_transitions=50_000)
-    report = screen(training_views(store)[0], config, seed=0)
+    report = screen_states(training_views(store)[0], config, seed=0)
     assert report.flagged == (11,)
     assert store.record.columns[schema.OBSERVATION] == [12]

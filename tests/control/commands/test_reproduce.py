@@ -7,7 +7,7 @@ import pytest
 from tests.support.control_files import TINY, control, refused, write_made
 from tests.support.result_rows import result_row
 from ucfrec.benchmark.cells import Budget, Evaluation
-from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec.results.rows import append_rows, read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
 from ucfrec_control.commands.reproduce import PARTS

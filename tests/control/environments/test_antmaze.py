@@ -21,12 +21,11 @@ from tests.support.control_files import (
     set_options,
     write_hdf5,
 )
-from ucfrec.acting.rollout import rollout
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari

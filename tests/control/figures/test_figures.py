@@ -10,12 +10,12 @@ import torch
 
 from tests.support.control_files import TINY, control, set_options, write_made
 from tests.support.result_rows import result_row
+from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import append_rows
 from ucfrec_control.benchmark.robustness import drops
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.figures.figures import HIGHS, LOWS, NEEDS, make_figures
@@ -127,14 +127,12 @@ def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, k
 
 def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
     run = runs / "tangent"
-    store, overlay = (
-        EpisodeStore.open(runs.parent / "store"),
-        Overlay.load(run / "overlay.safetensors"),
-    )
-    at = overlay.copy_source[overlay.edit_copy], overlay.edit_step
+    store = EpisodeStore.open(runs.parent / "store")
+    copies = AugmentedEpisodes.load(run / "augmented.safetensors", store)
+    at = copies.copy_source[copies.edit_copy], copies.edit_step
     factual = store.windows(*at, 1).states[:, 0]
     std = store.split("train").state_statistics[1]
-    lengths = ((torch.from_numpy(overlay.edit_state) - factual) / std).norm(dim=1).numpy()
+    lengths = ((torch.from_numpy(copies.edit_state) - factual) / std).norm(dim=1).numpy()
     edges, counts, band = diagnostics.move_histogram(run)
     assert band == (0.2, 0.5)
     assert sum(counts) == len(lengths)
@@ -146,7 +144,7 @@ def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
     assert np.abs(shares - expected).max() <= 2 * 100 / len(lengths)
 
 
-def test_the_overlay_shows_the_widest_direction_first(runs: Path) -> None:
+def test_the_edits_show_the_widest_direction_first(runs: Path) -> None:
     factual, edited = diagnostics.edit_states(runs / "tangent")
     assert 0.19 < np.linalg.norm(edited - factual, axis=1).mean() < 0.5
     (axes,) = plots.state_overlay(factual, edited).axes

@@ -15,8 +15,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.processes import random_state_kept
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import TABLES
 from ucfrec_control.benchmark.plan import score_cells

@@ -12,8 +12,7 @@ import pytest
 from tests.support.control_files import MADE, TINY, control, refused, set_options, write_made
 from tests.support.real_data import data_folder
 from ucfrec import schema
-from ucfrec.acting.rollout import rollout
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
@@ -21,7 +20,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.policies.registry import BUILT_IN
-from ucfrec.results.rows_file import read_results, read_rows
+from ucfrec.results.rows import read_results, read_rows
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.benchmark.budgets import BUDGETS, ZOO
 from ucfrec_control.benchmark.methods import METHODS, TABLES

@@ -1,0 +1,480 @@
+"""Which rows of a log count, and in which order: one rule for files, frames and requests.
+
+One ORDER BY, then one pass: the SQL is run by DuckDB or by Spark and means the same to both, and
+what follows compares a row with the one before.
+
+Rows of one user at one time, such as a page that was logged at once or a log of days, have no order
+that could be learned: theirs is that of a hash of user, time and item. Any other order, such as
+that of the ids, is one that a policy predicts.
+"""
+
+import hashlib
+import io
+import mmap
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.errors import InputError
+from ucfrec.logs.engine import to_numpy
+from ucfrec.logs.tables import MAX_FLOAT, glob_pattern, quote
+from ucfrec.logs.typed import ROWS, WANTED, TypedLog, not_finite
+
+USER, ITEM, SESSION = "user_code", "item_code", "session"
+"""Columns of the sorted rows: numbers of the ids, in the order of the ids."""
+CODES: Final = {
+    schema.USER_ID: ("user_codes", USER),
+    schema.ITEM_ID: ("item_codes", ITEM),
+    schema.SESSION_ID: ("session_codes", SESSION),
+}
+"""Id column to the table of its ids, `code` and `hash`, and to the column of the sorted rows."""
+FAULTY: Final = "faulty"
+"""View of all rows, as of `mark_faults`."""
+FAULT_COUNTS: Final = f"SELECT fault, count(*) FROM {FAULTY} GROUP BY fault"
+DUPLICATES: Final = {
+    "highest": "has the highest",
+    "lowest": "has the lowest",
+    "first": "comes first in the files",
+    "last": "comes last in the files",
+}
+"""Which of several rows with the same user, item or action, and time is kept: rule to its
+description."""
+PRIME: Final = 2**31 - 1
+USER_FACTOR: Final = 7919
+HASH: Final = "CAST(conv(substr(md5(CAST({} AS STRING)), 1, 7), 16, 10) AS BIGINT)"
+"""SQL of `hash_ids`, for Spark and, where `conv` is a macro, for DuckDB."""
+TIE: Final = f"((1 + ({{}} * {USER_FACTOR} + {{}}) % {PRIME - 1}) * (1 + {{}}) % {PRIME})"
+"""SQL of the place of a row among those of one user and time, by the hash of the user, the time and
+the hash of the item. Each user and time multiply by a number of their own, modulo a prime, so that
+two items are as often in one order as in the other."""
+DAY_MS: Final = 86_400_000
+REASONS: Final = {
+    "left_out": "does not fulfil --where",
+    "null_key": "user, item or action, time or session is missing",
+    "clock_out_of_range": "time before 2000 (or --earliest, or the end of an updated store) or "
+    "more than a day ahead of now",
+    "vector_not_finite": "action is missing or holds NaN or infinity",
+    "unknown_item": "item is not in the store",
+    "duplicate": "repeats user, item or action, and time of another row, which is kept",
+    "reward_not_finite": "reward is missing, NaN or infinite",
+}
+"""Reason to its description; a row is dropped for the first reason that applies."""
+
+
+class RowVectors:
+    """The observation of every row of a log, in a file or in memory.
+
+    Long rows are not sorted: where a row was in the files, its observation is read at the end.
+    """
+
+    def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
+        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation`.
+
+        Args:
+            size: of an observation.
+        """
+        rows, self._file, memory = 0, file, io.BytesIO()
+        with memory if file is None else file.open("xb") as out:
+            for batch in batches:
+                places = to_numpy(batch.column("row"))
+                # What is at the place of a row must be its own: the engine keeps their order.
+                assert np.array_equal(places, np.arange(rows + 1, rows + 1 + len(places)))
+                values = to_numpy(batch.column(schema.OBSERVATION).flatten())
+                out.write(np.ascontiguousarray(values).data)
+                rows += len(places)
+            self._memory = memory.getvalue()
+        self._shape = rows, size
+
+    def of_rows(self, rows: IntArray) -> Float32Array:
+        """(M, O) observations of the rows at the positions (M,), from 1."""
+        if self._file is None:
+            return np.frombuffer(self._memory, np.float32).reshape(self._shape)[rows - 1]
+        # Mapped anew each time: mapped pages count as the memory of a process that must keep to a
+        # limit.
+        mapped: np.memmap[Any, np.dtype[np.float32]] = np.memmap(
+            self._file, np.float32, "r", shape=self._shape
+        )
+        if hasattr(mmap, "MADV_RANDOM"):  # neighbours in the file are hardly ever so in the order
+            mapped._mmap.madvise(mmap.MADV_RANDOM)  # type: ignore[attr-defined]
+        return np.array(mapped[rows - 1])
+
+
+class RowFile:
+    """Batches of rows, column by column, in a scratch folder or in memory."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """Make the folder of the files; None for memory."""
+        if folder is not None:
+            folder.mkdir()
+        self._folder = folder
+        self._memory: list[dict[str, Array]] = []
+        self._batches = 0
+
+    def append(self, batch: dict[str, Array]) -> None:
+        """Append rows, the same columns every time."""
+        self._batches += 1
+        if self._folder is None:
+            self._memory.append(batch)
+            return
+        for name, values in batch.items():
+            with (self._folder / name).open("ab") as file:
+                np.save(file, values)
+
+    def read(self, *names: str) -> Iterator[dict[str, Array]]:
+        """Some columns of the batches, or all, in order."""
+        if self._folder is None or not self._batches:
+            yield from self._memory
+            return
+        with ExitStack() as stack:
+            files = {
+                path.name: stack.enter_context(path.open("rb"))
+                for path in self._folder.iterdir()
+                if path.name in names or not names
+            }
+            for _ in range(self._batches):
+                yield {name: np.load(file) for name, file in files.items()}
+
+
+@dataclass
+class SortedRows:
+    """The usable rows of a log, and what was found on the way."""
+
+    log: TypedLog
+    file: RowFile
+    """The rows in order of user and time, all of a user in one batch: `USER`, `ITEM` or `action`,
+    `timestamp`, `reward` (float64), `row` (position in the files) and, if the log has them,
+    `SESSION` (with sessions by session_id), `propensity` (NaN if unknown) and `is_random`."""
+    observations: RowVectors | None
+    dropped: dict[str, int]
+    """Number of dropped rows by reason."""
+    read: int
+    """Number of rows; those below are of usable ones: no duplicates, with a finite reward."""
+    count: int = 0
+    conflicts: int = 0
+    """Number of duplicates with another reward than the row that counts."""
+    tied: int = 0
+    """Number of rows that share their user and time."""
+    unsorted: int = 0
+    """Number of rows that are in the files before the row that precedes them in time."""
+    first_ms: int = np.iinfo(np.int64).max
+    last_ms: int = 0
+    """Times of the earliest and the latest row."""
+    lowest: float = np.inf
+    highest: float = -np.inf
+    """Rewards."""
+    large: int = 0
+    """Number of rewards that are too large to train with."""
+
+    def add(self, batch: dict[str, Array], duplicates: str, by_session: bool) -> None:
+        """Add rows as of `order_rows`, all of their users; leave out duplicates, undefined rewards.
+
+        Args:
+            by_session: whether the rows of a session follow each other, as sessions of one user may
+                overlap.
+        """
+        keys = (USER, schema.TIMESTAMP, ITEM if ITEM in batch else schema.ACTION)
+        repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
+        if repeated.any():
+            batch = self._put_winners_first(batch, repeated, duplicates)
+            winners = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(repeated))))
+            rewards = batch[schema.REWARD]
+            lost, counted = rewards[repeated], rewards[winners[repeated]]
+            equal = (lost == counted) | (np.isnan(lost) & np.isnan(counted))
+            self.conflicts += int(np.count_nonzero(~equal))
+            self.dropped["duplicate"] += len(lost)
+        undefined = np.isnan(batch[schema.REWARD]) & ~repeated
+        self.dropped["reward_not_finite"] += int(np.count_nonzero(undefined))
+        usable = ~(repeated | undefined)
+        if not usable.all():
+            batch = {name: values[usable] for name, values in batch.items()}
+        if not usable.any():
+            return
+        times, rewards, rows = (batch[n] for n in (schema.TIMESTAMP, schema.REWARD, "row"))
+        same_user = _equal_before(batch[USER])
+        tied = np.concatenate([[False], same_user & _equal_before(times), [False]])
+        self.tied += int(np.count_nonzero(tied[1:] | tied[:-1]))
+        moved = same_user & (times[1:] > times[:-1]) & (rows[1:] < rows[:-1])
+        self.unsorted += int(np.count_nonzero(moved))
+        self.count += len(times)
+        self.first_ms = min(self.first_ms, int(times.min()))
+        self.last_ms = max(self.last_ms, int(times.max()))
+        self.lowest = min(self.lowest, float(rewards.min()))
+        self.highest = max(self.highest, float(rewards.max()))
+        self.large += int(np.count_nonzero(np.abs(rewards) > schema.LARGEST_REWARD))
+        if by_session:
+            users, sessions = batch[USER], batch[SESSION]
+            # Sessions are in the order of their first times.
+            grouped = np.lexsort((sessions, users))
+            same = _equal_before(users[grouped]) & _equal_before(sessions[grouped])
+            starts = np.flatnonzero(np.append(True, ~same))
+            began = np.empty(len(users), dtype=np.int64)
+            lengths = np.diff(np.append(starts, len(users)))
+            began[grouped] = np.repeat(times[grouped][starts], lengths)
+            order = np.lexsort((sessions, began, users))
+            batch = {name: values[order] for name, values in batch.items()}
+        self.file.append(batch)
+
+    def _put_winners_first(
+        self, batch: dict[str, Array], repeated: BoolArray, duplicates: str
+    ) -> dict[str, Array]:
+        """The rows with the one that counts as the first of those that repeat the one before."""
+        places = np.flatnonzero(repeated | np.append(repeated[1:], False))
+        some = {name: values[places] for name, values in batch.items()}
+        if self.observations is not None:
+            some[schema.OBSERVATION] = self.observations.of_rows(some["row"])
+        groups = np.cumsum(~repeated)[places]
+        order = places[np.lexsort([*order_duplicates(some, duplicates), groups])]
+        ordered = {}
+        for name, values in batch.items():
+            ordered[name] = values.copy()
+            ordered[name][places] = values[order]
+        return ordered
+
+
+def _equal_before(values: Array) -> BoolArray:
+    """(M − 1,) whether each of M values but the first is equal to the one before."""
+    equal = values[1:] == values[:-1]
+    return np.asarray(equal if equal.ndim == 1 else equal.all(axis=1))
+
+
+def keep_users_whole(batches: Iterable[dict[str, Array]], user: str) -> Iterator[dict[str, Array]]:
+    """The same rows in batches that end between two users, who are in the column `user`."""
+    pending: dict[str, Array] = {}
+    for batch in batches:
+        if pending:
+            ends = np.flatnonzero(~_equal_before(pending[user]))
+            end = int(ends[-1]) + 1 if len(ends) else 0
+            if end:
+                yield {name: values[:end] for name, values in pending.items()}
+            batch = {name: np.concatenate([pending[name][end:], batch[name]]) for name in batch}
+        pending = batch
+    if pending and len(pending[user]):
+        yield pending
+
+
+def _to_columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
+    columns = {}
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        size = log.vector_size.get(name)
+        columns[name] = (
+            to_numpy(column) if size is None else to_numpy(column.flatten()).reshape(-1, size)
+        )
+    return columns
+
+
+def sort_rows(
+    log: TypedLog,
+    known_items: Path | None,
+    duplicates: str,
+    folder: Path | None,
+    by_session: bool = False,
+) -> SortedRows:
+    """Sort the rows of a log with DuckDB.
+
+    Rows with items that are not in `known_items` (`items.parquet` of a store) are dropped.
+    `duplicates` is a key of `DUPLICATES`, `folder` for scratch (None for a log in memory). With
+    `by_session`, the rows of a session follow each other. Raises InputError if a reward is too
+    large to train with.
+    """
+    connection = log.connection
+    connection.execute(f"CREATE VIEW {FAULTY} AS {mark_faults(log, ROWS, known_items)}")
+    connection.execute("CREATE MACRO conv(digits, a, b) AS CAST('0x' || digits AS BIGINT)")
+    for name, table in code_tables(log).items():
+        connection.execute(f"CREATE TABLE {table} AS {code_ids(name, ROWS)}")
+    counts = dict(connection.sql(FAULT_COUNTS).fetchall())
+
+    def read(query: str) -> Iterator[pa.RecordBatch]:
+        yield from connection.sql(query).to_arrow_reader(log.batch_rows)
+
+    observations = read(f"SELECT row, {schema.OBSERVATION} FROM {ROWS}")
+    batches = read(order_rows(log, FAULTY))
+    return check_sorted(log, counts, observations, batches, duplicates, folder, by_session)
+
+
+def code_tables(log: TypedLog) -> dict[str, str]:
+    """Id columns of the log, and the tables of `code_ids`."""
+    return {name: table for name, (table, _) in CODES.items() if name in log.columns}
+
+
+def code_ids(name: str, rows: str) -> str:
+    """SQL of the ids in a column of some typed rows: `code`, its place in their order, `hash`."""
+    return (
+        f"SELECT {name}, CAST(row_number() OVER (ORDER BY {name}) - 1 AS INTEGER) AS code, "
+        f"{HASH.format(name)} AS hash "
+        f"FROM (SELECT DISTINCT {name} FROM {rows} WHERE {name} IS NOT NULL) AS ids"
+    )
+
+
+def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
+    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1.
+
+    Actions get a hash. With `known_items`, of a store, other items are a fault.
+    """
+    keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
+    keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
+    latest = int(time.time() * 1000) + DAY_MS
+    conditions = {"left_out": f"NOT {WANTED}"} if log.has_condition else {}
+    conditions |= {
+        "null_key": " OR ".join(f"{key} IS NULL" for key in keys if key != schema.ACTION),
+        "clock_out_of_range": f"{schema.TIMESTAMP} NOT BETWEEN {log.earliest_ms} AND {latest}",
+    }
+    if schema.ACTION in log.vector_size:
+        conditions["vector_not_finite"] = not_finite(schema.ACTION)
+    if known_items is not None:
+        source = f"read_parquet({quote(glob_pattern(known_items))}, hive_partitioning = false)"
+        known_ids = f"SELECT CAST(item_id AS VARCHAR) FROM {source}"
+        conditions["unknown_item"] = f"CAST({log.key} AS VARCHAR) NOT IN ({known_ids})"
+    cases = " ".join(
+        f"WHEN {sql} THEN {list(REASONS).index(reason) + 1}" for reason, sql in conditions.items()
+    )
+    columns = [f"* EXCLUDE ({WANTED})" if log.has_condition else "*"]
+    if log.key == schema.ACTION:
+        text = f"md5(CAST({schema.ACTION} AS VARCHAR))"
+        columns.append(f"CAST('0x' || left({text}, 7) AS BIGINT) AS action_hash")
+    fault = f"CAST(CASE {cases} ELSE 0 END AS SMALLINT) AS fault"
+    return f"SELECT {', '.join(columns)}, {fault} FROM {rows}"
+
+
+def order_rows(log: TypedLog, rows: str) -> str:
+    """SQL of the rows without a fault in order of user, time, the hash of `TIE` and choice, from a
+    relation as of `mark_faults`, beside which are the tables of `code_tables`."""
+    tables = code_tables(log)
+    joins = [
+        f"{'LEFT' if name == schema.SESSION_ID else ''} JOIN {table} USING ({name})"
+        for name, table in tables.items()
+    ]
+    columns = {CODES[name][1]: f"{table}.code" for name, table in tables.items()}
+    hashed = "item_codes.hash" if schema.ITEM_ID in tables else "action_hash"
+    finite = f"abs({schema.REWARD}) <= {MAX_FLOAT}"
+    columns |= {
+        schema.TIMESTAMP: schema.TIMESTAMP,
+        "tie": f"CAST({TIE.format('user_codes.hash', schema.TIMESTAMP, hashed)} AS INTEGER)",
+        "reward": f"CASE WHEN {finite} THEN reward ELSE CAST('nan' AS DOUBLE) END",
+        "row": "row",
+    }
+    if schema.SESSION_ID in tables:
+        columns[SESSION] = f"coalesce({columns[SESSION]}, {2**31 - 1})"
+    columns |= {name: name for name in (schema.ACTION, schema.IS_RANDOM) if name in log.columns}
+    if schema.PROPENSITY in log.columns:
+        columns[schema.PROPENSITY] = f"coalesce({schema.PROPENSITY}, CAST('nan' AS FLOAT))"
+    choice = ITEM if schema.ITEM_ID in tables else schema.ACTION
+    values = ", ".join(f"{sql} AS {name}" for name, sql in columns.items())
+    names = ", ".join(name for name in columns if name != "tie")
+    return (
+        f"SELECT {names} FROM (SELECT {values} FROM {rows} AS faulty {' '.join(joins)} "
+        f"WHERE fault = 0) AS coded ORDER BY {USER}, {schema.TIMESTAMP}, tie, {choice}"
+    )
+
+
+def check_sorted(
+    log: TypedLog,
+    fault_counts: Mapping[int, int],
+    observations: Iterable[pa.RecordBatch],
+    batches: Iterable[pa.RecordBatch],
+    duplicates: str,
+    folder: Path | None,
+    by_session: bool,
+) -> SortedRows:
+    """Check the sorted rows of a log, with numbers of all rows by `fault`.
+
+    `observations` are as of `RowVectors` and read only of a log that has them, `batches` as of
+    `order_rows` and read after these. Raises InputError if a reward is too large to train with.
+    """
+    vectors = None
+    if schema.OBSERVATION in log.columns:
+        file = None if folder is None else folder / "observations.bin"
+        vectors = RowVectors(observations, log.vector_size[schema.OBSERVATION], file)
+    rows = SortedRows(
+        log,
+        RowFile(None if folder is None else folder / "rows"),
+        vectors,
+        {reason: fault_counts.get(number, 0) for number, reason in enumerate(REASONS, 1)},
+        sum(fault_counts.values()),
+    )
+    for columns in keep_users_whole((_to_columns(batch, log) for batch in batches), USER):
+        rows.add(columns, duplicates, by_session)
+    if rows.large:
+        raise InputError(
+            f"{log.tables[0].files[0]}: {rows.large:,} of {rows.count:,} rewards are beyond "
+            f"±{schema.LARGEST_REWARD:g} (up to {max(rows.highest, -rows.lowest):.3g}), too large "
+            "to train with in float32; divide them in the reward expression"
+        )
+    return rows
+
+
+def choose_rows(
+    rows: Mapping[str, Array], duplicates: str, user_id: int | str | None = None
+) -> IntArray:
+    """(K,) positions of the rows of a log in memory that count, in order of user and time.
+
+    `order_rows` and `SortedRows.add` do the same for logs of any size.
+
+    Args:
+        rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
+            (position in the log) and perhaps those of `order_duplicates`.
+        duplicates: key of `DUPLICATES`.
+        user_id: the only user, if `user` does not hold identifiers.
+    """
+    users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
+    order = np.lexsort((times, users))
+    apart = (np.diff(times[order]) > 0) | (np.diff(users[order]) != 0)
+    if apart.all():
+        return np.asarray(order[finite[order]])
+    tied = np.zeros(len(users), dtype=bool)
+    tied[order[1:]] |= ~apart
+    tied[order[:-1]] |= ~apart
+    items, ties = np.zeros((2, len(users)), dtype=np.int64)
+    ids, items[tied] = np.unique(rows[schema.ITEM][tied], return_inverse=True)
+    names, places = np.unique(users[tied], return_inverse=True)
+    of_users = hash_ids([user_id] * len(names) if user_id is not None else names.tolist())[places]
+    multiplier = 1 + np.fmod(of_users * USER_FACTOR + times[tied], PRIME - 1)
+    ties[tied] = np.fmod(multiplier * (1 + hash_ids(ids.tolist())[items[tied]]), PRIME)
+    keys = [users, times, ties, items]
+    order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    return np.asarray(order[first & finite[order]])
+
+
+def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
+    """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
+    is the first.
+
+    Columns besides `reward` and `row` decide between rows that are equal to the rule, so that the
+    order of rows and files does not matter.
+    """
+    rewards = rows[schema.REWARD]
+    finite = np.abs(rewards) <= MAX_FLOAT
+    rule = {"highest": -rewards, "lowest": rewards, "first": rows["row"], "last": -rows["row"]}
+    keys = [~finite, np.where(finite, rule[duplicates], 0)]
+    for name in (schema.OBSERVATION, schema.PROPENSITY, "session", schema.IS_RANDOM):
+        if name in rows:
+            keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
+    return keys[::-1]
+
+
+def hash_ids(ids: Sequence[object]) -> IntArray:
+    """(N,) `HASH` of the text of each identifier, below 2**28, so that 7 and '7' have one."""
+    # Text of JSON may hold half a character.
+    texts = (str(identifier).encode("utf-8", "surrogatepass") for identifier in ids)
+    digests = (hashlib.md5(text, usedforsecurity=False).hexdigest() for text in texts)
+    return np.asarray([int(digest[:7], 16) for digest in digests], dtype=np.int64)
+
+
+def mix_bits(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """The finaliser of SplitMix64: every bit of the result depends on all of a value, and different
+    values have different results."""
+    values = values + np.uint64(0x9E3779B97F4A7C15)
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))

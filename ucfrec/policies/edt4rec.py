@@ -17,7 +17,7 @@ from ucfrec import schema
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Exposed, Transitions, Windows
+from ucfrec.episodes.windows import Transitions, Windows
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.policies.base import Context, PolicyConfig, Returns, standardise
 from ucfrec.policies.dt import DTConfig, DTPolicy

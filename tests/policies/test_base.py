@@ -19,8 +19,8 @@ from tests.policies.test_ucf import (
 )
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Exposed
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import SequencePolicy

@@ -11,7 +11,7 @@ import torch
 from tests.support.logs import store_of
 from tests.support.tagged import tagged_store
 from ucfrec.commands.cli import main
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.policies.baselines import (

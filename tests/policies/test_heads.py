@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from tests.policies.test_ucf import VECTORS, K, random_windows
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness
+from ucfrec.episodes.exposure import ExposureTerm, Likeness
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.policies import heads
 from ucfrec.policies.heads import (
     BEST,

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.sessions import Sessions
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.convformers import LSDTConfig, LSDTPolicy

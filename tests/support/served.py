@@ -15,7 +15,8 @@ import torch
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.windows import Shown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tests.support.episodes import N_ITEMS, Logged, some_states, write_store
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 
 LAGS = 10

@@ -10,7 +10,7 @@ from sklearn.gaussian_process.kernels import DotProduct
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.reward import ItemRewardModel, UserPosterior, _solution, root_of_tastes
 
 ITEMS, USERS, STATE, DIM = 30, 5, 6, 4

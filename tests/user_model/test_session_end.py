@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.session_end import (
     BoostedTrees,
     LoggedEnds,

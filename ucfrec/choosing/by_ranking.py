@@ -19,9 +19,9 @@ from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
-from ucfrec.episodes.sessions import Sessions, seen_before
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.progress import progress
 from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import draw_steps

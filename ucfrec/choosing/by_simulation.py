@@ -30,9 +30,8 @@ from ucfrec.choosing.choice import (
     SimulatedRule,
     ValueEstimate,
 )
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.progress import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions

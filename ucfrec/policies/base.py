@@ -11,10 +11,9 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
 from ucfrec.settings import Dropout, Width, require, settings_table

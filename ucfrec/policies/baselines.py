@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -388,7 +388,7 @@ class BPRPolicy(SequencePolicy):
         return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
 
     def _find_liked(self, windows: Windows) -> Tensor:
-        """(B, K) 1 at liked steps, as of `ucfrec.episodes.item_counts`, otherwise 0."""
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
         least = least_liked(self.reward_low, self.reward_high)
         return ((windows.rewards >= least) & windows.mask).float()
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, columns_of
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.exposure import ExposureTerm, Likeness, columns_of
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.fitting.distributed import joint_moments
 
 EXPOSURE_KNOTS = 6

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory

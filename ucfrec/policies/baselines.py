@@ -100,11 +100,7 @@ class PopularPolicy(SequencePolicy):
     def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
-        """Sets the biases, unless settings add something to learn.
-
-        Raises:
-            InputError: likes of actions that are vectors.
-        """
+        """Sets the biases, unless settings add something to learn; likes are of items only."""
         config, head = self.config, self.head
         if self.scored_by != "steps":
             if isinstance(head, ItemHead):
@@ -165,10 +161,7 @@ class PopularPolicy(SequencePolicy):
 
 
 class ItemRatePolicy(PopularPolicy):
-    """`PopularPolicy` by the rate of likes.
-
-    With a tag window of the decision rule, it is the baseline "item click rate with a tag mask".
-    """
+    """`PopularPolicy` by the rate of likes; with a tag window, a usual baseline."""
 
     scored_by = "rate"
 
@@ -196,11 +189,8 @@ class RecentClicksPolicy(RecentRatePolicy):
 
 
 def shrink_rates(counts: TrainingCounts) -> Tensor:
-    """Share of each item's training steps that were liked, (n_items,), shrunk to the mean share.
-
-    `PRIOR` steps at the mean are added to every item, and half a step to both outcomes of the mean,
-    so that no rate is 0 or 1.
-    """
+    """Share of each item's training steps that were liked, (n_items,), with `PRIOR` steps at the
+    mean, which has half a step of both outcomes more, so that no rate is 0 or 1."""
     impressions, liked = counts.shown.double(), counts.liked.double()
     mean = (liked.sum() + 0.5) / (impressions.sum() + 1)
     rates: Tensor = (liked + PRIOR * mean) / (impressions + PRIOR)
@@ -210,12 +200,8 @@ def shrink_rates(counts: TrainingCounts) -> Tensor:
 def count_decayed(
     train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_rewards
 ) -> TrainingCounts:
-    """Counts of shown and liked steps, float64, in which older steps count less.
-
-    Args:
-        train: a view of a store of items.
-        half_life: hours; infinite, or without times in the store, all steps count alike.
-    """
+    """Counts of shown and liked steps, float64, that halve with every half-life (hours) of their
+    age; if it is infinite, or the store has no times, all steps count alike."""
     n_items = len(train.item_states.embeddings)
     impressions, liked = np.zeros(n_items), np.zeros(n_items)
     timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
@@ -305,10 +291,7 @@ class ItemKNNPolicy(SequencePolicy):
         self.temperature.fill_((low + high) / 2)
 
     def features(self, windows: Windows) -> Tensor:
-        """Cosines to the earlier items, summed with their rewards as weights, (B, K, n_items).
-
-        Windows must not be normalised.
-        """
+        """Cosines to the earlier items, summed by rewards, (B, K, n_items), of raw windows."""
         weights = (windows.rewards - self.reward_low) * windows.mask
         weighted = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
         scores = weighted.new_zeros(*windows.mask.shape, len(self.cosines))
@@ -317,12 +300,7 @@ class ItemKNNPolicy(SequencePolicy):
         return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
 
     def similarity(self, items: Tensor, rewards: Tensor) -> Tensor:
-        """Cosines to some items, summed with their rewards as weights, (B, n_items).
-
-        Args:
-            items: (B, N) int64; −1 for none.
-            rewards: (B, N) of these, in reward units.
-        """
+        """Cosines to items (B, N), −1 for none, summed by their rewards (B, N), (B, n_items)."""
         weights = (rewards - self.reward_low) * (items >= 0)
         items = items.clamp(min=0)
         weighted = (self.cosines[items] * weights.unsqueeze(-1)).flatten(1)

@@ -136,13 +136,9 @@ class BoostedPolicy(SequencePolicy):
         return torch.logit((liked + PRIOR * mean) / (impressions + PRIOR))
 
     def _inputs(self, windows: Windows, items: Tensor, counts: Tensor | None = None) -> Tensor:
-        """Inputs (B, C, F) of the trees for C items at the windows' last steps.
-
-        Args:
-            windows: B windows; their last action and reward are not read.
-            items: (C,), or (B, C) int64.
-            counts: (2, B, C) how often the items were shown and liked; None for all training rows.
-        """
+        """Inputs (B, C, F) of the trees for items (C,) or (B, C) at the windows' last steps, whose
+        action and reward are not read; counts (2, B, C) of shown and liked ones, or None for all
+        rows."""
         valid = windows.mask[:, :-1].float()  # (B, N)
         earlier, rewards = windows.actions[:, :-1], windows.rewards[:, :-1]
         liked = valid * (rewards >= least_liked(self.reward_low, self.reward_high))

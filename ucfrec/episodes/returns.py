@@ -61,16 +61,13 @@ class ReturnToGo:
         return np.asarray(ahead < reach, dtype=np.float64)
 
     def of_logs(self, rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
-        """Returns-to-go of logged episodes.
+        """Returns-to-go (N,) of logged episodes; summed in float64, rounded to float32.
 
         Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5] for `session`.
 
         Args:
             rewards: (N,) rewards of all episodes, concatenated.
             offsets: (E + 1,) index of the first step of each episode, followed by N.
-
-        Returns:
-            (N,) in reward units; summed in float64, rounded to float32.
         """
         if self.definition == "discounted":
             return _discounted(rewards, offsets, self.discount)
@@ -84,12 +81,8 @@ class ReturnToGo:
         return _rest(before, offsets)
 
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
-        """Target returns at the next step, (B,) float64, in reward units.
-
-        Args:
-            target: of the session if `per_session`, otherwise of every step.
-            collected: (B,) sum of the rewards earlier in the session.
-        """
+        """Target returns (B,) float64 at the next step, in reward units, of a `target` of the
+        session if `per_session`, otherwise of every step; `collected` (B,) before it."""
         # Checking a log needs this module, but not the seconds that importing torch takes.
         import torch
 
@@ -97,17 +90,11 @@ class ReturnToGo:
         return whole - collected if self.per_session else whole
 
     def before(self, targets: "Tensor", rewards: "Tensor") -> "Tensor":
-        """Returns-to-go of all steps of a window, given the target return at its last step.
+        """Returns-to-go (B, K) float32 of windows with target returns (B,) at their last steps.
 
         Earlier steps count the rewards that followed them, then the target return: the numbers that
-        training would show if the rest of the session returned exactly that.
-
-        Args:
-            targets: (B,) at the last step.
-            rewards: (B, K) of the windows' steps, 0 at padding; the last column is not used.
-
-        Returns:
-            (B, K) float32.
+        training would show if the rest of the session returned exactly that. The last column of the
+        rewards (B, K), 0 at padding, is not used.
         """
         import torch
 

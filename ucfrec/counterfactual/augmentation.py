@@ -99,13 +99,11 @@ class MoveReport:
     """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
 
     edits: int
-    """Number of accepted edits."""
     length_quantiles: dict[str, float]
     """Quantiles of ‖Δ‖₂ by level; empty without edits."""
     histogram_edges: tuple[float, ...]
     """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
     histogram_counts: tuple[int, ...]
-    """Number of edits in each bin."""
     mean_move_ratio: Undefinable
     """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
@@ -119,9 +117,8 @@ class ActionReport:
     """Other actions that were proposed, and their counterfactual rewards."""
 
     proposals: int
-    """Number of other actions proposed."""
     reproduced: float
-    """Share of them at steps whose logged reward the reward model reproduces within ε_r."""
+    """Share of the proposals at steps whose logged reward the model reproduces within ε_r."""
     copies: int
     """Number of action copies: those that, at such steps, change the reward by more than δ."""
     mean_change: Undefinable
@@ -137,11 +134,9 @@ class AugmentationReport:
     copies: int
     """Number of augmented episodes."""
     proposals: int
-    """Number of proposed edits."""
     acceptance: float
     """Share of proposals that passed both gates."""
     moves: MoveReport
-    """Statistics of the accepted edits."""
     epsilon_r: float
     """Tolerance of the reward gate, in reward units."""
     delta: float
@@ -151,10 +146,8 @@ class AugmentationReport:
     verdict: str
     """A sentence on whether the bound is informative."""
     warnings: tuple[str, ...]
-    """Warnings of a reward model that predicts nothing, latent collapse, latent leak and edit
-    collapse."""
+    """Of a reward model that predicts nothing, latent collapse, latent leak and edit collapse."""
     reward_model: CRMReport
-    """Quality of the reward model."""
     actions: ActionReport | None = None
     """Action copies; None if no other action was proposed."""
 
@@ -231,12 +224,8 @@ def augment_episodes(
 def find_candidates(
     view: EpisodeStore, config: AugmentConfig, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes.
-
-    Args:
-        view: the training episodes.
-        rng: draws episodes if there are too many steps.
-    """
+    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes, which are
+    drawn if there are too many steps."""
     order = rng.permutation(view.n_episodes)
     count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
     sampled = np.sort(order[: max(1, int(count))])
@@ -265,13 +254,8 @@ def edit_states(
     seed: int,
     item_rewards: ItemRewardModel | None = None,
 ) -> tuple[AugmentedEpisodes, AugmentationReport]:
-    """Copy episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`).
-
-    Args:
-        view: the training episodes.
-        config: numbers of copies and edits, and the gate.
-        item_rewards: see `read_transitions`.
-    """
+    """Copy training episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`);
+    `item_rewards` is that of `read_transitions`."""
     rng, random = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     # The gates are evaluated in float64 on the stored float32 values, so that a later check of the
     # edits confirms every one.
@@ -338,17 +322,12 @@ def accept(
     epsilon_r: float,
     rho_high: float,
 ) -> Tensor:
-    """Which proposals pass both gates of Eq. 4 (Algorithm 4).
+    """Which proposals (M, S) pass both gates of Eq. 4 (Algorithm 4), (M,) bool.
 
     Args:
-        factual: M logged steps.
-        z: (M, latent_dim) disturbances abduced from them.
-        proposals: (M, S) counterfactual states.
+        factual: M logged steps, from which z (M, latent_dim) is abduced.
         epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
         rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
-
-    Returns:
-        (M,) bool.
     """
     change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
     length = crm.moves(factual.states, proposals).norm(dim=1)
@@ -403,11 +382,8 @@ class MoveStatistics:
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0.
-
-        Args:
-            rho_high: upper end of the histogram of lengths.
-        """
+        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0. The
+        histogram of lengths ends at `rho_high`."""
         lengths = torch.cat(self._lengths).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
         levels = _QUANTILES if len(lengths) else ()

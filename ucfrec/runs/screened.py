@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ucfrec.counterfactual.augmentation import interventions
-from ucfrec.counterfactual.screening import MeasurementConfig, ScreeningReport, screen
+from ucfrec.counterfactual.screening import ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
@@ -33,7 +33,7 @@ def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
     Raises:
         InputError: as `ucfrec.counterfactual.screening.screen`.
     """
-    return screen(training_views(store)[0], MeasurementConfig(), seed)
+    return screen(training_views(store)[0], seed)
 
 
 def train_screened(

@@ -14,7 +14,7 @@ not help to predict the next state.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -26,7 +26,6 @@ from ucfrec.counterfactual.screening import (
     CLIP,
     MAX_TRANSITIONS,
     DimensionReport,
-    MeasurementConfig,
     ScreeningReport,
     clustered_p_value,
     find_measurements,
@@ -71,8 +70,6 @@ class ScreeningConfig:
     """Level of the tests, over held-out episodes."""
     min_reward_r2: float = 0.9
     """Least R² of the reward at which no help is evidence."""
-    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
-    """The test whether a dimension measures the reward."""
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
@@ -95,8 +92,7 @@ def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Sc
     def measured(dimensions: Sequence[int]) -> list[int]:
         """Those of `dimensions` that measure the reward."""
         new = [dimension for dimension in dimensions if dimension not in measures]
-        most, settings = config.max_transitions, config.measurement
-        measures.update(find_measurements(train, settings, most, seed, new))
+        measures.update(find_measurements(train, config.max_transitions, seed, new))
         return [dimension for dimension in dimensions if measures[dimension]]
 
     tested: Sequence[int] = range(data.size)

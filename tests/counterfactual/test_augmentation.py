@@ -46,8 +46,13 @@ from ucfrec.counterfactual.generators import (
     make_generator,
     state_clusters,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
-from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    CRMReport,
+    fit_crm,
+    read_transitions,
+)
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions

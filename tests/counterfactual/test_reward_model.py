@@ -9,8 +9,14 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, Posterior, kl_to_prior
-from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    Posterior,
+    fit_crm,
+    fit_warning,
+    kl_to_prior,
+)
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 

@@ -29,13 +29,11 @@ from ucfrec.counterfactual.generators import (
 from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
-    EffectsMean,
-    read_transitions,
-)
-from ucfrec.counterfactual.reward_model_fit import (
     CRMReport,
+    EffectsMean,
     fit_crm,
     fit_warning,
+    read_transitions,
     sample_steps,
     sample_transitions,
 )

@@ -15,8 +15,7 @@ from ucfrec.counterfactual.generators import (
     TangentGenerator,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel
-from ucfrec.counterfactual.reward_model_fit import sample_transitions
+from ucfrec.counterfactual.reward_model import CausalRewardModel, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError

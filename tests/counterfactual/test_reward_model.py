@@ -83,7 +83,7 @@ def test_dimensions_that_never_vary_are_inert(tmp_path: Path) -> None:
     train = planted(2_000, 0).transitions
     crm, _ = fit_crm(train, planted(500, 1).transitions, QUICK, tmp_path, seed=0)
     assert crm.state_std[CONSTANT] == 0
-    normalised = crm.normalised_states(train.states)
+    normalised = crm.normalise_states(train.states)
     assert normalised[:, CONSTANT].abs().max() < 1e-6
     torch.testing.assert_close(
         normalised.std(0)[:CONSTANT], torch.ones(CONSTANT), rtol=0.01, atol=0

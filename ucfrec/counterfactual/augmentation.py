@@ -177,17 +177,8 @@ def augment_episodes(
     seed: int,
     device: torch.device = _CPU,
 ) -> tuple[AugmentedEpisodes, AugmentationReport]:
-    """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1).
-
-    Args:
-        train: view to fit both models to and to copy episodes from.
-        validation: view for early stopping and for the quality of the reward model.
-        folder: of the checkpoints, which training resumes from.
-        device: where both models are fitted and edits are made.
-
-    Raises:
-        InputError: all training rewards are equal, or there are no held-out steps.
-    """
+    """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1) of the episodes
+    of `train`; those of `validation` stop the fit early. Training resumes from `folder`."""
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
     item_rewards: ItemRewardModel | None = None
     mean: EffectsMean | None = None
@@ -208,9 +199,9 @@ def augment_episodes(
     episodes, report = edit_states(train, crm, crm_report, generator, config, seed, item_rewards)
     if clusters is None or not config.actions:
         return episodes, report
-    states = crm.normalised_states(training.states.to(device)).cpu()
+    states = crm.normalise_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
-    support = ActionSupport(labels, logged_actions(train, sampled_episodes, sampled_steps))
+    support = ActionSupport(labels, read_actions(train, sampled_episodes, sampled_steps))
     actions = ActionGenerator(
         train, crm, clusters, support, report.epsilon_r, report.delta, item_rewards
     )
@@ -449,11 +440,8 @@ def _report(
 def interventions(
     view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
 ) -> AugmentedEpisodes:
-    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
-
-    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
-    an intervention that stays put; copies 1, 3, … at every step.
-    """
+    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`: values are
+    drawn, jointly, from its steps, for copies 0, 2, … once an episode, otherwise at every step."""
     rng = np.random.default_rng(seed)
     episodes, steps = view.all_steps()
     states = view.windows(episodes, steps, 1).states[:, 0].numpy()
@@ -557,25 +545,27 @@ class ActionGenerator:
         z = exact.abduct(s, a, r)
         reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
         rows = np.repeat(np.arange(len(steps)), count)
-        states = self.crm.normalised_states(factual.states).cpu()
+        states = self.crm.normalise_states(factual.states).cpu()
         labels = self.clusters.nearest(states).numpy()
         actions, drawable = self.support.draw(labels[rows], rng)
-        logged = logged_actions(self.view, episodes[rows], steps[rows])
+        logged = read_actions(self.view, episodes[rows], steps[rows])
         differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
         rows, actions = rows[differs], actions[differs]
-        other = read_transitions(self.view, episodes[rows], steps[rows], self.item_rewards, actions)
+        changed = read_transitions(
+            self.view, episodes[rows], steps[rows], self.item_rewards, actions
+        )
         at = torch.from_numpy(rows).to(s.device)
         return {
             "episode": episodes[rows],
             "step": steps[rows],
             "action": actions,
-            "reward": exact.predict(s[at], other.actions.to(s), z[at]).cpu().numpy(),
+            "reward": exact.predict(s[at], changed.actions.to(s), z[at]).cpu().numpy(),
             "logged": r.cpu().numpy()[rows],
             "reproduced": reproduced[rows],
         }
 
 
-def logged_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
+def read_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
     """The logged actions of M steps, (M,) int64 items or (M, A) float32 vectors."""
     if view.has_items:
         return view.step_values(schema.ITEM, episodes, steps).astype(np.int64)

@@ -206,7 +206,7 @@ class CausalRewardModel(nn.Module):
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
         disturbance = self._disturbance(self.given(states, actions), z)
-        decoded = self.expected_reward(states, actions) + disturbance
+        decoded = self.predict_expected(states, actions) + disturbance
         return self.reward_mean + self.reward_std * decoded
 
     def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,7 +221,7 @@ class CausalRewardModel(nn.Module):
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
-        return self.normalised_rewards(rewards) - self.expected_reward(states, actions)
+        return self.normalise_rewards(rewards) - self.predict_expected(states, actions)
 
     def _disturbance(self, inputs: Tensor, z: Tensor) -> Tensor:
         """What z adds to the expected reward, in standard deviations of the reward, (...)."""
@@ -232,21 +232,21 @@ class CausalRewardModel(nn.Module):
             disturbance = disturbance - self.decoder(without).squeeze(-1)
         return disturbance
 
-    def expected_reward(self, states: Tensor, actions: Tensor) -> Tensor:
+    def predict_expected(self, states: Tensor, actions: Tensor) -> Tensor:
         """E[r | s, a], standardised as rewards are, (...); 0 without `mean_first`."""
         if not self.config.mean_first:
             return states.new_zeros(states.shape[:-1])
         if isinstance(self.expected, EffectsMean):
-            return self.normalised_rewards(self.expected(states, actions))
+            return self.normalise_rewards(self.expected(states, actions))
         expected: Tensor = self.expected(self.given(states, actions)).squeeze(-1)
         return expected
 
     def given(self, states: Tensor, actions: Tensor) -> Tensor:
         """Normalised states and actions, concatenated, (..., S + A)."""
         actions = _normalise(actions, self.action_mean, self.action_std)
-        return torch.cat([self.normalised_states(states), actions], dim=-1)
+        return torch.cat([self.normalise_states(states), actions], dim=-1)
 
-    def normalised_states(self, states: Tensor) -> Tensor:
+    def normalise_states(self, states: Tensor) -> Tensor:
         """States (..., S), standardised; 0 in dimensions that never vary in training."""
         return _normalise(states, self.state_mean, self.state_std)
 
@@ -255,7 +255,7 @@ class CausalRewardModel(nn.Module):
         difference = edited - states
         return torch.where(difference == 0, 0.0, difference / self.state_std)
 
-    def normalised_rewards(self, rewards: Tensor) -> Tensor:
+    def normalise_rewards(self, rewards: Tensor) -> Tensor:
         """Rewards (...), standardised."""
         return _normalise(rewards, self.reward_mean, self.reward_std)
 
@@ -293,13 +293,13 @@ def read_transitions(
         actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
     """
     transitions = view.transitions(episodes, steps)
-    other = None if actions is None else torch.from_numpy(actions)
+    chosen = None if actions is None else torch.from_numpy(actions)
     if item_rewards is None:
-        if other is None:
+        if chosen is None:
             return transitions
-        return replace(transitions, actions=view.action_vectors(other))
+        return replace(transitions, actions=view.action_vectors(chosen))
     rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
-    items = rows.items if other is None else other
+    items = rows.items if chosen is None else chosen
     fixed = item_rewards.score_without_state(rows.history, rows.users, items)
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
 
@@ -377,7 +377,7 @@ def _fit_mean(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
     (inputs, rewards), held_out_rows = (
-        (model.given(steps.states, steps.actions), model.normalised_rewards(steps.rewards))
+        (model.given(steps.states, steps.actions), model.normalise_rewards(steps.rewards))
         for steps in (train, held_out)
     )
 

@@ -137,13 +137,8 @@ def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
 def find_measurements(
     train: EpisodeStore, most: int, seed: int, dimensions: Sequence[int] | None = None
 ) -> dict[int, bool]:
-    """Whether observation dimensions measure the reward, by their errors on held-out episodes.
-
-    Args:
-        train: a view of the training episodes, with observations.
-        most: largest number of transitions to use.
-        seed: of the transitions and of the rows kept apart.
-        dimensions: to test; None for all.
+    """Whether observation dimensions of training episodes measure the reward, by their errors on
+    held-out episodes; None stands for all dimensions. At most `most` transitions are used.
 
     Raises:
         InputError: there are too few episodes with two steps or more to hold some out.
@@ -176,9 +171,9 @@ class _Steps:
         self.episodes, steps = steps_with_successor(view, most, seed)
         now = view.transitions(self.episodes, steps)
         then = view.transitions(self.episodes, steps + 1)
-        others, observed = now.states.tensor_split([-view.observation_size], dim=1)
+        item_part, observed = now.states.tensor_split([-view.observation_size], dim=1)
         self.columns = standardise(observed).numpy()
-        self.rest = standardise(torch.cat([others, now.actions, then.actions], dim=1)).numpy()
+        self.rest = standardise(torch.cat([item_part, now.actions, then.actions], dim=1)).numpy()
         self.rewards = standardise(torch.stack([now.rewards, then.rewards], dim=1)).numpy()
         self.held_out = held_out_steps(view, self.episodes)
 
@@ -191,8 +186,8 @@ def _measures(data: _Steps, dimension: int, without: Collection[int], seed: int)
     alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
     variance = max(float(alone.mean()), 1e-12)
 
-    def explain(inputs: Float32Array) -> Float64Array:
-        """Share (B,) of the variance that the inputs explain of held-out steps."""
+    def explain(columns: Float32Array) -> Float64Array:
+        """Share (B,) of the variance that columns explain of held-out steps."""
         model = HistGradientBoostingRegressor(
             learning_rate=_LEARNING_RATE,
             max_iter=TREES,
@@ -201,23 +196,23 @@ def _measures(data: _Steps, dimension: int, without: Collection[int], seed: int)
             n_iter_no_change=_PATIENCE,
             random_state=seed,
         )
-        model.fit(inputs[~held_out], values[~held_out])
-        errors = np.square(values[held_out] - model.predict(inputs[held_out]))
+        model.fit(columns[~held_out], values[~held_out])
+        errors = np.square(values[held_out] - model.predict(columns[held_out]))
         return np.asarray((alone - errors) / variance)
 
     def is_explained(shares: Float64Array) -> bool:
-        p_value = clustered_p_value(torch.from_numpy(shares), data.episodes[held_out])
+        p_value = compute_p_value(torch.from_numpy(shares), data.episodes[held_out])
         return bool(shares.mean() >= _MIN_EXPLAINED) and p_value < _LEVEL
 
     # The cheapest first: most dimensions fail one of these.
     by_reward = explain(data.rewards)
     if not is_explained(by_reward):
         return False
-    rest = np.column_stack([np.delete(data.columns, [dimension, *without], axis=1), data.rest])
-    by_rest = explain(rest)
+    inputs = np.column_stack([np.delete(data.columns, [dimension, *without], axis=1), data.rest])
+    by_rest = explain(inputs)
     if not is_explained(by_rest) or by_reward.mean() < by_rest.mean():
         return False
-    by_both = explain(np.column_stack([rest, data.rewards]))
+    by_both = explain(np.column_stack([inputs, data.rewards]))
     return bool(by_both.mean() - by_reward.mean() <= _MOST_ADDED * by_rest.mean())
 
 
@@ -231,11 +226,7 @@ def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntA
 
 
 def held_out_steps(train: EpisodeStore, episodes: IntArray) -> BoolArray:
-    """Which steps are held out: those of every fifth episode.
-
-    Args:
-        train: a view of the training episodes.
-        episodes: (N,) of which episode each step is.
+    """Which steps (N,) are held out, given their episodes (N,): those of every fifth.
 
     Raises:
         InputError: there are too few episodes to hold some out.
@@ -255,13 +246,9 @@ def standardise(values: Tensor) -> Tensor:
     return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-CLIP, CLIP)
 
 
-def clustered_p_value(differences: Tensor, episodes: IntArray) -> float:
-    """Of a mean of at most 0, one-sided, where whole episodes (not steps) are independent.
-
-    Args:
-        differences: (B,).
-        episodes: (B,) of which episode each is.
-    """
+def compute_p_value(differences: Tensor, episodes: IntArray) -> float:
+    """Of a mean of at most 0, one-sided, of differences (B,) of steps whose whole episodes (B,) are
+    independent."""
     from scipy import stats  # takes long to import
 
     _, cluster = np.unique(episodes, return_inverse=True)

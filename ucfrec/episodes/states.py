@@ -194,11 +194,11 @@ class TrainingCounts:
         liked_of: Callable[["EpisodeStore", Array], BoolArray] = liked_rewards,
     ) -> "TrainingCounts":
         """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`."""
-        shown, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
+        impressions, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
         for items, rewards in train.column_batches(schema.ITEM, schema.REWARD):
-            shown += np.bincount(items, minlength=len(shown))
+            impressions += np.bincount(items, minlength=len(impressions))
             liked += np.bincount(items[liked_of(train, rewards)], minlength=len(liked))
-        return cls(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)
+        return cls(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""

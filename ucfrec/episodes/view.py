@@ -178,12 +178,12 @@ class Columns:
         parts, record = self._parts(schema.OFFSETS), self.record
         for offsets in parts:
             if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
-                raise self._damaged(schema.OFFSETS, "do not ascend from 0")
+                raise self._explain_damage(schema.OFFSETS, "do not ascend from 0")
         lengths = np.concatenate([np.diff(offsets) for offsets in parts])
-        found, steps = len(lengths), int(lengths.sum())
-        if (found, steps) != (record.n_episodes, record.n_steps):
-            fault = f"have {found} episodes of {steps} steps, not {record.n_episodes} of "
-            raise self._damaged(schema.OFFSETS, f"{fault}{record.n_steps}")
+        episodes, steps = len(lengths), int(lengths.sum())
+        if (episodes, steps) != (record.n_episodes, record.n_steps):
+            fault = f"have {episodes} episodes of {steps} steps, not {record.n_episodes} of "
+            raise self._explain_damage(schema.OFFSETS, f"{fault}{record.n_steps}")
         return lengths
 
     @cached_property
@@ -226,9 +226,11 @@ class Columns:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
         values = np.concatenate(parts)
         if len(values) != self.record.n_episodes:
-            raise self._damaged(name, f"has {len(values)} of {self.record.n_episodes} episodes")
+            raise self._explain_damage(
+                name, f"has {len(values)} of {self.record.n_episodes} episodes"
+            )
         if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
-            raise self._damaged(name, "has numbers that are not a split")
+            raise self._explain_damage(name, "has numbers that are not a split")
         return values
 
     def step_column(self, name: str) -> StepColumn:
@@ -242,14 +244,16 @@ class Columns:
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
             column = StepColumn(self._parts(name, mmap=True))
             if len(column) != self.record.n_steps:
-                raise self._damaged(name, f"has {len(column)} of {self.record.n_steps} steps")
+                raise self._explain_damage(
+                    name, f"has {len(column)} of {self.record.n_steps} steps"
+                )
             if name == schema.ITEM and name not in self._arrays and self.has_item_states:
                 low = min(part.min() for part in column.parts)
                 high = max(part.max() for part in column.parts)
                 items = len(self.item_states.embeddings)
                 if not -1 <= low <= high < items:
                     fault = f"has items from {low} to {high}, there are {items}"
-                    raise self._damaged(name, fault)
+                    raise self._explain_damage(name, fault)
             self._steps[name] = column
         return self._steps[name]
 
@@ -309,7 +313,7 @@ class Columns:
             observations,
         )
 
-    def _damaged(self, name: str, fault: str) -> InputError:
+    def _explain_damage(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.path} is damaged: column {name!r} {fault}; {StoreRecord.REMEDY}")
 
 

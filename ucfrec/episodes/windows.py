@@ -308,7 +308,7 @@ class Sessions:
         for values in (self.rewards, self.steps, self.collected):
             values[rows] = 0
 
-    def with_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
+    def add_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
         """The sessions after one more step: actions (B,) or (B, A), and their rewards (B,)."""
         received = rewards.float()  # rounded like the store's, for bit-identical states
         return replace(
@@ -415,9 +415,9 @@ class AugmentedEpisodes:
             f"{size}, {len(self.action_source):,} action copies)"
         )
 
-    def join(self, other: "AugmentedEpisodes") -> "AugmentedEpisodes":
-        """These episodes, followed by those of `other`."""
-        renumbered = replace(other, edit_copy=other.edit_copy + len(self.copy_source))
+    def join(self, episodes: "AugmentedEpisodes") -> "AugmentedEpisodes":
+        """These episodes, followed by others."""
+        renumbered = replace(episodes, edit_copy=episodes.edit_copy + len(self.copy_source))
         values = {}
         for name in (column.name for column in fields(self)):
             parts = [getattr(self, name), getattr(renumbered, name)]

@@ -178,7 +178,7 @@ def _add_history(
         store, users, None if earlier is None else _select_observations(earlier, trained)
     )
     if record.session_by != schema.SESSION_ID:
-        store = rows.continued(record.session_gap_ms)
+        store = rows.continue_sessions(record.session_gap_ms)
     return store, rows
 
 

@@ -27,7 +27,7 @@ from ucfrec.counterfactual.screening import (
     MAX_TRANSITIONS,
     DimensionReport,
     ScreeningReport,
-    clustered_p_value,
+    compute_p_value,
     find_measurements,
     held_out_steps,
     standardise,
@@ -297,10 +297,10 @@ class _Errors(NamedTuple):
             pair = self.next_state[[without, having]][:, :, helped]
             capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
             saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)
-            effect, p_value = float(saved.mean()), clustered_p_value(saved.mean(1), episodes)
+            effect, p_value = float(saved.mean()), compute_p_value(saved.mean(1), episodes)
         more = self.reward[without] - self.reward[having]
         of_reward = float(more.mean()) / data.reward_variance
-        reward_p_value = clustered_p_value(more, episodes)
+        reward_p_value = compute_p_value(more, episodes)
         report = DimensionReport(
             dimension, effect, tuple(helped.tolist()), p_value, of_reward, reward_p_value
         )

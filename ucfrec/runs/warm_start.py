@@ -9,7 +9,7 @@ import torch
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM
-from ucfrec.counterfactual.reward_model_fit import INITIAL
+from ucfrec.counterfactual.reward_model import INITIAL
 from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_trained
 from ucfrec.policies.base import SequencePolicy

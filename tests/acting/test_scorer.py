@@ -36,7 +36,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.policies.baselines import ItemKNNPolicy

@@ -154,7 +154,7 @@ class ExposureLog:
         columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
         for user_id, now, answer in waiting:
             size = len(answer.items)
-            values = {
+            values: dict[str, Iterable[object]] = {
                 schema.USER_ID: [user_id] * size,
                 schema.ITEM_ID: answer.items,
                 schema.TIMESTAMP: [now] * size,

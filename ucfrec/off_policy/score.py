@@ -18,9 +18,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import sessions_before
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.sessions import seen_before
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
+from ucfrec.episodes.windows import seen_before
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.mapping import LogMapping

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from ucfrec.provenance import provenance
+from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.results.rows import ResultRow, append_rows
 

@@ -26,7 +26,7 @@ import numpy as np
 from prepare_time import make_log
 
 from ucfrec.logs.engine import anonymous_bytes, bytes_of
-from ucfrec.provenance import provenance
+from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.results.rows import ResultRow, append_rows
 

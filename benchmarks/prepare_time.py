@@ -171,7 +171,7 @@ def compare(options: argparse.Namespace, rows: int, folder: Path) -> list[tuple[
     """Measure all methods on a log of `rows` rows; returns lines of the table."""
     import shutil
 
-    from ucfrec.provenance import provenance
+    from ucfrec.processes import provenance
     from ucfrec.results.rows import ResultRow, append_rows
 
     log, out = folder / "log", folder / "out"
@@ -238,7 +238,7 @@ def main() -> None:
     if options.method:
         RUN[options.method](options.log, options.out, options.memory_limit)
         return
-    from ucfrec.files.locks import scratch_folder
+    from ucfrec.files.atomic import scratch_folder
     from ucfrec.reporting.tables import markdown_table
 
     lines = []

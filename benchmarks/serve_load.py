@@ -27,7 +27,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from ucfrec.provenance import provenance
+from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -21,11 +21,10 @@ from torch import Tensor, nn
 
 from ucfrec.arrays import Float64Array
 from ucfrec.episodes.windows import Windows
-from ucfrec.fitting.average import WeightAverage
-from ucfrec.fitting.loop import RowAdamW
+from ucfrec.fitting.loop import RowAdamW, WeightAverage
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class
-from ucfrec.provenance import provenance
+from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec.runs.config import resolve_config

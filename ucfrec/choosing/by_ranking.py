@@ -22,7 +22,7 @@ from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
 from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
 from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
 
 SHOWN = 10

@@ -35,7 +35,7 @@ class Rank(LogOptions, RuleOptions):
         from ucfrec.evaluation.ranking_table import require_one_catalogue
         from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
-        from ucfrec.provenance import shorten_paths
+        from ucfrec.processes import shorten_paths
         from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
         from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -17,8 +17,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
 from ucfrec.evaluation.simulator import Environment
-from ucfrec.processes import random_state_kept
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.processes import config_hash, provenance, random_state_kept
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.runs.trained_policy import TrainedPolicy

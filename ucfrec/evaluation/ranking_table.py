@@ -28,7 +28,7 @@ from ucfrec.evaluation.ranking_baselines import (
     baselines,
     recent_rankers,
 )
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 

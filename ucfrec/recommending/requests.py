@@ -30,8 +30,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.row_rewards import RowRewards
-from ucfrec.runs.later_logs import reward_of
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, reward_of
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]

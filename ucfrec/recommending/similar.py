@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.arguments import require_ids, require_whole
 from ucfrec.errors import InputError
 from ucfrec.recommending.recommend import RANK, SCORE
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.settings import require_ids, require_whole
 
 SIMILAR_ITEM: Final = "similar_item_id"
 _ITEMS_AT_ONCE = 1024

@@ -12,7 +12,7 @@ from ucfrec import schema
 from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.locks import lock_path
+from ucfrec.files.atomic import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
@@ -21,10 +21,9 @@ from ucfrec.runs.record import RUN, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import without_columns
+from ucfrec.runs.start import SHARE, warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.runs.warm_start import SHARE, warm_settings
-from ucfrec.updating.drift import measure_drift
-from ucfrec.updating.verdict import compare_runs
+from ucfrec.updating.verdict import compare_runs, measure_drift
 
 STORE_SUFFIX: Final = "-store"
 """Added to the name of the run, it is the default name of the grown store beside it."""

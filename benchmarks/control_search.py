@@ -18,14 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Cell, Method, Task, measured_by, opened
+from ucfrec.benchmark.cells import Budget, Cell, Measurement, Method, Plan, Task, open_store
 from ucfrec.benchmark.grid import run_grid
-from ucfrec.benchmark.plan import Plan
-from ucfrec.benchmark.tables import over_seeds
+from ucfrec.benchmark.tables import average_seeds
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.results.statistics import grouped, summary
 from ucfrec.runs.record import RunRecord
 from ucfrec_control.benchmark.budgets import budget_of
@@ -65,7 +64,7 @@ def rate_cells(data: Path, out: Path, budget: Budget) -> Iterator[Cell]:
         for rate in RATES[budget.name]:
             at_rate = partial(settings, rate)
             plan = Plan("rates", out / budget.name, budget, at_rate, presets_of)
-            yield from plan.trained(
+            yield from plan.list_trained(
                 f"{rate:g}", Task(file, store, conditions={RATE: rate}), SEARCHED
             )
 
@@ -77,7 +76,7 @@ def measure_rate(cell: Cell, row_key: RowKey) -> list[ResultRow]:
         loss = record.finished.best_validation
     else:
         assert cell.run is not None
-        loss = action_loss(cell.run, opened(cell))
+        loss = action_loss(cell.run, open_store(cell))
     row = ResultRow(
         **vars(row_key),
         metric="validation_loss",
@@ -142,14 +141,14 @@ def main() -> None:
     if options.search == "rates":
         condition, metric = RATE, "validation_loss"
         cells = list(rate_cells(options.data, options.out, replace(budget, seeds=1)))
-        rows = run_grid(cells, measured_by(measure_rate, config), results, options.workers)
+        rows = run_grid(cells, Measurement(measure_rate, config), results, options.workers)
     else:
         condition, metric = "context", "score"
         cells = list(context_cells(options.data, options.out, budget))
         rows = run_grid(cells, SCORE_MEASUREMENT, results, options.workers)
         rows = [row for row in rows if row.checkpoint == "last"]
     by = ("task", "method", condition)
-    print(format_rows(over_seeds([row.as_line() for row in rows], by, (metric,)), (*by, metric)))
+    print(format_rows(average_seeds([row.as_line() for row in rows], by, (metric,)), (*by, metric)))
     for method, value in best(rows, condition, options.search == "rates").items():
         print(f"{method} = {value}")
 

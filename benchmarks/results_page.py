@@ -19,8 +19,7 @@ from typing import Final
 import numpy as np
 
 from ucfrec.reporting.tables import NONE, markdown_table
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import latest, read_rows
+from ucfrec.results.rows import ResultRow, latest, read_rows
 from ucfrec.results.statistics import Summary, grouped, summary
 
 ROOT = Path(__file__).parents[1]

@@ -6,8 +6,8 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ucfrec.reporting.plot_style import OURS, PAGE, PLAIN, save, styled
-from ucfrec.results.row import ResultRow
+from ucfrec.reporting.charts import OURS, PAGE, PLAIN, save, styled
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 
 

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from tests.support import killed_run
 from tests.support.signals import wait_until_handled
-from ucfrec.counterfactual.augmentation import counterfactual_augmentation
+from ucfrec.counterfactual.augmentation import augment_episodes
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect_store
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
 from ucfrec.runs.config import resolve_config
@@ -270,9 +270,7 @@ def test_augmentation(store: EpisodeStore, tmp_path: Path, kind: str) -> None:
     config = resolve_config("ucf", None, {"crm.epochs": 1, "csg.epochs": 1, "csg.kind": kind})
     tables = (config.crm, config.csg, config.augment)
     with unnoticed():
-        counterfactual_augmentation(
-            store.split("train"), store.split("validation"), *tables, tmp_path, 0
-        )
+        augment_episodes(store.split("train"), store.split("validation"), *tables, tmp_path, 0)
 
 
 @pytest.mark.parametrize("name", ["ucf", "dt", "edt4rec"])

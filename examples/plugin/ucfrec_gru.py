@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import Layers, PolicyConfig, SequencePolicy
-from ucfrec.policies.layers import recurrent
+from ucfrec.policies.base import Layers, PolicyConfig, SequencePolicy, recurrent
 from ucfrec.settings import settings_table
 
 

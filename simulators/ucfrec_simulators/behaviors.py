@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from ucfrec.acting.rollout import Actor
-from ucfrec.acting.uniform import Memoryless
+from ucfrec.acting.rollout import Actor, Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 
 

@@ -33,7 +33,7 @@ rules = st.builds(
 
 
 def draws(scores: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Uniforms for `DecisionRule.ranked`."""
+    """Uniforms for `DecisionRule.rank_items`."""
     return torch.rand(len(scores), scores.shape[1] + 1, generator=generator)
 
 
@@ -152,7 +152,7 @@ def test_what_is_chosen_and_ranked_first_follows_the_probabilities(rule: Decisio
         scores = SCORES[row].expand(n, -1)
         items, chances = rule.choose(scores, generator)
         torch.testing.assert_close(chances, probabilities[row][items])
-        ranked, propensities = rule.ranked(scores, 3, draws(scores, generator))
+        ranked, propensities = rule.rank_items(scores, 3, draws(scores, generator))
         firsts = ranked[:, 0]
         torch.testing.assert_close(propensities[:, 0].float(), probabilities[row][firsts])
         for drawn in (items, firsts):
@@ -175,7 +175,7 @@ def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: 
     """Chi-square over all lists of three of the five items; one item may not be shown."""
     scores = torch.tensor([[0.0, 1.5, -math.inf, 2.0, 0.5]]).expand(n, -1)
     generator = torch.Generator().manual_seed(2)
-    items, propensities = rule.ranked(scores, 3, draws(scores, generator))
+    items, propensities = rule.rank_items(scores, 3, draws(scores, generator))
     lists, number, counts = items.unique(dim=0, return_inverse=True, return_counts=True)
     stated = torch.zeros(len(lists), dtype=torch.float64)
     stated[number] = propensities.prod(1)
@@ -187,7 +187,7 @@ def test_lists_are_as_frequent_as_their_propensities_say(rule: DecisionRule, n: 
 
 def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> None:
     scores = torch.tensor([[0.0, 40.0, 1.0]])
-    items, propensities = DecisionRule(0.0, temperature=1.0).ranked(
+    items, propensities = DecisionRule(0.0, temperature=1.0).rank_items(
         scores, 3, torch.full((1, 4), 0.5)
     )
     assert items.tolist() == [[1, 2, 0]]
@@ -199,7 +199,9 @@ def test_propensities_stay_exact_where_one_item_has_nearly_all_probability() -> 
 )
 def test_items_left_out_are_ranked_last_and_good_ones_first(rule: DecisionRule) -> None:
     scores = torch.tensor([[1.0, -math.inf, 7.0, 3.0, 2.0, 6.0]]).expand(200, -1)
-    found, propensities = rule.ranked(scores, 6, draws(scores, torch.Generator().manual_seed(0)))
+    found, propensities = rule.rank_items(
+        scores, 6, draws(scores, torch.Generator().manual_seed(0))
+    )
     assert (propensities[:, 2:] == 1).all()
     assert (found.sort(1).values == torch.arange(6)).all()
     assert (found[:, :2].sort(1).values == torch.tensor([2, 5])).all()

@@ -16,8 +16,8 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.plugins import load_plugin
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.baselines import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
 from ucfrec.policies.ucf import UCFConfig, UCFPolicy
 
 TARGET, EPISODES, SIDE_BY_SIDE, K = 20.0, 30, 8, 2

@@ -1,4 +1,4 @@
-"""Rollouts and metrics against plain bookkeeping."""
+"""Rollouts and metrics against plain bookkeeping; uniform actions, allowed and evenly."""
 
 from typing import Any
 
@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.rollout import Episodes, Step, rollout
+from ucfrec.acting.rollout import Episodes, Step, Uniform, rollout
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
+from ucfrec.evaluation.evaluate import session_metrics
+from ucfrec.results.statistics import bootstrap_interval
+from ucfrec.schema import FORBIDDEN
 
 
 class Countdown(gym.Env[Float32Array, int]):
@@ -100,3 +102,46 @@ def test_bootstrap_interval_is_the_normal_one_for_many_episodes() -> None:
     assert low == pytest.approx(values.mean() - error, abs=0.02)
     assert high == pytest.approx(values.mean() + error, abs=0.02)
     assert bootstrap_interval(values, seed=1) == (low, high)
+
+
+# Uniform actions.
+
+
+class Bare(gym.Env[np.ndarray, np.ndarray]):
+    """Nothing but an action space."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, actions: gym.spaces.Space[np.ndarray]) -> None:
+        self.action_space = actions
+
+
+def uniform(actions: gym.spaces.Space[np.ndarray], seed: int = 0) -> Uniform:
+    return Uniform(SyncVectorEnv([lambda: Bare(actions)]), seed)
+
+
+LIVE = np.ones(3000, dtype=np.bool_)
+NOTHING = np.zeros((3000, 0), dtype=np.float32)
+
+
+def test_forbidden_items_are_never_drawn_and_the_others_evenly() -> None:
+    actor = uniform(gym.spaces.Discrete(6))
+    actor.inform({FORBIDDEN: np.tile([4, -1, 0], (3000, 1))})
+    items, propensities = actor.act(NOTHING, LIVE)
+    counts = np.bincount(items, minlength=6)
+    assert counts[[0, 4]].sum() == 0
+    np.testing.assert_allclose(counts[[1, 2, 3, 5]], 750, atol=110)
+    np.testing.assert_allclose(propensities, 1 / 4)
+
+
+def test_vectors_fill_their_box() -> None:
+    low, high = np.array([-1.0, 5.0], dtype=np.float32), np.array([1.0, 7.0], dtype=np.float32)
+    vectors, propensities = uniform(gym.spaces.Box(low, high)).act(NOTHING, LIVE)
+    assert propensities is None
+    np.testing.assert_allclose(vectors.min(0), low, atol=0.01)
+    np.testing.assert_allclose(vectors.max(0), high, atol=0.01)
+
+
+def test_a_box_without_bounds_has_no_uniform_vectors() -> None:
+    with pytest.raises(InputError, match="no finite bounds"):
+        uniform(gym.spaces.Box(-np.inf, np.inf, (2,)))

@@ -29,17 +29,16 @@ from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
-from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.sessions import seen_before
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.store import UserRows
+from ucfrec.episodes.windows import Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
-from ucfrec.policies.item_knn import ItemKNNPolicy
+from ucfrec.policies.baselines import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.start import training_views
@@ -141,7 +140,7 @@ def naive_scores(scorer: Scorer, windows: Windows, excluded: Tensor) -> Tensor:
             score = scorer.reward_model.score(windows.states[:, -1], shown, sessions.users, every)
             if rule.lookahead:
                 assert scorer.session_end is not None
-                score = scorer.reward_model.expected(score)
+                score = scorer.reward_model.expect(score)
                 steps, recent = windows.timesteps[:, -1].numpy(), shown.latest(LAGS)
                 ends = [
                     torch.from_numpy(

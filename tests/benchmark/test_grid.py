@@ -10,26 +10,20 @@ from typing import Any
 import pytest
 
 from tests.support.result_rows import read_configurations
-from ucfrec.benchmark.grid import Measurement, chosen, run_grid
+from ucfrec.benchmark.cells import Cell, Evaluation, Measurement
+from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.errors import InputError
-from ucfrec.results.row import ResultRow, RowKey
-from ucfrec.results.rows_file import read_rows
-
-Cell = tuple[str, int]
-"""A folder for marks, and a number."""
-
-
-def _key(cell: Cell) -> RowKey:
-    return RowKey(suite="s", table="squares", task=str(cell[1]), method="m", policy="p")
+from ucfrec.results.rows import ResultRow, RowKey, read_rows
 
 
 def _config(cell: Cell) -> dict[str, Any] | None:
-    return {"number": (cell[1],)} if cell[1] > 1 else None
+    return {"number": (int(cell.task),)} if int(cell.task) > 1 else None
 
 
 def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
-    folder, number = cell
-    with (Path(folder) / "marks").open("a") as file:
+    number = int(cell.task)
+    assert cell.run is not None
+    with (cell.run.parent / "marks").open("a") as file:
         file.write(f"{number}\n")
     if number < 0:
         raise ValueError("negative")
@@ -44,11 +38,14 @@ def _threads() -> int:
     return torch.get_num_threads()
 
 
-HOW = Measurement(_key, _config, _square)
+HOW = Measurement(_square, _config)
 
 
 def _cells(folder: Path, *numbers: int) -> list[Cell]:
-    return [(str(folder), number) for number in numbers]
+    evaluation = Evaluation(1, 0)
+    return [
+        Cell("s", "squares", str(n), "m", "p", evaluation, run=folder / f"run-{n}") for n in numbers
+    ]
 
 
 def _marks(folder: Path) -> list[str]:
@@ -66,7 +63,7 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def _measured_by(rows: Sequence[ResultRow]) -> set[float]:
+def _Measurement(rows: Sequence[ResultRow]) -> set[float]:
     """The processes that measured the rows, each with one thread."""
     assert {row.metrics["threads"] for row in rows} == {1}
     return {row.metrics["process"] for row in rows}
@@ -75,7 +72,7 @@ def _measured_by(rows: Sequence[ResultRow]) -> set[float]:
 def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) -> None:
     results = tmp_path / "results" / "rows.jsonl"
     rows = run_grid(_cells(tmp_path, 2, 1), HOW, results, 2)
-    assert os.getpid() not in _measured_by(rows)
+    assert os.getpid() not in _Measurement(rows)
     rows = run_grid(_cells(tmp_path, 1, 3, 2, 3), HOW, results, 2)
     assert [(row.task, row.value, row.checkpoint) for row in rows] == [
         (str(n), float(n**2), name) for n in (1, 3, 2) for name in ("last", "best")
@@ -91,12 +88,11 @@ def test_measures_once_and_returns_rows_in_the_order_of_cells(tmp_path: Path) ->
 @pytest.mark.usefixtures("two_threads")
 def test_rows_and_folders_of_a_cell_are_replaced_when_it_is_measured_again(tmp_path: Path) -> None:
     results = tmp_path / "rows.jsonl"
-    how = replace(HOW, made=lambda cell: [Path(cell[0]) / f"run-{cell[1]}"])
-    first = run_grid(_cells(tmp_path, 2, 3), how, results, 1)
+    first = run_grid(_cells(tmp_path, 2, 3), HOW, results, 1)
     for number in (2, 3):
         (tmp_path / f"run-{number}" / "policy").mkdir(parents=True)
-    rows = run_grid(_cells(tmp_path, 2), how, results, 1, again=True)
-    assert _measured_by(rows) == {os.getpid()}, "one worker needs no process of its own"
+    rows = run_grid(_cells(tmp_path, 2), HOW, results, 1, again=True)
+    assert _Measurement(rows) == {os.getpid()}, "one worker needs no process of its own"
     assert _marks(tmp_path) == ["2", "2", "3"]
     assert read_rows(results) == [*first[2:], *rows], "rows of other cells stay"
     assert not (tmp_path / "run-2").exists()
@@ -135,7 +131,7 @@ def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Pa
 
 
 def test_what_is_chosen_keeps_its_order() -> None:
-    assert chosen(("a", "b", "c"), ["c", "a"], "method") == ["a", "c"]
-    assert chosen(("a", "b"), [], "method") == ["a", "b"]
+    assert select_names(("a", "b", "c"), ["c", "a"], "method") == ["a", "c"]
+    assert select_names(("a", "b"), [], "method") == ["a", "b"]
     with pytest.raises(InputError, match="no method is called d; there are a, b"):
-        chosen(("a", "b"), ["d"], "method")
+        select_names(("a", "b"), ["d"], "method")

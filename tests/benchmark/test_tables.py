@@ -1,21 +1,27 @@
-"""Printed tables of the benchmarks are what their rows say."""
+"""Tables and plots of the benchmarks are what their rows say."""
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from tests.support.result_rows import distractor_rows, result_row
+from ucfrec.benchmark import tables
 from ucfrec.benchmark.tables import (
+    DISTRACTOR_RATES,
+    average_seeds,
     difference_table,
     distractor_table,
     method_table,
-    of_best_target,
-    over_seeds,
+    plot_distractor,
+    plot_methods,
     score_table,
+    select_best_target,
 )
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 
 
 def scored(task: str, method: str, seed: int, score: float, **more: Any) -> ResultRow:
@@ -69,7 +75,7 @@ def test_of_several_targets_the_best_in_the_mean_counts() -> None:
         for target, seeds in scores.items()
         for seed, score in enumerate(seeds)
     ] + [scored("t", "iql", 0, 5.0)]
-    kept = of_best_target(rows)
+    kept = select_best_target(rows)
     assert [(row.method, row.target_return, row.value) for row in kept] == [
         ("dt", 2.0, 20.0), ("dt", 2.0, 45.0), ("iql", None, 5.0),
     ]  # fmt: skip
@@ -81,7 +87,7 @@ def test_what_was_not_measured_is_a_dash() -> None:
         {"method": "dc", "seed": 0, "score": 5.0},
         {"method": "dt", "seed": 1, "score": 3.0, "other": 4.0},
     ]
-    found = over_seeds(rows, ("method",), ("score", "other"))
+    found = average_seeds(rows, ("method",), ("score", "other"))
     assert [row["method"] for row in found] == ["dt", "dc"]
     assert [row["other"] for row in found] == ["4", "–"]
     mean, _, deviation = found[0]["score"].partition(" ± ")
@@ -148,3 +154,32 @@ def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
     one = method_table([*rows("dt", {(0, 0): 9.0}), *rows("ucf", ours)]).splitlines()[2]
     assert one.endswith("| -1 |")
     assert method_table(rows("dt", other)).endswith("| – |")
+
+
+def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) -> None:
+    values = dict.fromkeys(DISTRACTOR_RATES, (1.0, 2.0))
+    rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
+    clean = [row for row in rows if row.conditions["distractor"] is None]
+    for plot, given, name in (
+        (plot_methods, clean, "methods-w"),
+        (plot_distractor, rows, "distractor-w"),
+    ):
+        made = plot(given, tmp_path)
+        assert made == [tmp_path / f"{name}.png", tmp_path / f"{name}.svg"]
+        drawn = made[1].read_text()
+        assert ">ucf<" in drawn
+        assert ">dt<" in drawn
+        plot(given, tmp_path)
+        assert made[1].read_text() == drawn
+    assert plot_distractor(clean, tmp_path) == []
+
+
+def test_error_bars_are_those_of_the_tables() -> None:
+    figure = Figure()
+    axes = figure.add_subplot()
+    tables._draw_bars(
+        axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))]
+    )
+    (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
+    ((left, right),) = (segment[:, 0] for segment in spread.get_segments())
+    assert (right - left) / 2 == pytest.approx(2**0.5)

@@ -13,7 +13,7 @@ from ucfrec.commands.demo import (
     conclusion,
     demo,
 )
-from ucfrec.results.rows_file import read_results
+from ucfrec.results.rows import read_results
 
 TINY = DemoConfig(
     sessions=300,

@@ -100,7 +100,7 @@ def test_weights_are_loaded_without_the_compiler() -> None:
         "import torch\n"
         "from ucfrec.episodes.exposure import ExposureTerm, Likeness\n"
         "from ucfrec.fitting.checkpoint import load_module\n"
-        "from ucfrec.policies.layers import embedding\n"
+        "from ucfrec.policies.base import embedding\n"
         "def build():\n"
         "    return torch.nn.ModuleList(\n"
         "        [embedding(3, 2), ExposureTerm(2, 3, Likeness(3, 2, 0))])\n"

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
-from ucfrec.policies.dc import DCConfig, DCPolicy
+from ucfrec.policies.convformers import DCConfig, DCPolicy, LSDTConfig, LSDTPolicy
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SIZES = {"state": 5, "action": 3, "items": 0}

@@ -1,22 +1,13 @@
-"""Values of options that no command can use are refused before anything is done."""
+"""What no command can use is refused on one line before anything is done."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.support.control_files import hopper_like, write_hdf5
-from ucfrec_control.cli import main
+from tests.support.control_files import hopper_like, refused, write_hdf5
 
-FILE = "hopper_medium-zoo"
-
-
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    """A folder with one file of the benchmark."""
-    folder = tmp_path / "data"
-    folder.mkdir()
-    write_hdf5(folder / f"{FILE}.hdf5", hopper_like((30, 8, 25) * 8))
-    return folder
+ZOO_FILE = "hopper_medium-zoo"
+DATA = ("--data", "data")
 
 
 @pytest.mark.parametrize("seed", ["-1", "4294967296", "1.5", "9" * 5000])
@@ -27,48 +18,52 @@ def data(tmp_path: Path) -> Path:
         ["distract", "store", "--out", "out", "--seed"],
         ["screen", "store", "--seed"],
         ["collect", "--env", "Hopper-v5", "--out", "out", "--seed"],
-        ["benchmark", "--data", "data", "--evaluation-seed"],
+        ["benchmark", *DATA, "--evaluation-seed"],
     ],
 )
-def test_seeds_that_are_none_are_refused(
-    command: list[str], seed: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([*command, seed])
-    assert ended.value.code == 2
-    assert "not a whole number from 0 to 4294967295" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("workers", ["0", "-3"])
-def test_a_benchmark_needs_a_worker(
-    data: Path, tmp_path: Path, workers: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cells = ["--file", FILE, "--method", "bc", "--seeds", "1", "--out", str(tmp_path / "out")]
-    assert main(["benchmark", "--data", str(data), *cells, "--workers", workers]) == 2
-    assert f"--workers is {workers}; at least one" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("noise", ["nan", "inf", "-1"])
-def test_noise_is_a_finite_number(
-    tmp_path: Path, noise: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    agent = ["--agent", "agent.zip", "--env", "Hopper-v5", "--out", str(tmp_path / "out")]
-    assert main(["collect", *agent, "--noise", noise]) == 2
-    assert "give at least 0" in capsys.readouterr().err
+def test_seeds_that_are_none_are_refused(command: list[str], seed: str) -> None:
+    assert "not a whole number from 0 to 4294967295" in refused(*command, seed)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("command", "says"),
     [
-        (["evaluate", "run", "--target", "abc"], "abc is no target; give a number or max"),
-        (["evaluate", "run", "--target", "nan"], "nan is no target; give a number or max"),
-        (["train", "store", "--out", "run", "--policy", "popular"], "invalid choice: 'popular'"),
+        ("prepare nowhere.hdf5 --out s", "nowhere.hdf5 does not exist"),
+        ("prepare mujoco/hopper/expert-v9 --out s", "--download"),
+        ("train nowhere --out run", "nowhere is not an episode store"),
+        ("train store --out run --policy popular", "invalid choice: 'popular'"),
+        ("train {store} --out {run} --policy dt --screen drop", "without --screen"),
+        ("evaluate nowhere", "nowhere is not a run folder"),
+        ("evaluate run --target abc", "abc is no target; give a number or max"),
+        ("evaluate run --target nan", "nan is no target; give a number or max"),
+        ("evaluate {run} --env Nope-v1", "Nope-v1 cannot be made"),
+        ("evaluate {run} --env Walker2d-v5", "sizes (17, 6)"),
+        ("evaluate {run} --episodes 0", "at least one"),
+        ("evaluate {run} --episodes 1 --target max", "policy.max_return=true"),
+        ("collect --env Hopper-v5 --out out --agent a.zip --noise nan", "give at least 0"),
+        ("collect --env Hopper-v5 --out out --agent a.zip --noise inf", "give at least 0"),
+        ("collect --env Hopper-v5 --out out --agent a.zip --noise -1", "give at least 0"),
+        ("collect --env Nowhere-v0 --out out", "Nowhere-v0 cannot be made"),
+        ("benchmark --method nope", "no method is called nope; there are bc, bc-10"),
+        ("benchmark --seeds 0", "0 training seeds are requested"),
+        ("benchmark --file nowhere", "nowhere.hdf5 does not exist"),
+        ("benchmark --results rows.jsonl", "rows.jsonl, line 1 is not a result row"),
+        ("benchmark --method bc --seeds 1 --workers 0", "--workers is 0; at least one"),
+        ("benchmark --method bc --seeds 1 --workers -3", "--workers is -3; at least one"),
+        ("figures --out out --results no.jsonl", "check the path"),
+        ("figures --out out --runs no", "check the path"),
     ],
 )
-def test_wrong_values_are_named(
-    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+def test_what_cannot_be_used_is_refused(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, says: str
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
-    assert says in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    given = command.format(run=folder / "store-run", store=folder / "store").split()
+    if given[0] == "benchmark":
+        Path("data").mkdir()
+        Path("rows.jsonl").write_text("no row\n")
+        write_hdf5(Path("data", f"{ZOO_FILE}.hdf5"), hopper_like((30, 8, 25)))
+        given += [*DATA, "--out", "out"]
+        given += ["--file", ZOO_FILE] if "--file" not in given else []
+    assert says in refused(*given)

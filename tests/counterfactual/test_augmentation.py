@@ -1,24 +1,61 @@
-"""From views of the log to copies of both kinds."""
+"""Every edit passes both gates; other actions get the reward of the model with z kept."""
 
-from dataclasses import replace
+import functools
+import json
+import math
+import tempfile
+from copy import deepcopy
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
 
 from tests.support.causes import planted_vectors
-from tests.support.planted import planted_store
+from tests.support.planted import (
+    ACTION,
+    CONSTANT,
+    STATE,
+    STEPS,
+    f,
+    fitted,
+    planted,
+    planted_store,
+)
 from ucfrec import schema
-from ucfrec.counterfactual.augmentation import counterfactual_augmentation, interventions
-from ucfrec.counterfactual.generators import CSGConfig
-from ucfrec.counterfactual.reward_model import CRMConfig, EffectTransitions
-from ucfrec.counterfactual.state_augmentation import AugmentConfig
+from ucfrec.counterfactual.augmentation import (
+    ActionGenerator,
+    ActionReport,
+    AugmentationReport,
+    AugmentConfig,
+    MoveStatistics,
+    accept,
+    augment_episodes,
+    edit_states,
+    interventions,
+    logged_actions,
+)
+from ucfrec.counterfactual.generators import (
+    ActionSupport,
+    CSGConfig,
+    Generator,
+    make_generator,
+    state_clusters,
+)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
+from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions
+from ucfrec.errors import InputError
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
+ALGORITHM_5 = AugmentConfig(copies=4, edits_per_copy=1, reward_quantile=0.0)
+APPENDIX_H = AugmentConfig(copies=2, edits_per_copy=0, reward_quantile=0.3)
 QUICK = CRMConfig(epochs=2, hidden=32)
 LOOSE = AugmentConfig(copies=2, epsilon_r=3.0)
 
@@ -28,8 +65,305 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def test_from_views_to_an_overlay(tmp_path: Path) -> None:
-    overlay, report = counterfactual_augmentation(
+@functools.cache
+def view() -> EpisodeStore:
+    return planted_store().split("train")
+
+
+@functools.cache
+def generator() -> Generator:
+    return make_generator(
+        planted(20_000, 0).transitions, fitted()[0], CSGConfig(), Path(tempfile.mkdtemp()), seed=0
+    )
+
+
+def augmented(
+    config: AugmentConfig, seed: int = 0, by: Generator | None = None
+) -> tuple[AugmentedEpisodes, AugmentationReport]:
+    return edit_states(view(), *fitted(), by or generator(), config, seed)
+
+
+@pytest.mark.parametrize("config", [ALGORITHM_5, APPENDIX_H], ids=["algorithm 5", "appendix H"])
+def test_every_edit_passes_both_gates_in_float64(config: AugmentConfig) -> None:
+    crm = deepcopy(fitted()[0]).double()
+    copies, report = augmented(config)
+    base = planted_store().transitions(copies.copy_source[copies.edit_copy], copies.edit_step)
+    s, a, r = base.states.double(), base.actions.double(), base.rewards.double()
+    edited = torch.from_numpy(copies.edit_state).double()
+    with torch.no_grad():
+        change = (crm.predict(edited, a, crm.abduct(s, a, r)) - r).abs()
+    sigma = crm.state_std.double()
+    varies = sigma > 0
+    length = ((edited - s)[:, varies] / sigma[varies]).norm(dim=1)
+    assert change.max() <= report.epsilon_r
+    assert length.max() <= 0.5
+    assert torch.equal(edited[:, CONSTANT], s[:, CONSTANT])
+    assert report.acceptance >= 0.8
+
+
+def test_appendix_h_carries_every_accepted_edit_above_the_quantile() -> None:
+    copies, report = augmented(APPENDIX_H)
+    rewards = view().step_values(schema.REWARD, *view().all_steps())
+    high = rewards >= np.quantile(rewards, 0.3)
+    assert report.proposals == 2 * high.sum()
+    assert (
+        len(copies.edit_step) == report.moves.edits == round(report.acceptance * report.proposals)
+    )
+    edited = planted_store().step_values(
+        schema.REWARD, copies.copy_source[copies.edit_copy], copies.edit_step
+    )
+    assert edited.min() >= np.quantile(rewards, 0.3)
+    # Copies of one episode are edited apart from one another.
+    assert len(np.unique(copies.edit_state, axis=0)) == len(copies.edit_state)
+
+
+class EvenSteps:
+    """Leaves states alone where the first is ≥ 0, and moves too far elsewhere."""
+
+    band = (0.2, 0.5)
+
+    def propose(
+        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        return torch.where(states[:, :1] >= 0, states, states + 10.0)
+
+
+@pytest.mark.parametrize("edits", [1, 3])
+def test_algorithm_5_fills_copies_and_stops(edits: int) -> None:
+    config = replace(ALGORITHM_5, edits_per_copy=edits)
+    copies, report = augmented(config, by=EvenSteps())
+    per_copy = np.bincount(copies.edit_copy)
+    assert per_copy.max() == edits
+    episodes, steps = view().all_steps()
+    acceptable = np.bincount(
+        episodes, weights=view().transitions(episodes, steps).states[:, 0].numpy() >= 0
+    ).astype(int)
+    made = np.bincount(copies.copy_source, weights=per_copy, minlength=len(view())).astype(int)
+    # The stub's proposals change no reward, so only the reward model's own error rejects.
+    assert (made <= np.minimum(acceptable, 4 * edits)).all()
+    assert made.sum() >= 0.95 * np.minimum(acceptable, 4 * edits).sum()
+    assert report.proposals < len(steps)
+    source = copies.copy_source[copies.edit_copy]
+    pairs = np.stack([source, copies.edit_step])
+    assert len(np.unique(pairs, axis=1).T) == len(copies.edit_step)
+
+
+@pytest.mark.parametrize("config", [ALGORITHM_5, APPENDIX_H], ids=["algorithm 5", "appendix H"])
+def test_edits_are_in_order_and_the_seeds(config: AugmentConfig) -> None:
+    copies, _ = augmented(config)
+    key = copies.edit_copy * (STEPS + 1) + copies.edit_step
+    assert (np.diff(key) > 0).all()
+    assert np.array_equal(np.unique(copies.edit_copy), np.arange(len(copies.copy_source)))
+    assert copies.edit_state.dtype == np.float32
+    again, other = augmented(config)[0], augmented(config, seed=1)[0]
+    assert np.array_equal(copies.edit_state, again.edit_state)
+    assert not np.array_equal(copies.edit_state[:10], other.edit_state[:10])
+
+
+def test_a_large_store_is_sampled() -> None:
+    copies, report = augmented(replace(APPENDIX_H, copies=1, max_steps=500))
+    assert 0 < report.proposals <= 500
+    assert len(copies.copy_source) < len(view())
+
+
+def test_the_report_says_what_proposition_1_promises() -> None:
+    crm, crm_report = fitted()
+    copies, report = augmented(APPENDIX_H)
+    assert report.epsilon_r == pytest.approx(0.1 * float(crm.reward_std))
+    assert report.bound == report.delta + report.epsilon_r
+    assert report.verdict.startswith("an accepted edit changes the true reward by at most")
+    assert report.warnings == ()
+    assert sum(report.moves.histogram_counts) == report.moves.edits == len(copies.edit_step)
+    assert json.loads(json.dumps(asdict(report)))["reward_model"]["latent_dim"] == 16
+
+    poor = replace(crm_report, delta=dict.fromkeys(crm_report.delta, 5.0))
+    _, doubted = edit_states(view(), crm, poor, generator(), ALGORITHM_5, 0)
+    assert doubted.verdict.startswith("the bound means nothing")
+    _, strict = augmented(replace(APPENDIX_H, epsilon_r=1e-12))
+    assert strict.verdict.startswith("no edit was accepted")
+    assert (strict.copies, strict.acceptance) == (0, 0.0)
+
+
+def test_impossible_configurations_are_refused() -> None:
+    for wrong in (
+        {"copies": -1},
+        {"actions": -1},
+        {"edits_per_copy": -1},
+        {"reward_quantile": 1.0},
+    ):
+        with pytest.raises(InputError, match="augment"):
+            augmented(replace(APPENDIX_H, **wrong))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    lengths=st.lists(st.floats(0, 2), min_size=1, max_size=8),
+    epsilon_r=st.floats(0, 3),
+    rho_high=st.floats(0, 2),
+    seed=st.integers(0, 2**31),
+)
+def test_the_gate_is_equation_4(
+    lengths: list[float], epsilon_r: float, rho_high: float, seed: int
+) -> None:
+    torch.manual_seed(seed)
+    size = len(lengths)
+    crm = CausalRewardModel(STATE, ACTION, CRMConfig(hidden=8, latent_dim=2)).double()
+    crm.state_std.copy_(torch.rand(STATE) + 0.1)
+    crm.state_std[CONSTANT] = 0.0
+    s, a, r = torch.randn(size, STATE), torch.randn(size, ACTION), torch.randn(size)
+    s, a, r = s.double(), a.double(), r.double()
+    direction = torch.randn(size, STATE).double() * (crm.state_std > 0)
+    direction = direction / direction.norm(dim=1, keepdim=True)
+    edited = s + crm.state_std * direction * torch.tensor(lengths).double().unsqueeze(1)
+    factual = Transitions(s, a, r, torch.zeros_like(s), torch.zeros(size, dtype=torch.bool))
+    with torch.no_grad():
+        z = crm.abduct(s, a, r)
+        got = accept(crm, factual, z, edited, epsilon_r, rho_high)
+        for i in range(size):
+            change = abs(float(crm.predict(edited[i], a[i], z[i])) - float(r[i]))
+            if min(abs(change - epsilon_r), abs(lengths[i] - rho_high)) > 1e-6:
+                assert bool(got[i]) == (change <= epsilon_r and lengths[i] <= rho_high)
+        moved = edited + torch.eye(STATE)[CONSTANT]
+        assert not accept(crm, factual, z, moved, math.inf, 1e9).any()
+
+
+def test_constant_moves_are_collapsed_and_isotropic_ones_are_not() -> None:
+    def report(moves: Tensor) -> tuple[float, float]:
+        statistics = MoveStatistics(5)
+        for chunk in torch.split(moves, 100):
+            statistics.add(chunk)
+        found = statistics.report(rho_high=10.0, dimensions=5)
+        return found.mean_move_ratio, found.effective_rank
+
+    assert report(torch.tensor([[0.1, 0.2, 0.0, 0.0, 0.3]]).repeat(500, 1)) == pytest.approx((1, 1))
+    ratio, rank = report(torch.randn(4_000, 5, generator=torch.Generator().manual_seed(0)))
+    assert ratio < 0.05
+    assert rank == pytest.approx(5, abs=0.05)
+    nothing = MoveStatistics(5).report(0.5, 5)
+    assert (nothing.edits, nothing.effective_rank) == (0, 0.0)
+    assert math.isnan(nothing.mean_move_ratio)
+
+
+# Other actions.
+
+
+@functools.cache
+def small_model() -> tuple[CausalRewardModel, CRMReport]:
+    """A reward model that is fitted in seconds."""
+    torch.set_num_threads(1)
+    train, held_out = planted(8_000, 0).transitions, planted(2_000, 1).transitions
+    return fit_crm(
+        train, held_out, CRMConfig(hidden=64, epochs=6), Path(tempfile.mkdtemp()), seed=0
+    )
+
+
+@functools.cache
+def others() -> ActionGenerator:
+    """Asks at the steps of the planted store, with the gate of the default settings."""
+    crm, report = small_model()
+    steps = view().all_steps()
+    training = view().transitions(*steps)
+    clusters = state_clusters(training, crm, CSGConfig(), 0)
+    labels = clusters.nearest(crm.normalised_states(training.states)).numpy()
+    support = ActionSupport(labels, logged_actions(view(), *steps))
+    epsilon_r, delta = 0.1 * float(crm.reward_std), report.delta["0.95"]
+    return ActionGenerator(view(), crm, clusters, support, epsilon_r, delta)
+
+
+def asked(
+    how: ActionGenerator, count: int = 3, seed: int = 0
+) -> tuple[AugmentedEpisodes, ActionReport]:
+    return how.propose(*view().all_steps(), count, seed)
+
+
+def sources(copies: AugmentedEpisodes) -> tuple[Tensor, Tensor, Tensor]:
+    """Logged states, actions and rewards of the steps that were changed, in float64."""
+    logged = planted_store().transitions(copies.action_source, copies.action_step)
+    return logged.states.double(), logged.actions.double(), logged.rewards.double()
+
+
+def test_the_other_reward_is_the_models_with_the_disturbance_kept() -> None:
+    exact = deepcopy(small_model()[0]).double()
+    copies, report = asked(others())
+    assert report.copies == len(copies.action_source) > 1_000
+    s, a, r = sources(copies)
+    rewards = view().step_values(schema.REWARD, *view().all_steps())
+    with torch.no_grad():
+        z = exact.abduct(s, a, r)
+        factual = exact.predict(s, a, z)
+        other = exact.predict(s, torch.from_numpy(copies.action).double(), z)
+    other = other.clamp(float(rewards.min()), float(rewards.max()))
+    np.testing.assert_allclose(copies.action_reward, other, rtol=1e-6, atol=1e-6)
+    assert (factual - r).abs().max() <= others().epsilon_r
+    change = copies.action_reward - r.numpy()
+    assert np.abs(change).min() > others().delta
+    assert report.mean_change == pytest.approx(change.mean())
+    assert report.earns_more == pytest.approx((change > 0).mean())
+
+
+def test_the_other_reward_is_near_the_true_one() -> None:
+    copies, _ = asked(others())
+    s, a, r = sources(copies)
+    truth = f(s, torch.from_numpy(copies.action).double()) - f(s, a)
+    change = torch.from_numpy(copies.action_reward).double() - r
+    assert torch.corrcoef(torch.stack([truth, change]))[0, 1] > 0.9
+
+
+def test_only_other_actions_of_the_same_cluster_are_asked_about() -> None:
+    copies, _ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
+    crm, clusters = small_model()[0], others().clusters
+    logged = view().transitions(*view().all_steps())
+    near = clusters.nearest(crm.normalised_states(logged.states)).tolist()
+    cluster_of = {
+        action.tobytes(): n for action, n in zip(logged.actions.numpy(), near, strict=True)
+    }
+    at = planted_store().transitions(copies.action_source, copies.action_step)
+    own = clusters.nearest(crm.normalised_states(at.states)).tolist()
+    assert [cluster_of[action.tobytes()] for action in copies.action] == own
+    assert (copies.action != at.actions.numpy()).any(axis=1).all()
+    assert set(copies.action_source) <= set(view().episode_ids)
+
+
+def test_the_gate_opens_and_shuts() -> None:
+    steps = view().n_steps
+    _, open_ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
+    # A draw of the logged action is not a proposal; in large clusters that is rare.
+    assert 2.9 * steps < open_.proposals <= 3 * steps
+    assert open_.copies == open_.proposals
+    assert open_.reproduced == 1
+    for closed in (replace(others(), epsilon_r=1e-12), replace(others(), delta=1e9)):
+        copies, report = asked(closed)
+        assert (len(copies.action_source), report.copies) == (0, 0)
+        assert (report.mean_change, report.earns_more) == (0, 0)
+        assert report.proposals == open_.proposals
+
+
+def test_draws_are_the_seeds() -> None:
+    first, again, other = (asked(others(), 1, seed)[0] for seed in (0, 0, 1))
+    assert np.array_equal(first.action_reward, again.action_reward)
+    assert not np.array_equal(first.action_reward[:50], other.action_reward[:50])
+
+
+def test_no_reward_leaves_the_range_of_the_log() -> None:
+    rewards = view().step_values(schema.REWARD, *view().all_steps())
+    exaggerating = deepcopy(small_model()[0])
+    exaggerating.reward_std *= 3
+    how = replace(others(), crm=exaggerating, epsilon_r=np.inf)
+    made = asked(how)[0].action_reward
+    assert (made.min(), made.max()) == (rewards.min(), rewards.max())
+
+
+def test_no_steps_make_no_copies() -> None:
+    nothing = np.zeros(0, dtype=np.int64)
+    copies, report = others().propose(nothing, nothing, 2, 0)
+    assert (report.proposals, len(copies.action_source)) == (0, 0)
+
+
+# From views of the log to copies of both kinds.
+
+
+def test_from_views_to_copies(tmp_path: Path) -> None:
+    copies, report = augment_episodes(
         planted_store().split("train"),
         planted_store().split("validation"),
         QUICK,
@@ -40,13 +374,13 @@ def test_from_views_to_an_overlay(tmp_path: Path) -> None:
     )
     assert report.reward_model.validation_transitions == planted_store().split("validation").n_steps
     assert any(warning.startswith("edit collapse") for warning in report.warnings)
-    assert len(overlay.edit_step) > 0
+    assert len(copies.edit_step) > 0
 
 
-def made(config: AugmentConfig, folder: Path, kind: str = "tangent") -> Overlay:
+def made(config: AugmentConfig, folder: Path, kind: str = "tangent") -> AugmentedEpisodes:
     views = planted_store().split("train"), planted_store().split("validation")
     csg = CSGConfig(kind=kind, epochs=1, hidden=32)  # type: ignore[arg-type]
-    return counterfactual_augmentation(*views, QUICK, csg, config, folder, seed=0)[0]
+    return augment_episodes(*views, QUICK, csg, config, folder, seed=0)[0]
 
 
 def test_asking_about_actions_leaves_the_edits_as_they_are(tmp_path: Path) -> None:
@@ -61,14 +395,14 @@ def test_actions_alone_need_no_generator(tmp_path: Path) -> None:
     views = planted_store().split("train"), planted_store().split("validation")
     config = AugmentConfig(copies=0, actions=1, epsilon_r=3.0, reward_quantile=0.5)
     kind = CSGConfig(kind="faithful")
-    overlay, report = counterfactual_augmentation(*views, QUICK, kind, config, tmp_path, seed=0)
+    copies, report = augment_episodes(*views, QUICK, kind, config, tmp_path, seed=0)
     assert not (tmp_path / "csg").exists()
-    assert (len(overlay.copy_source), report.copies, report.proposals) == (0, 0, 0)
+    assert (len(copies.copy_source), report.copies, report.proposals) == (0, 0, 0)
     assert report.verdict == "no state is edited"
     assert report.actions is not None
-    assert report.actions.copies == len(overlay.action_source) > 0
+    assert report.actions.copies == len(copies.action_source) > 0
     rewards = views[0].step_values(schema.REWARD, *views[0].all_steps())
-    logged = planted_store().step_values(schema.REWARD, overlay.action_source, overlay.action_step)
+    logged = planted_store().step_values(schema.REWARD, copies.action_source, copies.action_step)
     assert logged.min() >= np.quantile(rewards, 0.5)
 
 
@@ -95,12 +429,12 @@ def item_store() -> EpisodeStore:
     )
 
 
-def with_other_items(store: EpisodeStore, overlay: Overlay, copy: int) -> EpisodeStore:
+def with_other_items(store: EpisodeStore, copies: AugmentedEpisodes, copy: int) -> EpisodeStore:
     """The store as if the log had shown the item of an action copy."""
     at = store.all_steps()
     items = store.step_values(schema.ITEM, *at)
-    here = (at[0] == overlay.action_source[copy]) & (at[1] == overlay.action_step[copy])
-    items[here] = overlay.action[copy]
+    here = (at[0] == copies.action_source[copy]) & (at[1] == copies.action_step[copy])
+    items[here] = copies.action[copy]
     return EpisodeStore.from_arrays(
         {schema.ITEM: items, schema.REWARD: store.step_values(schema.REWARD, *at)},
         store.lengths,
@@ -116,19 +450,18 @@ def test_additive_effects_read_the_other_item_where_it_would_have_been_shown(
     train, validation = store.split("train"), store.split("validation")
     config = AugmentConfig(copies=0, actions=2, epsilon_r=10.0)
     crm = CRMConfig(mean="effects", epochs=1, hidden=16)
-    overlay, report = counterfactual_augmentation(
-        train, validation, crm, CSGConfig(), config, tmp_path, seed=0
-    )
+    copies, report = augment_episodes(train, validation, crm, CSGConfig(), config, tmp_path, seed=0)
     assert report.actions is not None
     assert report.actions.copies > 20
-    assert overlay.action_reward.min() >= 0
-    assert overlay.action_reward.max() <= 1
+    assert copies.action_reward.min() >= 0
+    assert copies.action_reward.max() <= 1
     model, _ = fit_item_reward_model(train, validation, tmp_path / "item-reward", 0)
-    read, places = EffectTransitions(model), train.n_episodes + np.arange(5)
-    copied = read(train.with_overlay(overlay), places, overlay.action_step[:5])
+    positions = np.searchsorted(train.episode_ids, copies.action_source[:5])
+    at = train, positions, copies.action_step[:5]
+    copied = read_transitions(*at, model, copies.action[:5])
     for copy in range(5):
-        episode, step = overlay.action_source[[copy]], overlay.action_step[[copy]]
-        shown = read(with_other_items(store, overlay, copy), episode, step)
+        episode, step = copies.action_source[[copy]], copies.action_step[[copy]]
+        shown = read_transitions(with_other_items(store, copies, copy), episode, step, model)
         torch.testing.assert_close(copied.actions[copy], shown.actions[0])
         # What was not known before the step is not in its state.
         assert torch.equal(shown.states, store.transitions(episode, step).states)
@@ -137,9 +470,10 @@ def test_additive_effects_read_the_other_item_where_it_would_have_been_shown(
 def test_interventions_change_the_flagged_dimensions_alone(tmp_path: Path) -> None:
     store = planted_vectors(tmp_path / "store", trajectories=20, length=30)
     train = store.split("train")
-    union = train.with_overlay(interventions(train, [1, 4], seed=5))
+    made = interventions(train, [1, 4], seed=5)
+    union = TrainingEpisodes(train, made)
     n = train.n_episodes
-    assert union.n_episodes == 3 * n
+    assert union.n_steps == 3 * train.n_steps
     factual = train.windows(np.arange(n), train.lengths - 1, 30).states
     held, redrawn = (
         union.windows(np.arange(k * n, (k + 1) * n), train.lengths - 1, 30) for k in (1, 2)
@@ -156,16 +490,4 @@ def test_interventions_change_the_flagged_dimensions_alone(tmp_path: Path) -> No
     cut = np.corrcoef(drawn[:, 0], factual[..., 1].reshape(-1))[0, 1]
     assert abs(cut) < 0.15
     again = interventions(train, [1, 4], seed=5)
-    assert union.overlay is not None
-    np.testing.assert_array_equal(again.edit_state, union.overlay.edit_state)
-
-
-def test_overlays_join_in_order(tmp_path: Path) -> None:
-    train = planted_vectors(tmp_path / "store", trajectories=20, length=10).split("train")
-    first, second = (interventions(train, [d], seed=d, copies=1) for d in (0, 3))
-    union, n = train.with_overlay(first.joined(second)), train.n_episodes
-    for k, alone in ((1, first), (2, second)):
-        copies = np.arange(k * n, (k + 1) * n)
-        there = union.windows(copies, train.lengths - 1, 10).states
-        wanted = train.with_overlay(alone).windows(np.arange(n, 2 * n), train.lengths - 1, 10)
-        assert torch.equal(there, wanted.states)
+    np.testing.assert_array_equal(again.edit_state, made.edit_state)

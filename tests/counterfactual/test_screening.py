@@ -1,63 +1,15 @@
-"""Screening finds what causes nothing, and keeps what causes something."""
+"""Screening of logs of items finds what measures the reward, and keeps what causes something."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.support.causes import QUICK, planted_category, planted_items, planted_vectors
+from tests.support.causes import QUICK, planted_items, planted_vectors
 from ucfrec import schema
-from ucfrec.counterfactual.screening import describe_screening, screen
+from ucfrec.counterfactual.screening import screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-
-
-def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None:
-    store = planted_vectors(tmp_path / "store")
-    report = screen(store.split("train"), QUICK, seed=0)
-    assert report.flagged == (3, 4)
-    by_dimension = report.dimensions
-    assert by_dimension[0].helps[0] == 1
-    assert by_dimension[0].effect > 0.1
-    assert by_dimension[2].reward_effect > 0.1
-    assert abs(by_dimension[3].effect) < 0.03
-    assert by_dimension[3].reward_effect < 0.01
-    assert screen(store.split("train"), QUICK, seed=0) == report
-
-
-def test_a_few_violent_steps_do_not_decide(tmp_path: Path) -> None:
-    store = planted_vectors(tmp_path / "store", jolt=40.0)
-    assert screen(store.split("train"), QUICK, seed=0).flagged == (3, 4)
-    # What they would decide: that nothing helps to predict what is jolted.
-    uncapped = screen(store.split("train"), replace(QUICK, capped=0.0), seed=0)
-    assert uncapped.dimensions[0].p_value > QUICK.level
-
-
-def test_indicators_of_a_category_are_kept_beside_a_measurement(tmp_path: Path) -> None:
-    """One by one they follow from the others, and never change within an episode."""
-    store = planted_category(tmp_path / "store")
-    report = screen(store.split("train"), QUICK, seed=0)
-    assert report.flagged == (6, 7)
-    indicators = report.dimensions[1:6]
-    assert all(each.reward_effect < 0.01 for each in indicators)
-    assert all(not set(each.helps) & {1, 2, 3, 4, 5} for each in report.dimensions)
-
-
-def test_weak_causes_of_a_noisy_reward_are_kept(tmp_path: Path) -> None:
-    """Where a quarter of the reward is noise, no visible help is not evidence."""
-    store = planted_category(tmp_path / "store", moves=0.05, noise=0.5)
-    report = screen(store.split("train"), QUICK, seed=0)
-    assert report.flagged == (6,)
-    # Taken as evidence, the same help would do away with the category.
-    trusting = screen(store.split("train"), replace(QUICK, min_reward_r2=0.5), seed=0)
-    assert set(trusting.flagged) >= {1, 2, 3, 4, 5, 6}
-
-
-def test_too_few_trajectories_are_refused(tmp_path: Path) -> None:
-    store = planted_vectors(tmp_path / "store", trajectories=8)
-    with pytest.raises(InputError, match="screening needs at least 15"):
-        screen(store.split("train"), QUICK, seed=0)
 
 
 @pytest.mark.parametrize("flip", [0.0, 0.15])
@@ -69,11 +21,16 @@ def test_in_logs_of_clicks_measurements_are_flagged_and_causes_are_not(
     assert report.flagged == (0, 4)
     assert [d.measures_reward for d in report.dimensions] == [True, False, False, False, True]
     assert report.dimensions[0].effect is None
-    assert "dimensions without effect: 0, 4" in describe_screening(report)
+    assert "dimensions without effect: 0, 4" in report.describe()
 
 
-def test_logs_without_observations_have_nothing_to_screen(tmp_path: Path) -> None:
+def test_what_cannot_be_screened_is_refused(tmp_path: Path) -> None:
     columns = {schema.ITEM: np.zeros(8, dtype=np.int64), schema.REWARD: np.arange(8.0)}
-    none = EpisodeStore.write(tmp_path / "store", columns, np.full(4, 2))
-    with pytest.raises(InputError, match="no logged observations to screen"):
-        screen(none, QUICK, seed=0)
+    none = EpisodeStore.write(tmp_path / "none", columns, np.full(4, 2))
+    for store, message in (
+        (none, "no logged observations to screen"),
+        (planted_vectors(tmp_path / "vectors"), "are vectors; screen it with ucfrec-control"),
+        (planted_items(tmp_path / "few", sessions=8), "screening needs at least 15"),
+    ):
+        with pytest.raises(InputError, match=message):
+            screen(store, QUICK, seed=0)

@@ -13,13 +13,12 @@ from ucfrec import schema
 from ucfrec.arrays import Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.session_metrics import bootstrap_interval
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import prepare
-from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.verdict import conclude
+from ucfrec.off_policy.verdict import conclude, diagnose
+from ucfrec.results.statistics import bootstrap_interval
 from ucfrec_datasets.obd import DATASET
 
 ITEMS, POSITIONS, ROWS = 6, 3, 400

@@ -13,9 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Step, rollout
-from ucfrec.acting.uniform import Uniform
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.acting.rollout import Step, Uniform, rollout
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.diversity import (
@@ -30,8 +29,8 @@ from ucfrec.evaluation.diversity import (
     tag_jaccard,
     variety_columns,
 )
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views

@@ -12,14 +12,13 @@ import pytest
 from gymnasium import spaces
 
 from tests.support.gymnasium_environments import ITEMS, LENGTH
-from ucfrec.acting.rollout import Step, rollout
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment, item_table
-from ucfrec.results.rows_file import read_results
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.results.rows import read_results
 from ucfrec.schema import USER_IDS
 
 MODULE = "tests.support.gymnasium_environments"

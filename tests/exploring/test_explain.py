@@ -10,8 +10,8 @@ import pytest
 from tests.recommending.test_recommend import random_log
 from ucfrec import DecisionRule, FeatureTable, LogMapping, Recommender
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
-from ucfrec.python_api.given_data import histories_given
+from ucfrec.exploring.explain import PARTS, Explained, explain, read_pasted
+from ucfrec.python_api.given_data import read_histories
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Recommender:
 
 
 def explained(policy: Recommender, rule: DecisionRule, seen: bool = False) -> Explained:
-    (user,) = histories_given(policy.trained, None, None, [7])
+    (user,) = read_histories(policy.trained, None, None, [7])
     return explain(policy.trained, rule, user, 5, seen)
 
 
@@ -72,11 +72,11 @@ def test_excluded_items_have_their_reason(policy: Recommender) -> None:
     assert not explained(policy, DecisionRule(2.0)).excluded
 
 
-def test_a_pasted_history_is_recommended_for(policy: Recommender) -> None:
-    frame = pasted_history("3, 1\n\n5\n 7,0 ")
+def test_a_read_pasted_is_recommended_for(policy: Recommender) -> None:
+    frame = read_pasted("3, 1\n\n5\n 7,0 ")
     assert frame.item_id.tolist() == ["3", "5", "7"]
     assert frame.reward.tolist() == [1, 0, 0]
-    (user,) = histories_given(policy.trained, frame, None, None)
+    (user,) = read_histories(policy.trained, frame, None, None)
     found = explain(policy.trained, DecisionRule(2.0), user, 4, True)
     assert [str(item) for item, _ in found.rows] == ["7", "5", "3"]
     assert len(found.cards) == 4
@@ -86,4 +86,4 @@ def test_a_pasted_history_is_recommended_for(policy: Recommender) -> None:
         ("1\n" * 1001, "1,001 rows; paste at most 1,000"),
     ):
         with pytest.raises(InputError, match=message):
-            pasted_history(text)
+            read_pasted(text)

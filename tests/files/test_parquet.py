@@ -17,7 +17,7 @@ from ucfrec.evaluation.gymnasium_environment import item_table
 from ucfrec.files import parquet
 from ucfrec.files.parquet import read_ids, require_plausible_rows, require_plausible_size
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
-from ucfrec.reporting.samples import read_features
+from ucfrec.reporting.training import read_features
 
 
 def test_ids_come_back(tmp_path: Path) -> None:

@@ -15,10 +15,12 @@ from ucfrec.off_policy.estimators import (
     DR_KINDS,
     IPS_KINDS,
     LOGGED,
+    MOST_CLUSTERS,
+    cluster_intervals,
+    cluster_mean,
     estimate,
     mean_squared_error,
     session_terms,
-    step_value,
     tune,
 )
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
@@ -284,22 +286,6 @@ def test_the_behavior_itself_is_its_own_mean() -> None:
         assert one.high == pytest.approx(returns.mean() + 1.98 * error, abs=0.3 * error)
 
 
-def test_weights_without_a_reward_have_no_interval() -> None:
-    """Of 10,000 sessions, those that the policy would repeat had no reward: that is not 0 ± 0."""
-    rng = np.random.default_rng(0)
-    action = rng.integers(100, size=10_000)
-    steps = LoggedSteps(
-        session=np.arange(10_000),
-        reward=(action > 50).astype(float),
-        propensity=np.full(10_000, 0.01),
-        target=(action == 7).astype(float),
-    )
-    for name in ("IPS", "SNIPS", "PDIS", "SNPDIS"):
-        one = estimate(steps, 0)[name]
-        assert one.value == 0
-        assert (one.low, one.high) == (None, None)
-
-
 def test_a_few_missing_propensities_leave_their_sessions_out() -> None:
     """One in 4,000 does not switch the rest off."""
     steps = random_steps([2] * 2000, modelled=False)
@@ -370,63 +356,84 @@ def test_shrinking_is_tuned_to_err_less_where_weights_are_heavy() -> None:
         np.testing.assert_allclose(shrink(weights, unshrunk), weights)
 
 
-ITEMS = 6
-PAYS = np.linspace(0, 1, ITEMS)
-TARGET = np.array([0.05, 0.05, 0.1, 0.2, 0.2, 0.4])
-TRUTH = float(TARGET @ PAYS)
+def column(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values, dtype=np.float64)[:, None]
 
 
-def logs(seed: int, share: float = 0.2, sessions: int = 300, wrong: float = 1.0) -> LoggedSteps:
-    """Sessions of six steps of three users each; a share of the steps shows a random item, with its
-    propensity, and the others favour bad items, with none."""
-    rng, n = np.random.default_rng(seed), 6 * sessions
-    user = np.arange(sessions) // 3
-    random = rng.random(n) < share
-    usual = rng.choice(ITEMS, n, p=TARGET[::-1])
-    item = np.where(random, rng.integers(ITEMS, size=n), usual)
-    # Steps of a user are alike.
-    liking = rng.normal(0, 0.3, user.max() + 1)[user][np.repeat(np.arange(sessions), 6)]
-    return LoggedSteps(
-        session=np.repeat(np.arange(sessions), 6),
-        reward=PAYS[item] + liking + rng.normal(0, 0.3, n),
-        propensity=np.where(random, wrong / ITEMS, np.nan),
-        target=TARGET[item],
-        # A model that is wrong by a constant.
-        model=Modelled(np.full(n, TRUTH + 0.2), np.zeros(n), np.zeros(n), PAYS[item] + 0.2),
-        user=user,
-    )
+def covers(interval: object, truth: float) -> bool:
+    return interval is not None and interval.low <= truth <= interval.high  # type: ignore[attr-defined]
 
 
-def test_intervals_cover_the_value_of_the_policy_per_step() -> None:
-    covered = dict.fromkeys(("IPS", "SNIPS", "DR"), 0)
-    values = []
-    for seed in range(25):
-        found = step_value(logs(seed), 0).estimates
-        values.append([found[name].value for name in covered])
-        for name in covered:
-            low, high = found[name].low, found[name].high
-            assert low is not None
-            assert high is not None
-            covered[name] += low <= TRUTH <= high
-    assert min(covered.values()) >= 21
-    np.testing.assert_allclose(np.mean(values, axis=0), TRUTH, atol=0.03)
+def test_sessions_of_one_user_are_resampled_together() -> None:
+    """Users of 20 sessions each, taste far more different between than within them."""
+    together = apart = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        taste = np.repeat(rng.normal(size=40), 20)
+        values, ones = column(taste + 0.5 * rng.normal(size=800)), np.ones((800, 1))
+        users = np.repeat(rng.permutation(40), 20)
+        together += covers(cluster_intervals(values, ones, users, seed)[0], 0.0)
+        apart += covers(cluster_intervals(values, ones, None, seed)[0], 0.0)
+    assert together >= 26
+    assert apart <= 15
 
 
-def test_the_lift_is_over_the_same_steps_as_logged() -> None:
-    steps = logs(1)
-    found = step_value(steps, 0)
-    known = ~np.isnan(steps.propensity)
-    assert (found.steps, found.of) == (known.sum(), len(known))
-    logged = found.estimates["logged"].value
-    assert logged == pytest.approx(steps.reward[known].mean())
-    assert found.lift.value == pytest.approx(found.estimates["DR"].value - logged)
-    assert found.lift.low is not None
-    assert found.lift.low > 0
-    assert "not an estimate of the session return" in str(found)
-    assert found.doubt is None
+def test_heavy_weights_are_covered_as_the_percentile_interval_does_not() -> None:
+    studentised = percentile = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        weights = rng.lognormal(sigma=1.2, size=200) / np.exp(0.72)
+        (interval,) = cluster_intervals(column(weights), np.ones((200, 1)), None, seed)
+        studentised += covers(interval, 1.0)
+        means = rng.choice(weights, (1000, 200)).mean(axis=1)
+        low, high = np.quantile(means, [0.025, 0.975])
+        percentile += bool(low <= 1 <= high)
+    assert studentised >= 90
+    assert studentised > percentile
 
 
-def test_wrong_propensities_are_doubted() -> None:
-    doubt = step_value(logs(2, wrong=0.5), 0).doubt
-    assert doubt is not None
-    assert "where 1 is expected" in doubt
+def test_ratios_and_columns_are_independent_of_each_other() -> None:
+    rng = np.random.default_rng(0)
+    above, below = rng.normal(size=(50, 2)), rng.uniform(1, 2, (50, 2))
+    both = cluster_intervals(above, below, None, seed=3)
+    for k in range(2):
+        (alone,) = cluster_intervals(above[:, [k]], below[:, [k]], None, seed=3)
+        assert both[k] is not None
+        assert vars(both[k]) == pytest.approx(vars(alone))
+    # Scales neither overflow nor change anything but the unit.
+    huge = cluster_intervals(above * 1e100, below, None, seed=3)
+    assert huge[0] is not None
+    assert huge[0].low == pytest.approx(both[0].low * 1e100)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("values", "users"),
+    [
+        (np.zeros(50), None),
+        (np.ones(50), None),
+        (np.arange(50), np.zeros(50, dtype=np.int64)),
+        (np.eye(1, 50)[0], None),
+    ],
+)
+def test_where_nothing_spreads_there_is_no_interval(
+    values: np.ndarray, users: np.ndarray | None
+) -> None:
+    assert cluster_intervals(column(values), np.ones((50, 1)), users, 0) == [None]
+
+
+def test_more_clusters_than_are_drawn_from_change_no_error() -> None:
+    values = column(np.random.default_rng(0).exponential(size=3 * MOST_CLUSTERS))
+    (interval,) = cluster_intervals(values, np.ones_like(values), None, seed=0)
+    assert interval is not None
+    expected = values.std() / len(values) ** 0.5
+    assert interval.error == pytest.approx(expected, rel=0.03)
+    assert interval.high - interval.low == pytest.approx(2 * 1.96 * expected, rel=0.08)
+
+
+def test_means_have_clustered_errors() -> None:
+    values = np.repeat([0.0, 1.0, 5.0], 4)
+    mean, error = cluster_mean(values, np.repeat([7, 3, 9], 4))
+    assert mean == pytest.approx(2.0)
+    assert error == pytest.approx(np.std([0, 1, 5], ddof=1) / 3**0.5)
+    weights = np.repeat([1.0, 1.0, 0.0], 4)
+    assert cluster_mean(values, np.repeat([7, 3, 9], 4), weights)[0] == pytest.approx(0.5)

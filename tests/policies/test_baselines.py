@@ -1,259 +1,141 @@
-"""The baselines: invariants they share, what distinguishes each, and that it matters."""
+"""Popular items, rates and recent ones: what they equal, and the half-life that fits best."""
 
+import math
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, VECTORS, both_heads, build, changed_at, random_windows
-from tests.support.episodes import lengths_of, random_episodes, some_states, write_store
+from tests.support.logs import store_of
+from tests.support.tagged import tagged_store
+from ucfrec.commands.cli import main
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.cdt4rec import CDT4RecPolicy
-from ucfrec.policies.dt4rec import DT4RecPolicy
-from ucfrec.policies.edt4rec import (
-    ConservativeQ,
-    CQLConfig,
-    EDT4RecPolicy,
-    _consistent,
-    _entropy,
-    optimistic_returns,
-    relabelled,
+from ucfrec.policies.baselines import (
+    HALF_LIVES,
+    RecentClicksPolicy,
+    RecentRatePolicy,
+    count_decayed,
+    shrink_rates,
 )
-from ucfrec.policies.registry import policy_class
+from ucfrec.results.rows import read_results
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.start import new_policy
+from ucfrec.runs.run import train_run
+from ucfrec.runs.trained_policy import TrainedPolicy
+
+ITEMS, DAYS = 20, 10
 
 
-def gradients(policy: SequencePolicy, windows: Windows, part: str) -> Tensor:
-    """Of the loss, with respect to the parameters whose name begins with `part`."""
-    policy.zero_grad()
-    torch.manual_seed(3)
-    policy.loss(windows)[0].backward()
-    named = [p for name, p in policy.named_parameters() if name.startswith(part)]
-    return torch.cat([torch.zeros(1) if p.grad is None else p.grad.ravel() for p in named])
-
-
-@both_heads
-@pytest.mark.parametrize(
-    ("name", "switch", "part"),
-    [
-        ("cdt4rec", {"reward_weight": 0.0}, "estimate"),
-        ("dt4rec", {"contrastive_weight": 0.0}, "embed.embed_return"),
-    ],
-)
-def test_switching_the_distinguishing_part_off_changes_loss_and_gradient(
-    name: str, switch: dict[str, float], part: str, sizes: dict[str, int]
-) -> None:
-    windows = random_windows(sizes)
-    policy, without = build(name, sizes), build(name, sizes, **switch)
-    on, off = gradients(policy, windows, part), gradients(without, windows, part)
-    assert on.abs().max() > 1e-6
-    assert not torch.allclose(on, off)
-    torch.manual_seed(3)
-    loss, scalars = policy.loss(windows)
-    torch.manual_seed(3)
-    plain, _ = without.loss(windows)
-    (weight,) = switch
-    extra = scalars["reward_loss" if name == "cdt4rec" else "contrastive_loss"]
-    torch.testing.assert_close(loss - plain, getattr(policy.config, weight) * extra)
-    # The shared blocks learn from it as well.
-    assert not torch.allclose(
-        gradients(policy, windows, "blocks"), gradients(without, windows, "blocks")
+def drifting_store(folder: Path, drifts: bool) -> EpisodeStore:
+    """A log in which, if it drifts, other items are liked every day."""
+    rng, n = np.random.default_rng(0), 8000
+    log = pd.DataFrame(
+        {"user_id": rng.integers(60, size=n), "item_id": rng.integers(ITEMS, size=n)}
     )
+    days = np.sort(rng.random(n)) * DAYS
+    log["timestamp"] = 1_700_000_000_000 + (days * 86_400_000).astype(np.int64)
+    favourite = (log.item_id + (days.astype(int) if drifts else 0)) % 10 < 3
+    log["reward"] = (rng.random(n) < np.where(favourite, 0.8, 0.1)).astype(float)
+    return store_of(log, folder, reward="reward", session_by="user", split=(0.85, 0.05, 0.1))
 
 
-def trained(policy: SequencePolicy, windows: Windows, steps: int = 150) -> SequencePolicy:
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
-    policy.train()
-    for step in range(steps):
-        torch.manual_seed(step)
-        optimizer.zero_grad()
-        policy.loss(windows)[0].backward()
-        optimizer.step()
-    return policy.eval()
+def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
+    train = drifting_store(tmp_path, drifts=False).split("train")
+    whole, half = count_decayed(train, math.inf), count_decayed(train, 24.0)
+    exact = TrainingCounts.of(train)
+    torch.testing.assert_close(whole.shown, exact.shown.double())
+    torch.testing.assert_close(whole.liked, exact.liked.double())
+    times = train.column("timestamp")
+    weights = 0.5 ** ((times.max() - times) / 86_400_000)
+    expected = np.bincount(train.column("item"), weights, ITEMS)
+    np.testing.assert_allclose(half.shown, expected, rtol=1e-9)
 
 
-@both_heads
-def test_the_reward_estimator_learns_the_reward_of_the_action_taken(sizes: dict[str, int]) -> None:
-    policy, windows = build("cdt4rec", sizes, dropout=0.0), random_windows(sizes)
-    assert isinstance(policy, CDT4RecPolicy)
-    first = policy.loss(windows)[1]["reward_loss"]
-    trained(policy, windows)
-    assert policy.loss(windows)[1]["reward_loss"] < 0.1 * first
-    hidden = policy.transform(policy.normalize(windows))
-    estimate = policy.estimated_rewards(hidden, windows.mask)
-    later = changed_at(windows, (slice(None), 6), ("actions",))
-    hidden = policy.transform(policy.normalize(later))
-    moved = policy.estimated_rewards(hidden, windows.mask)
-    torch.testing.assert_close(moved[:, :6], estimate[:, :6])
-    assert not torch.allclose(moved[:, 6], estimate[:, 6])
+@pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])
+def test_the_half_life_is_short_where_tastes_change(
+    tmp_path: Path, kind: type[RecentRatePolicy]
+) -> None:
+    hours = {}
+    for drifts in (False, True):
+        (tmp_path / str(drifts)).mkdir()
+        store = drifting_store(tmp_path / str(drifts), drifts)
+        hours[drifts] = kind.best_half_life(store.split("train"), store.split("validation"))
+    assert hours[True] <= 24 < 96 <= hours[False]
+    assert {*hours.values()} <= {*HALF_LIVES}
 
 
-def test_near_returns_have_near_prompts_within_the_hull_of_the_buckets() -> None:
-    policy = build("dt4rec", VECTORS)
-    assert isinstance(policy, DT4RecPolicy)
-    prompt = policy.embed.embed_return
-    returns = torch.tensor([0.30, 0.31, 0.90]).view(1, 3, 1)
-    near, nearer, far = prompt(returns)[0]
-    assert (near - nearer).norm() < (near - far).norm()
-    buckets = prompt.embed_centre(prompt.centres.unsqueeze(-1))
-    assert (near >= buckets.min(0).values - 1e-5).all()
-    assert (near <= buckets.max(0).values + 1e-5).all()
+def test_rates_are_shrunk_to_the_mean() -> None:
+    counts = TrainingCounts(torch.tensor([0, 10, 1000]), torch.tensor([0, 10, 100]), 5)
+    mean = 110.5 / 1011
+    expected = [mean, (10 + 10 * mean) / 20, (100 + 10 * mean) / 1010]
+    np.testing.assert_allclose(shrink_rates(counts), expected, rtol=1e-6)
 
 
-@pytest.mark.slow
-@both_heads
-def test_the_contrast_teaches_to_answer_what_was_asked(sizes: dict[str, int]) -> None:
-    windows = random_windows(sizes)
-
-    def contrast(weight: float) -> float:
-        settings = {"dropout": 0.0, "recurrent_dropout": 0.0, "layers": 1}
-        policy = build("dt4rec", sizes, contrastive_weight=weight, **settings)
-        assert isinstance(policy, DT4RecPolicy)
-        trained(policy, windows, 60)
-        torch.manual_seed(0)
-        normalized = policy.normalize(windows)
-        encoded = policy.tokens(normalized)[1:]
-        features = policy.features(normalized)
-        return policy.contrastive_loss(normalized, encoded, features).item()
-
-    assert contrast(10.0) < 0.85 * contrast(0.0)
-
-
-@pytest.mark.slow
-@both_heads
-def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str, int]) -> None:
-    windows = random_windows(sizes)
-    entropies = {}
-    for beta in (-1e3, 0.9):
-        settings = {"vector_entropy": beta, "item_entropy": beta, "layers": 1}
-        policy = build("edt4rec", sizes, dropout=0.0, multiplier=1.0, **settings)
-        assert isinstance(policy, EDT4RecPolicy)
-        before = policy.log_multiplier.item()
-        trained(policy, windows, 250)
-        features = policy.features(policy.normalize(_consistent(windows)))[windows.mask]
-        entropies[beta] = _entropy(policy.head, features, None).item()
-        if beta < 0:
-            assert policy.log_multiplier.item() < before
-        else:
-            assert entropies[beta] > 0.8 * policy.least_entropy
-    assert entropies[-1e3] < entropies[0.9] - 0.5
+def test_the_best_item_is_shown_first_and_tags_are_left_out(tmp_path: Path) -> None:
+    store = tagged_store(tmp_path)
+    settings = ["rule.choose=false", "rule.default_tag_window=2", "policy.context=4"]
+    train_run(store, tmp_path / "run", resolve_config("item-rate", None, settings))
+    trained = TrainedPolicy.load(tmp_path / "run")
+    assert trained.rule.tag_window == 2
+    counts = TrainingCounts.of(store.split("train"))
+    order = shrink_rates(counts).argsort(descending=True, stable=True)
+    actor = trained.actor(3)
+    actor.begin(np.arange(3))
+    shown = []
+    for _ in range(3):
+        items, _ = actor.act(np.zeros((3, 0), dtype=np.float32), np.ones(3, dtype=bool))
+        actor.observe(items, np.ones(3, dtype=np.float32))
+        assert len(set(items)) == 1
+        shown.append(int(np.flatnonzero(trained.item_ids == items[0])[0]))
+    assert shown[0] == int(order[0])
+    tags = store.item_states.tags
+    seen = [set(tags[item].tolist()) - {-1} for item in shown]
+    assert not seen[0] & seen[1]
+    assert not seen[2] & (seen[0] | seen[1])
 
 
-def test_relabelled_windows_are_as_when_acting() -> None:
-    windows = _consistent(random_windows(CATALOG))
-    fall = windows.returns_to_go[:, :-1] - windows.returns_to_go[:, 1:]
-    there = windows.mask[:, :-1]
-    torch.testing.assert_close(fall[there], windows.rewards[:, :-1][there])
-    assert (windows.returns_to_go[~windows.mask] == 0).all()
-
-
-@given(st.lists(st.integers(1, 9), min_size=1, max_size=8), st.integers(0, 999))
-def test_optimistic_returns_are_those_of_the_recursion(lengths: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rewards, values = rng.normal(size=sum(lengths)), 3 * rng.normal(size=sum(lengths))
-    expected, end = [], 0
-    for length in lengths:
-        end += length
-        value, own = 0.0, []
-        for t in range(end - 1, end - length - 1, -1):
-            best = 0.0 if t == end - 1 else max(value, values[t + 1])
-            value = rewards[t] + best
-            own.append(value)
-        expected += own[::-1]
-    found = optimistic_returns(rewards, values, np.array(lengths))
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("items", [True, False])
-def test_relabelling_is_a_store_that_promises_no_less(tmp_path: Path, items: bool) -> None:
-    episodes = random_episodes([5, 3, 7, 1, 4], items=items)
-    store = write_store(tmp_path / "store", episodes, some_states() if items else None)
-    view = store.select(np.array([0, 2, 4]))
-    config = CQLConfig(steps=20, hidden=16, batch_size=8, candidates=6)
-    new = relabelled(view, config, tmp_path / "q", seed=0)
-    assert new.n_episodes == 3
-    before = view.step_values("return_to_go", *view.all_steps())
-    after = new.step_values("return_to_go", *new.all_steps())
-    assert (after >= before - 1e-4).all()
-    assert (after > before + 1e-3).any()
-    others = np.array([1, 3])
-    np.testing.assert_array_equal(store.select(others).returns, store.returns[others])
-    again = relabelled(view, config, tmp_path / "q", seed=0)
-    np.testing.assert_array_equal(again.step_values("return_to_go", *new.all_steps()), after)
-
-
-def test_cql_values_the_better_action_and_presses_unseen_ones_down(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    actions = np.where(rng.random((600, 1)) < 0.5, 0.5, -0.5).astype(np.float32)
+def test_vectors_have_no_rate(tmp_path: Path) -> None:
     columns = {
-        "action": actions,
-        "reward": (actions[:, 0] > 0).astype(np.float32),
-        "observation": rng.normal(size=(600, 2)).astype(np.float32),
+        "observation": np.zeros((8, 2), dtype=np.float32),
+        "action": np.zeros((8, 1), dtype=np.float32),
+        "reward": np.arange(8, dtype=np.float32),
     }
-    store = EpisodeStore.write(tmp_path / "store", columns, np.ones(600, dtype=np.int64))
-    values = {}
-    for weight in (0.0, 5.0):
-        config = CQLConfig(steps=200, hidden=32, candidates=16, weight=weight)
-        torch.manual_seed(0)
-        network = ConservativeQ(store, config)
-        optimizer = torch.optim.Adam(network.network.parameters(), lr=5e-3)
-        for _ in range(config.steps):
-            batch = store.transitions(*store.draw_steps(rng, 128))
-            optimizer.zero_grad()
-            network.loss(batch)[0].backward()
-            optimizer.step()
-        states = torch.zeros(3, 2)
-        played = torch.tensor([[0.5], [-0.5], [0.0]])
-        values[weight] = network.q(states, played).detach()
-    assert values[0.0][0] > values[0.0][1] + 0.5
-    assert abs(values[0.0][0] - 1) < 0.2
-    seen, unseen = values[5.0][:2].mean(), values[5.0][2]
-    assert seen - unseen > values[0.0][:2].mean() - values[0.0][2] + 0.5
+    store = EpisodeStore.write(tmp_path / "store", columns, np.array([4, 4]))
+    with pytest.raises(InputError, match="store of items"):
+        train_run(store, tmp_path / "run", resolve_config("item-rate", None, []))
 
 
-@pytest.mark.parametrize("name", ["bc", "dt", "dc", "lsdt", "ucf", "edt4rec"])
-def test_a_share_learns_from_the_best_sessions(name: str, tmp_path: Path) -> None:
-    store = write_store(tmp_path / "store", random_episodes([4] * 20), some_states())
-    policy_type = policy_class(name)
-    own = {"cql_steps": 2} if name == "edt4rec" else {}
-
-    def view(share: float) -> EpisodeStore:
-        config = policy_type.Config(best_share=share, **own)
-        return policy_type.training_view(store, config, tmp_path / str(share), 0)
-
-    assert view(0.25).episode_ids.tolist() == sorted(np.argsort(-store.returns)[:5])
-    assert view(1.0).n_episodes == 20
-    with pytest.raises(InputError, match=r"policy\.best_share is 0"):
-        view(0.0)
+PEERS = ("bpr", "gsasrec", "boosted")
 
 
-def test_popular_recommends_what_is_popular(tmp_path: Path) -> None:
-    episodes = random_episodes([30] * 6)
-    store = write_store(tmp_path / "store", episodes, some_states())
-    policy = new_policy(store, resolve_config("popular"))
-    scores = policy.act(store.windows(np.array([0, 1]), np.array([3, 9]), 4))
-    counts = np.bincount(np.concatenate([e.items for e in episodes]), minlength=11)
-    assert lengths_of(episodes).sum() == counts.sum()
-    torch.testing.assert_close(scores[0].softmax(-1), scores[1].softmax(-1))
-    np.testing.assert_array_equal(scores[0].argsort().numpy()[-1], counts.argmax())
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
+    """Users who like the items of one of four kinds; a policy of no user has a GAUC of .5."""
+    folder, rng, n = tmp_path_factory.mktemp("peers"), np.random.default_rng(0), 12_000
+    log = pd.DataFrame({"user_id": rng.integers(120, size=n), "item_id": rng.integers(40, size=n)})
+    own = log.user_id % 4 == log.item_id % 4
+    log["reward"] = (rng.random(n) < np.where(own, 0.8, 0.05)).astype(float)
+    log["timestamp"] = 1_700_000_000_000 + 60_000 * np.arange(n)
+    # Most of what is shown was liked: gSASRec sees which items were shown, and no rewards.
+    log = log[(log.reward > 0) | (rng.random(n) < 0.05)]
+    return store_of(log, folder, reward="reward", session_by="user")
 
 
-def test_buckets_and_reward_scale_come_from_the_training_data(tmp_path: Path) -> None:
-    store = write_store(tmp_path / "store", random_episodes([6] * 9), some_states())
-    prompted = new_policy(store, resolve_config("dt4rec"))
-    assert isinstance(prompted, DT4RecPolicy)
-    returns = store.step_values("return_to_go", *store.all_steps()) / float(prompted.return_scale)
-    centres = prompted.embed.embed_return.centres
-    assert (float(centres[0]), float(centres[-1])) == pytest.approx((returns.min(), returns.max()))
-    estimating = new_policy(store, resolve_config("cdt4rec"))
-    assert isinstance(estimating, CDT4RecPolicy)
-    rewards = store.step_values("reward", *store.all_steps())
-    assert float(estimating.reward_std) == pytest.approx(rewards.std(), rel=1e-5)
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_beat_popularity_where_users_differ(
+    store: EpisodeStore, tmp_path: Path, name: str
+) -> None:
+    run, out = str(tmp_path / name), tmp_path / "rows.json"
+    settings = ["train.steps=300", "train.learning_rate=0.01", "train.validate_every=100"]
+    settings += ["policy.dim=16", "policy.context=10", "rule.choose=false", "train.warmup_steps=0"]
+    words = [word for each in settings for word in ("--set", each)]
+    command = ["train", str(store.path), "--out", run, "--policy", name, *words, "--no-refit"]
+    assert main(command) == 0
+    assert main(["rank", run, "--keep-seen", "--json", str(out)]) == 0
+    rows = {row.method: row.metrics for row in read_results(out)}
+    best = max(rows[other]["hit_rate_liked"] for other in ("most clicked", "item click rate"))
+    assert rows[name]["hit_rate_liked"] > best + 0.15
+    assert rows[name]["gauc"] > 0.7

@@ -11,7 +11,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.policies.boosted import BoostedPolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
-from ucfrec.user_model.trees import BoostedTrees
+from ucfrec.user_model.session_end import BoostedTrees, fit_trees
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +30,11 @@ def test_tables_are_the_trees_of_scikit_learn(
     policy, store = fitted
     numbers = np.arange(store.n_steps)
     inputs, liked = policy._rows(store, numbers)
-    trees = BoostedTrees.fit(inputs, liked, 0)
+    trees = BoostedTrees(**fit_trees(inputs, liked, 0))
     at = store.locate(numbers[:200])
     windows = store.windows(*at, 6)
     monkeypatch.setattr(policy, "_inputs", lambda *_: torch.from_numpy(inputs[:200, None]))
-    found = policy._scored(windows, windows.actions[:, -1:])[:, 0]
+    found = policy._score(windows, windows.actions[:, -1:])[:, 0]
     torch.testing.assert_close(
         found.double(), trees(torch.from_numpy(inputs[:200])), atol=1e-4, rtol=1e-4
     )
@@ -44,12 +44,12 @@ def test_only_the_best_items_are_boosted(fitted: tuple[BoostedPolicy, EpisodeSto
     policy, store = fitted
     windows = store.windows(*store.locate(np.arange(40)), 6)
     scores = policy.act(windows)
-    rates = policy._rate(policy.liked, policy.shown)
+    rates = policy._rate(policy.liked, policy.impressions)
     others = rates.argsort(descending=True)[5:]
     apart = scores[:, others] - rates[others]
     torch.testing.assert_close(apart, apart[:, :1].expand_as(apart))
     best = rates.topk(5).indices
-    torch.testing.assert_close(scores[:, best], policy._scored(windows, best))
+    torch.testing.assert_close(scores[:, best], policy._score(windows, best))
 
 
 def test_a_row_does_not_tell_the_trees_what_they_predict(

@@ -11,9 +11,8 @@ from tests.support.tagged import tagged_store
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import PolicyConfig, SequencePolicy
+from ucfrec.policies.base import PolicyConfig, SequencePolicy, recurrent
 from ucfrec.policies.checks import check_policy
-from ucfrec.policies.layers import recurrent
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy, policy_sizes

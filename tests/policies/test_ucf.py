@@ -9,20 +9,25 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
-from ucfrec.episodes.sessions import Sessions
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.base import SequencePolicy, interleave
-from ucfrec.policies.lsdt import LSDTConfig, LSDTPolicy
+from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.convformers import LSDTConfig, LSDTPolicy
+from ucfrec.policies.dt import attend
 from ucfrec.policies.registry import policy_class
 from ucfrec.policies.ucf import (
     _FEW,
     EPSILON,
+    CausalDepthwise,
+    Dropout,
     StackedStreams,
     UCFConfig,
     UCFPolicy,
+    draw_mask,
+    interleave,
     mask_loss,
     parent_targets,
 )
@@ -60,6 +65,19 @@ def random_windows(sizes: dict[str, int], padding: tuple[int, ...] = (0, 2, 5)) 
         timesteps=(torch.arange(K) - torch.tensor(padding).unsqueeze(1)).clamp(min=0),
         mask=mask,
     )
+
+
+def trained(
+    policy: SequencePolicy, windows: Windows, steps: int, rate: float = 3e-3
+) -> SequencePolicy:
+    optimizer = torch.optim.Adam(policy.parameters(), lr=rate)
+    policy.train()
+    for step in range(steps):
+        torch.manual_seed(step)
+        optimizer.zero_grad()
+        policy.loss(windows)[0].backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    return policy.eval()
 
 
 def sessions_of(windows: Windows, users: tuple[int, ...] = (2, 0, -1)) -> Sessions:
@@ -166,17 +184,6 @@ def test_padding_is_inert(name: str, sizes: dict[str, int]) -> None:
     torch.testing.assert_close(*losses)
 
 
-@both_heads
-@sequence
-def test_padding_is_as_if_the_window_were_shorter(name: str, sizes: dict[str, int]) -> None:
-    policy, windows = build(name, sizes), random_windows(sizes, padding=(4, 4, 4))
-    fields = ("states", "actions", "rewards", "returns_to_go", "timesteps", "mask")
-    short = Windows(**{field: getattr(windows, field)[:, 4:] for field in fields})
-    torch.testing.assert_close(
-        predictions(policy, windows)[:, 4:], predictions(policy, short), rtol=1e-5, atol=1e-5
-    )
-
-
 def test_attention_rows_sum_to_one_and_see_only_what_is_revealed() -> None:
     policy = build("ucf", VECTORS)
     assert isinstance(policy, UCFPolicy)
@@ -234,33 +241,21 @@ def test_only_the_predicting_rows_are_computed_and_they_are_the_full_ones() -> N
     torch.testing.assert_close(policy.features(windows), full[:, 1::3], rtol=1e-4, atol=1e-5)
 
 
-def trained_attention(lambda_mask: float) -> tuple[Tensor, Tensor]:
-    """Attention after a short training with weight λ, and its target."""
-    torch.manual_seed(0)
-    policy = UCFPolicy(UCFConfig(**SMALL, dropout=0.0, lambda_mask=lambda_mask), VECTORS)
-    windows = random_windows(VECTORS)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-2)
-    for _ in range(60):
-        optimizer.zero_grad()
-        policy.loss(windows)[0].backward()
-        optimizer.step()
-    config = policy.config
-    targets = parent_targets(
-        windows.mask, config.parent_window, config.parent_decay, config.parent_action
-    )
-    _, attention = policy.attend(policy.normalize(windows))
-    return attention.detach().mean(1)[windows.mask], targets[windows.mask]
-
-
 def test_supervision_draws_attention_to_the_parents() -> None:
-    masses, distances = [], []
+    masses, windows = [], random_windows(VECTORS)
     for lambda_mask in (0.0, 0.1, 100.0):
-        attention, targets = trained_attention(lambda_mask)
-        masses.append(float((attention * (targets > 0)).sum(-1).mean()))
-        distances.append(float((attention - targets).abs().sum(-1).mean()))
+        torch.manual_seed(0)
+        policy = UCFPolicy(UCFConfig(**SMALL, dropout=0.0, lambda_mask=lambda_mask), VECTORS)
+        trained(policy, windows, 60, 1e-2)
+        attention = policy.attend(policy.normalize(windows))[1].detach().mean(1)
+        config = policy.config
+        parents = config.parent_window, config.parent_decay, config.parent_action
+        targets = parent_targets(windows.mask, *parents)
+        mass = (attention * (targets > 0)).sum(-1)[windows.mask]
+        masses.append(float(mass.mean()))
     assert masses[0] < masses[1] < masses[2]
     assert masses[2] > 0.99
-    assert distances[2] < 0.1
+    assert (attention - targets).abs().sum(-1)[windows.mask].mean() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -405,3 +400,98 @@ def test_mask_loss_equals_a_plain_loop(mask: Tensor, heads: int, seed: int) -> N
         if mask[b, t]
     ]
     assert float(mask_loss(attention, targets, mask)) == pytest.approx(np.mean(rows), rel=1e-5)
+
+
+# Layers that cost less than PyTorch's do the same.
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_shifted_products_are_the_convolution_and_have_its_gradients(padded: bool) -> None:
+    torch.manual_seed(0)
+    layer = CausalDepthwise(6)
+    mask = torch.arange(5) >= torch.tensor([[0], [2], [4]])
+    steps = torch.randn(3, 5, 6, requires_grad=True)
+    weights = torch.randn(3, 5, 6)
+
+    def convolution(x: torch.Tensor) -> torch.Tensor:
+        x = x.masked_fill(~mask.unsqueeze(-1), 0.0) if padded else x
+        return nn.Conv1d.forward(layer, F.pad(x.transpose(1, 2), (2, 0))).transpose(1, 2)
+
+    found, right = layer(steps, mask if padded else None), convolution(steps)
+    torch.testing.assert_close(found, right)
+    inputs = (steps, layer.weight, layer.bias)
+    gradients = (torch.autograd.grad((out * weights).sum(), inputs) for out in (found, right))
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_a_convolution_of_fewer_steps_than_it_reaches_back() -> None:
+    layer = CausalDepthwise(4)
+    steps = torch.randn(2, 1, 4, requires_grad=True)
+    layer(steps).sum().backward()  # type: ignore[no-untyped-call]
+    assert steps.grad is not None
+    torch.testing.assert_close(steps.grad[0, 0], layer.weight[:, 0, 2].detach())
+
+
+@pytest.mark.parametrize("p", [0.1, 0.5, 0.93])
+def test_the_given_share_is_dropped_and_the_mean_stays(p: float) -> None:
+    torch.manual_seed(0)
+    mask = draw_mask(torch.Size((401, 999)), p)
+    assert float((mask == 0).float().mean()) == pytest.approx(p, abs=0.004)
+    torch.testing.assert_close(mask.max(), torch.tensor(1 / (1 - p)), rtol=1e-3, atol=0)
+    # Neighbours share a draw of 64 bits, but not their fate.
+    together = ((mask[:, 1:] == 0) & (mask[:, :-1] == 0)).float().mean()
+    assert float(together) == pytest.approx(p**2, abs=0.004)
+
+
+def test_dropout_follows_the_seed_and_rests_in_evaluation() -> None:
+    layer, values, residual = Dropout(0.3), torch.randn(7, 11), torch.randn(7, 11)
+    drawn = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        drawn.append(layer(values))
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    torch.manual_seed(1)
+    torch.testing.assert_close(layer.add(residual, values), residual + drawn[0])
+    layer.eval()
+    assert torch.equal(layer(values), values)
+    assert torch.equal(layer.add(residual, values), residual + values)
+
+
+def test_attention_drops_weights_and_keeps_the_mean() -> None:
+    torch.manual_seed(0)
+    query, key, value = (torch.randn(3, 2, 5, 4) for _ in range(3))
+    visible = torch.ones(5, 5, dtype=torch.bool).tril().expand(3, 1, 5, 5)
+    right = F.scaled_dot_product_attention(query, key, value, visible)
+    torch.testing.assert_close(attend(query, key, value, visible, 0.0), right)
+    # A share too small to drop anything here is the same computation.
+    torch.testing.assert_close(attend(query, key, value, visible, 1e-6), right)
+    drawn = torch.stack([attend(query, key, value, visible, 0.3) for _ in range(4000)])
+    torch.testing.assert_close(drawn.mean(0), right, rtol=0, atol=0.06)
+    # The first row sees one column, whose weight is 1: dropped, or divided by 0.7.
+    first = drawn[:, 0, 0, 0] / value[0, 0, 0]
+    assert float((first == 0).float().mean()) == pytest.approx(0.3, abs=0.03)
+    torch.testing.assert_close(
+        first[first != 0], torch.full_like(first[first != 0], 1 / 0.7), rtol=1e-3, atol=0
+    )
+
+
+def test_every_layer_starts_with_xaviers_weights() -> None:
+    torch.manual_seed(0)
+    config = LSDTConfig(context=5, dim=64, max_timestep=100)
+    policy = LSDTPolicy(config, {"state": 11, "action": 3, "items": 0})
+    seen = 0
+    for name, module in policy.named_modules():
+        if not isinstance(module, nn.Linear | nn.Embedding):
+            continue
+        parts = 3 if name.endswith("query_key_value") else 1
+        for weight in module.weight.chunk(parts):
+            limit = (6 / sum(weight.shape)) ** 0.5
+            assert weight.abs().max() <= limit, name
+            # The standard deviation of U(−l, l) is l/√3; 64 weights tell it to a fifth.
+            assert abs(weight.std().item() / (limit / 3**0.5) - 1) < 0.25, name
+            seen += 1
+        if isinstance(module, nn.Linear):
+            assert not module.bias.any(), name
+    assert seen == 5 + 3 * (3 + 1 + 3 + 3 + 2)

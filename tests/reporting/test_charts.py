@@ -2,10 +2,12 @@
 
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from tests.support.report_page import HOSTILE
 from ucfrec.reporting.charts import (
@@ -15,6 +17,7 @@ from ucfrec.reporting.charts import (
     interval_chart,
     line_chart,
     name_bins,
+    save,
 )
 
 VALUES = st.floats(-1e6, 1e6, allow_subnormal=False).map(lambda x: round(x, 4))
@@ -92,3 +95,11 @@ def test_any_curve_and_any_counts_are_drawn(curve: dict[float, float]) -> None:
     counts = [abs(value) for value in curve.values()]
     values = name_bins(None, list(curve))
     assert f"{max(counts):,.6g}" in histogram("t", "x", counts, values).summary
+
+
+@pytest.mark.parametrize("name", ["scores-../../outside", "returns-hopper/mine-v0", "a\\b\n:c"])
+def test_a_name_does_not_lead_out_of_the_folder(name: str, tmp_path: Path) -> None:
+    files = save(Figure(), tmp_path / "figures", name)
+    assert {file.suffix for file in files} == {".png", ".svg"}
+    assert {file.parent for file in files} == {tmp_path / "figures"}
+    assert sorted(tmp_path.rglob("*.*")) == sorted(files)

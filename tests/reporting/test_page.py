@@ -14,7 +14,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import METRICS, MetricsLog, read_metrics
 from ucfrec.reporting.page import write_report
-from ucfrec.results.rows_file import append_rows, write_results
+from ucfrec.results.rows import append_rows, write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 

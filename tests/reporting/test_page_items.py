@@ -34,7 +34,7 @@ from ucfrec.counterfactual.reward_model_fit import fit_warning
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.reporting.page import write_report
-from ucfrec.results.rows_file import write_results
+from ucfrec.results.rows import write_results
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.trained_policy import TrainedPolicy

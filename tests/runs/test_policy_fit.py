@@ -73,7 +73,7 @@ def test_two_processes_give_the_curve_of_one(store: Path, tmp_path: Path) -> Non
     train(store, tmp_path / "one")
     together(2, lambda: train(store, tmp_path / "two"), tmp_path)
     same(tmp_path / "two", tmp_path / "one")
-    assert (tmp_path / "two" / "overlay.safetensors").exists()
+    assert (tmp_path / "two" / "augmented.safetensors").exists()
     assert not list(tmp_path.rglob("*.ucfrec-*"))
 
 

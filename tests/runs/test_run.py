@@ -15,7 +15,7 @@ from tests.support.episodes import random_episodes, some_states, write_store
 from tests.support.killed import kills
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config
@@ -49,7 +49,7 @@ def left_alone(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_a_run_killed_at_any_moment_ends_as_if_left_alone(store: Path, left_alone: Path) -> None:
     assert kills("run", store.parent) >= 3
-    for name in ("overlay", "policy/best", "policy/last"):
+    for name in ("augmented", "policy/best", "policy/last"):
         expected, _ = load_tensors(left_alone / f"{name}.safetensors")
         tensors, _ = load_tensors(store.parent / "killed" / f"{name}.safetensors")
         assert tensors.keys() == expected.keys()
@@ -71,11 +71,12 @@ def test_the_record_tells_what_was_done(store: Path, left_alone: Path) -> None:
 
 
 def test_edits_are_of_training_episodes_only(store: Path, left_alone: Path) -> None:
-    overlay = Overlay.load(left_alone / "overlay.safetensors")
-    training = EpisodeStore.open(store).split("train").episode_ids
-    assert set(overlay.copy_source) | set(overlay.action_source) <= set(training)
-    assert len(overlay.edit_step) > 0
-    assert len(overlay.action_step) > 0
+    view = EpisodeStore.open(store).split("train")
+    augmented = AugmentedEpisodes.load(left_alone / "augmented.safetensors", view)
+    training = view.episode_ids
+    assert set(augmented.copy_source) | set(augmented.action_source) <= set(training)
+    assert len(augmented.edit_step) > 0
+    assert len(augmented.action_step) > 0
 
 
 def test_a_run_needs_nothing_but_its_folder(store: Path, left_alone: Path) -> None:
@@ -154,8 +155,8 @@ def test_a_store_without_validation_holds_some_training_episodes_out(tmp_path: P
     whole = EpisodeStore.write(tmp_path / "store", columns, np.full(40, 5))
     settings = [*killed_run.SETTINGS, "augment.copies=1", "train.steps=10"]
     train_run(whole, tmp_path / "run", resolve_config("ucf", None, settings))
-    overlay = Overlay.load(tmp_path / "run" / "overlay.safetensors")
-    assert not set(overlay.copy_source) & {1, 11, 21, 31}
+    augmented = AugmentedEpisodes.load(tmp_path / "run" / "augmented.safetensors", whole)
+    assert not set(augmented.copy_source) & {1, 11, 21, 31}
     single = EpisodeStore.write(
         tmp_path / "single", {name: values[:5] for name, values in columns.items()}, np.array([5])
     )

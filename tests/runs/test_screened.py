@@ -10,8 +10,8 @@ import torch
 from tests.support.causes import planted_items, planted_vectors
 from ucfrec.commands.cli import main
 from ucfrec.counterfactual.screening import DimensionReport, ScreeningReport
-from ucfrec.episodes.distractor import logged_observations, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, with_observations
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
@@ -32,7 +32,7 @@ def verdicts(flagged: Sequence[int]) -> Callable[[EpisodeStore, int], ScreeningR
 
     def screen(store: EpisodeStore, seed: int) -> ScreeningReport:
         found = [
-            DimensionReport(d, None, (), None, None, None, d in flagged, d not in flagged)
+            DimensionReport(d, measures_reward=d in flagged, causes=d not in flagged)
             for d in range(store.observation_size)
         ]
         return ScreeningReport(tuple(found), None, 100)
@@ -57,7 +57,7 @@ def test_what_is_dropped_might_never_have_been_logged(items: bool, tmp_path: Pat
     plain = train_screened(never, tmp_path / "plain", config, None)
     assert record.dropped_observations == FLAGGED
     assert record.sizes == plain.sizes
-    for name in ("overlay", "policy/last", "policy/best"):
+    for name in ("augmented", "policy/last", "policy/best"):
         one, other = (
             load_tensors(tmp_path / run / f"{name}.safetensors")[0] for run in ("dropped", "plain")
         )

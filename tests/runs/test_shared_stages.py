@@ -43,7 +43,7 @@ def test_runs_are_what_they_would_be_alone(store: EpisodeStore, tmp_path: Path) 
     second = trained(store, tmp_path / "second", shared, "policy.lambda_mask=0.1")
     alone = trained(store, tmp_path / "alone", OWN, "policy.lambda_mask=0.1")
     assert len([*(tmp_path / "stages").iterdir()]) == 2  # copies, and the reward model of items
-    for name in ("overlay", "crm/cvae/last", "reward_model/item_reward", "policy/best"):
+    for name in ("augmented", "crm/cvae/last", "reward_model/item_reward", "policy/best"):
         own, _ = load_tensors(alone / f"{name}.safetensors")
         given, _ = load_tensors(second / f"{name}.safetensors")
         assert own.keys() == given.keys()
@@ -73,7 +73,7 @@ def test_what_differs_is_made_anew(
     run = trained(store, tmp_path / "second", shared, *settings, policy=policy)
     assert len([*(tmp_path / "stages").iterdir()]) == 2 + more
     alone = trained(store, tmp_path / "alone", OWN, *settings, policy=policy)
-    for name in ("overlay", "policy/best"):
+    for name in ("augmented", "policy/best"):
         if (alone / f"{name}.safetensors").exists():
             own, _ = load_tensors(alone / f"{name}.safetensors")
             given, _ = load_tensors(run / f"{name}.safetensors")

@@ -17,11 +17,11 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.commands.cli import main
-from ucfrec.episodes.distractor import reward_bit
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import reward_bit
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import train_screened
@@ -188,7 +188,7 @@ def test_screening_finds_the_distractor_among_items_and_its_value_changes_no_ret
 ) -> None:
     """That what is dropped might never have been logged is tested with `ucfrec.runs.screened`."""
     store = EpisodeStore.open(kuairand_folder / "log" / "store")
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK_SCREENING)
+    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK_SCREENING)
     planted = plant_distractor(store, tmp_path / "planted")
     record = train_screened(planted, tmp_path / "run", resolve_config("bc", overrides=TINY), "drop")
     assert record.dropped_observations == (0,)

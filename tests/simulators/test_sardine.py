@@ -10,7 +10,7 @@ import pytest
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.environment import Environment
+from ucfrec.evaluation.simulator import Environment
 from ucfrec_simulators import sardine
 from ucfrec_simulators.sardine import BORED_INF, EPSILONS, GreedyOracle, SardineEnvironment
 from ucfrec_simulators.synthetic_catalog import SyntheticCatalog

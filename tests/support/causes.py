@@ -7,14 +7,11 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array
-from ucfrec.counterfactual.measured_reward import MeasurementConfig
-from ucfrec.counterfactual.screening import ScreeningConfig
+from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 
-QUICK = ScreeningConfig(
-    hidden=48, shared_steps=300, own_steps=100, measurement=MeasurementConfig(trees=25)
-)
+QUICK = MeasurementConfig(trees=25)
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 
 

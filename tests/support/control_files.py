@@ -1,13 +1,19 @@
-"""Control datasets made up for tests, and files of them in D4RL's layout."""
+"""Control datasets made up for tests, and commands on them."""
 
+from collections.abc import Iterable
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from ucfrec.arrays import Array
+from ucfrec_control.cli import main
 
 Columns = dict[str, Array]
+MADE = "hopper_medium-made"
+TINY = ("train.steps=4", "train.validate_every=2", "policy.dim=16", "policy.context=5")
 
 
 def hopper_like(lengths: tuple[int, ...] = (4, 1, 6, 3), seed: int = 0) -> Columns:
@@ -39,3 +45,30 @@ def write_hdf5(path: Path, columns: Columns, env_id: str | None = "Hopper-v5") -
         if env_id is not None:
             file.attrs["env_id"] = env_id
     return path
+
+
+def write_made(folder: Path, name: str = MADE) -> Path:
+    """A file of 24 trajectories."""
+    return write_hdf5(folder / f"{name}.hdf5", hopper_like((30, 8, 25) * 8))
+
+
+def set_options(settings: Iterable[str] = TINY) -> list[str]:
+    return [part for setting in settings for part in ("--set", setting)]
+
+
+def control(*arguments: object, status: int = 0) -> tuple[str, str]:
+    """What `ucfrec-control` prints to the output and as errors."""
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as errors:
+        try:
+            ended = main([str(argument) for argument in arguments])
+        except SystemExit as error:
+            ended = int(error.code or 0)
+    assert ended == status, errors.getvalue()
+    return out.getvalue(), errors.getvalue()
+
+
+def refused(*arguments: object) -> str:
+    """The one line that a refused command says, after the usage where an option is wrong."""
+    lines = control(*arguments, status=2)[1].strip().splitlines()
+    assert len(lines) == 1 or lines[0].startswith("usage: ")
+    return lines[-1]

@@ -6,7 +6,7 @@ independent computation.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,11 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AugmentedEpisodes, Windows
 
 N_ITEMS, DIM, N_USERS = 11, 4, 5
+LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
+SHARDS = (2**24, 6, 1)
 
 
 @dataclass
@@ -121,6 +123,14 @@ def write_store(
     return store
 
 
+def all_windows(store: EpisodeStore, length: int) -> Windows:
+    return store.windows(*store.all_steps(), length)
+
+
+def are_equal(a: Windows, b: Windows) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+
+
 def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float64Array:
     """s_t in float64, straight from the documentation of `ItemStates`."""
     observation = episode.observations[step]
@@ -158,10 +168,10 @@ def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float
     )
 
 
-def random_overlay(
+def random_edits(
     store: EpisodeStore, copies: int, seed: int, share: float = 0.4
-) -> tuple[Overlay, dict[tuple[int, int], Float32Array]]:
-    """Copies of random base episodes of the view, and the edits by (copy, step)."""
+) -> tuple[AugmentedEpisodes, dict[tuple[int, int], Float32Array]]:
+    """Copies of random episodes of the view, and the edits by (copy, step)."""
     rng = np.random.default_rng(seed)
     positions = rng.integers(len(store.episode_ids), size=copies)
     edits = {
@@ -170,26 +180,26 @@ def random_overlay(
         for step in range(int(store.lengths[position]))
         if rng.random() < share
     }
-    overlay = Overlay(
+    augmented = AugmentedEpisodes(
         copy_source=store.episode_ids[positions],
         edit_copy=np.array([copy for copy, _ in edits], dtype=np.int64),
         edit_step=np.array([step for _, step in edits], dtype=np.int64),
         edit_state=np.array(list(edits.values()), dtype=np.float32).reshape(-1, store.state_size),
     )
-    return overlay, edits
+    return augmented, edits
 
 
-def random_action_augmentation(store: EpisodeStore, copies: int, seed: int) -> Overlay:
+def random_action_copies(store: EpisodeStore, copies: int, seed: int) -> AugmentedEpisodes:
     """Copies of random episodes of the view that end at a random step with a random action."""
     rng = np.random.default_rng(seed)
     positions = rng.integers(len(store.episode_ids), size=copies)
     actions = rng.integers(N_ITEMS, size=copies)
     if not store.has_items:
         actions = rng.uniform(-1, 1, (copies, 3)).astype(np.float32)  # type: ignore[assignment]
-    return Overlay.of_actions(
-        store.episode_ids[positions],
-        rng.integers(store.lengths[positions]),
-        actions,
-        (rng.integers(-8, 25, size=copies) / 8).astype(np.float32),
-        store.state_size,
+    return replace(
+        random_edits(store, 0, 0)[0],
+        action_source=store.episode_ids[positions],
+        action_step=rng.integers(store.lengths[positions]),
+        action=actions,
+        action_reward=(rng.integers(-8, 25, size=copies) / 8).astype(np.float32),
     )

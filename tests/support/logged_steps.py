@@ -1,7 +1,7 @@
 """Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL.
 
 The references are those of sb-obp 0.5.10 and scope-rl 0.2.1;
-`tests/off_policy/fixtures/make_*_fixture.py` made them.
+`tests/off_policy/fixtures/make_obp_fixture.py` made them.
 """
 
 from pathlib import Path
@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.off_policy.fqe import fit_models
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
+from ucfrec.off_policy.models import fit_models
 
 REFERENCE = Path(__file__).parents[1] / "off_policy" / "fixtures" / "reference.npz"
 

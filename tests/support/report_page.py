@@ -10,7 +10,7 @@ from tests.support.result_rows import result_row
 from ucfrec.files.atomic import read_json
 from ucfrec.off_policy.estimators import SUITE
 from ucfrec.reporting.page import write_report
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 
 VOID = {"meta", "br", "img", "link", "input", "hr"}
 HOSTILE = "</title><script>alert('1')</script><img src=x onerror=\"alert(2)\">&amp;"

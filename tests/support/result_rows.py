@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import CONFIGURATIONS
+from ucfrec.results.rows import CONFIGURATIONS, ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:

@@ -309,7 +309,7 @@ def list_readers(inputs: Inputs) -> list[Reader]:
     from ucfrec.logs.mapping import read_mapping
     from ucfrec.logs.prepare import validate
     from ucfrec.reporting.page import write_report
-    from ucfrec.results.rows_file import read_results, read_rows
+    from ucfrec.results.rows import read_results, read_rows
     from ucfrec.runs.config import resolve_config
     from ucfrec_control.data.d4rl import read_d4rl
 

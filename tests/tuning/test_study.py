@@ -17,9 +17,18 @@ from ucfrec.errors import InputError
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.tuning.report import _value
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import BEST, STUDY, Plan, finished, measure_run, tune
+from ucfrec.tuning.study import (
+    BEST,
+    BEST_TOML,
+    PAGE,
+    STUDY,
+    Plan,
+    format_toml,
+    list_finished,
+    measure_run,
+    tune,
+)
 
 FIXED = {
     "train.validate_every": 2,
@@ -48,7 +57,7 @@ def plan(store: Path, out: Path, policies: tuple[str, ...] = ("dt",), metric: st
 
 
 def values(study: optuna.Study) -> list[tuple[float | None, Mapping[str, object]]]:
-    return [(trial.value, trial.params) for trial in finished(study)]
+    return [(trial.value, trial.params) for trial in list_finished(study)]
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +77,15 @@ def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
 
 def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]) -> None:
     searched, study = found
-    assert len(finished(study)) == 4
+    assert len(list_finished(study)) == 4
     best = searched.out / BEST
-    assert {path.name for path in searched.out.iterdir()} == {BEST, STUDY, "stages"}
+    assert {path.name for path in searched.out.iterdir()} == {
+        BEST,
+        BEST_TOML,
+        PAGE,
+        STUDY,
+        "stages",
+    }
     trained = TrainedPolicy.load(best)
     store = EpisodeStore.open(searched.store)
     assert measure_run(trained, store, "ndcg", 5) == study.best_value
@@ -94,7 +109,7 @@ def test_a_search_goes_on_and_the_same_search_gives_the_same_trials(
 @pytest.mark.slow
 def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
     study = tune(plan(store, tmp_path / "tuned"), 4, workers=2)
-    assert len(finished(study)) == 4
+    assert len(list_finished(study)) == 4
     assert (tmp_path / "tuned" / BEST / RunRecord.FILE).exists()
 
 
@@ -126,7 +141,7 @@ def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["it's", '"it\'s"\\n', "a\nb\t\x7f\x01é", ""])
 def test_texts_are_written_as_they_are(text: str) -> None:
-    assert tomllib.loads(f"x = [{_value(text)}]") == {"x": [text]}
+    assert tomllib.loads(f"x = [{format_toml(text)}]") == {"x": [text]}
 
 
 def test_the_command_writes_settings_that_train_takes(

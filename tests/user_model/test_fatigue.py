@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tests.support.episodes import N_ITEMS, Logged, some_states, write_store
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 
 LAGS = 10
@@ -65,7 +65,7 @@ def test_held_out_sessions_must_show_it_too() -> None:
 
 def test_users_are_tired_for_so_many_steps_after_a_run() -> None:
     runs = torch.tensor([[3, 2, 1, 0], [0, 3, 2, 1], [0, 0, 3, 2], [2, 1, 0, 0]])
-    assert Fatigue(3, 2, 0.0).tired(runs).tolist() == [True, True, False, False]
+    assert Fatigue(3, 2, 0.0).is_tired(runs).tolist() == [True, True, False, False]
 
 
 def test_runs_of_a_log_know_nothing_of_the_step_or_later(tmp_path: Path) -> None:
@@ -107,11 +107,9 @@ def shown_of(history: list[tuple[int, float]], reach: int) -> Shown:
 
 def run_by_hand(history: list[tuple[int, float]]) -> int:
     """Length of the run of one main tag that ends with the last step."""
-    tags = [int(TAGS.tags[item]) if reward >= 1.2 else -1 for item, reward in history]
-    length = 0
-    while length < len(tags) and tags[-1] >= 0 and tags[-1 - length] == tags[-1]:
-        length += 1
-    return length
+    tags = np.array([int(TAGS.tags[item]) for item, _ in history])
+    likes = np.array([reward >= 1.2 for _, reward in history], dtype=bool)
+    return on_end(tags, likes & (tags >= 0))
 
 
 @given(steps)
@@ -125,11 +123,11 @@ def test_runs_are_those_counted_by_hand(history: list[tuple[int, float]]) -> Non
 @given(steps, st.integers(1, 6))
 def test_a_tag_tires_after_a_run_of_it(history: list[tuple[int, float]], run: int) -> None:
     expected = int(TAGS.tags[history[-1][0]]) if run_by_hand(history) >= run else -1
-    assert TAGS.tired(shown_of(history, 10), run).tolist() == [expected]
+    assert TAGS.find_tired(shown_of(history, 10), run).tolist() == [expected]
 
 
 def test_what_is_not_remembered_tires_nobody() -> None:
-    assert TAGS.tired(shown_of([(0, 2.0)] * 3, 3), 4).tolist() == [-1]
+    assert TAGS.find_tired(shown_of([(0, 2.0)] * 3, 3), 4).tolist() == [-1]
 
 
 def test_an_item_of_two_tags_has_the_one_whose_items_it_resembles() -> None:

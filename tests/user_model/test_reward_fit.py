@@ -20,8 +20,7 @@ from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
     refit_item_reward_model,
 )
-from ucfrec.user_model.reward_report import RewardRows
-from ucfrec.user_model.training_users import UserCalibration
+from ucfrec.user_model.reward_report import RewardRows, UserCalibration
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
 
@@ -163,13 +162,13 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     # After ten steps, the session shows what its user likes, which the log never says.
     late = (torch.arange(len(rows)) % LENGTH >= 10).numpy()
     true = planted.predictor[split[planted.users] == 1][late]
-    scores = model.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    scores = model.score(rows.states, rows.history, None, rows.items).numpy()[late]
     alone = copy.deepcopy(model)
     alone.tastes.weigh(0.0)
-    without = alone.score(rows.states, rows.shown, None, rows.items).numpy()[late]
+    without = alone.score(rows.states, rows.history, None, rows.items).numpy()[late]
     assert np.corrcoef(scores, true)[0, 1] > np.corrcoef(without, true)[0, 1] + 0.1
-    scores = model.score(rows.states, rows.shown, None, rows.items)
-    assert torch.equal(scores, model.score(rows.states, rows.shown, rows.users, rows.items))
+    scores = model.score(rows.states, rows.history, None, rows.items)
+    assert torch.equal(scores, model.score(rows.states, rows.history, rows.users, rows.items))
     again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)
     for name, value in model.state_dict().items():
         assert torch.allclose(value, again.state_dict()[name], atol=0.05), name
@@ -184,7 +183,7 @@ def test_a_search_begins_and_ends_near_an_earlier_one(
         counted.append(arguments[2])
         return fit_effects(*arguments)
 
-    monkeypatch.setattr("ucfrec.user_model.effect_search.fit_effects", counting)
+    monkeypatch.setattr("ucfrec.user_model.reward_effects.fit_effects", counting)
     store = store_of(planted, clicks(planted, 1))
     half = views(store_of(log(0, users=100), clicks(log(0, users=100))))
     old = fit_item_reward_model(*half, tmp_path / "old", seed=0)[1]
@@ -208,8 +207,8 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
     model, report = fit_item_reward_model(*views(store), tmp_path, seed=0)
     assert not report.binary
     rows = RewardRows.of(store.split("validation"), LAGS, 10**6, 0)
-    scores = model.score(rows.states, rows.shown, rows.users, rows.items)
-    errors = (model.expected(scores) - rows.rewards).numpy()
+    scores = model.score(rows.states, rows.history, rows.users, rows.items)
+    errors = (model.expect(scores) - rows.rewards).numpy()
     assert 1 - errors.var() / rows.rewards.numpy().var() == pytest.approx(report.r2, abs=0.02)
     assert report.r2 > 0.25
     slope = np.polyfit(planted.of_item, model.item.numpy() * float(model.reward_std), 1)[0]
@@ -240,7 +239,7 @@ def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> No
         store = store_of(given, paid)
         episodes = np.arange(store.n_episodes)
         rows = RewardRows.at(store, episodes, np.full(len(episodes), step), LAGS)
-        scores.append(model.scores(rows.states, rows.shown, rows.users))
+        scores.append(model.scores(rows.states, rows.history, rows.users))
     assert torch.equal(scores[0], scores[1])
 
 
@@ -266,12 +265,13 @@ def test_test_rows_have_no_effect_and_statistics_come_from_training_rows(tmp_pat
         assert torch.equal(first.get_buffer(name), chosen.get_buffer(name)), name
 
 
-def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
+def test_a_fit_repeats_and_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ucfrec.user_model.reward_fit._MAX_ROWS", 600)
     planted = log(8, users=60)
     store = store_of(planted, clicks(planted))
-    first, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0, max_rows=600)
-    again, _ = fit_item_reward_model(*views(store), tmp_path / "b", seed=0, max_rows=600)
-    kept, kept_report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0, max_rows=600)
+    first, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
+    again, _ = fit_item_reward_model(*views(store), tmp_path / "b", seed=0)
+    kept, kept_report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
     assert report.train_rows == 600
     assert kept_report == report
     for name, value in first.state_dict().items():

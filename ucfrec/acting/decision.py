@@ -70,8 +70,7 @@ class DecisionRule:
     """Such requests draw from the so many best items only; None for all."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields, as a JSON object."""
-        # Equal rules have the same hash: 0 is not −0.
+        """The fields, as a JSON object; equal rules have the same one: 0 is not −0."""
         return {
             name: value + 0.0 if isinstance(value, float) else value
             for name, value in asdict(self).items()
@@ -79,41 +78,38 @@ class DecisionRule:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], source: str) -> Self:
-        """Rebuild a rule from its `as_dict`.
-
-        Args:
-            source: where the fields come from, for messages.
+        """Rebuild a rule from its `as_dict`; messages name the `source`.
 
         Raises:
             InputError: a field is unknown, missing, of another type or out of range.
         """
+        if not isinstance(values, Mapping):
+            raise InputError(f"{source} is not a decision rule")
         try:
             return cls(**values)
         except InputError as error:
             raise InputError(f"{source} is not a decision rule: {error}") from None
 
     def __str__(self) -> str:
+        has_policy = self.policy_weight > 0
         target = "the largest return expected" if self.target is None else f"{self.target:g}"
-        parts = [f"target {target}"] if self.policy_weight else []
-        if self.minimum_target is not None and self.policy_weight:
-            parts.append(f"at least {self.minimum_target:g} at every step")
-        parts += [f"reward weight {self.reward_weight:g}"] if self.reward_weight else []
-        parts += [f"lookahead {self.lookahead:g}"] if self.lookahead else []
-        if not self.policy_weight:
-            parts.append("policy weight 0 (the policy has no effect)")
-        elif self.policy_weight != 1:
-            parts.append(f"policy weight {self.policy_weight:g}")
-        parts += [f"the {self.top_k} best"] if self.top_k else []
-        parts += ["unseen items"] if self.exclude_seen else []
-        parts += [f"no tag of the last {self.tag_window}"] if self.tag_window else []
-        parts += (
-            [f"no main tag liked more than {self.tag_run} times in a row"] if self.tag_run else []
-        )
-        how = f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax"
-        if self.explore:
-            of = f"the {self.explore_top} best items" if self.explore_top else "all items"
-            how += f", {self.explore:.3g} of the requests uniformly from {of}"
-        return ", ".join([*parts, how])
+        effect = f"{self.policy_weight:g}" if has_policy else "0 (the policy has no effect)"
+        among = f"the {self.explore_top} best items" if self.explore_top else "all items"
+        parts = {
+            f"target {target}": has_policy,
+            f"at least {self.minimum_target or 0.0:g} at every step": has_policy
+            and self.minimum_target is not None,
+            f"reward weight {self.reward_weight:g}": self.reward_weight,
+            f"lookahead {self.lookahead:g}": self.lookahead,
+            f"policy weight {effect}": self.policy_weight != 1,
+            f"the {self.top_k} best": self.top_k,
+            "unseen items": self.exclude_seen,
+            f"no tag of the last {self.tag_window}": self.tag_window,
+            f"no main tag liked more than {self.tag_run} times in a row": self.tag_run,
+            f"drawn at temperature {self.temperature:g}" if self.temperature else "argmax": True,
+            f"{self.explore:.3g} of the requests uniformly from {among}": self.explore,
+        }
+        return ", ".join(text for text, applies in parts.items() if applies)
 
     @property
     def draws(self) -> bool:
@@ -150,8 +146,8 @@ class DecisionRule:
         Args:
             scores: (B, n_items) of `Scorer.scores`.
         """
-        modes = [math.log(share) + logs for share, logs in self._modes(scores)]
-        return modes[0] if len(modes) == 1 else torch.logaddexp(*modes)
+        first, *second = (math.log(share) + logs for share, logs in self._modes(scores))
+        return torch.logaddexp(first, second[0]) if second else first
 
     def choose(self, scores: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Items (B,) and the probabilities (B,) with which they were chosen.
@@ -165,7 +161,7 @@ class DecisionRule:
         items = torch.multinomial(probabilities, 1, generator=generator)
         return items[:, 0], probabilities.gather(1, items)[:, 0]
 
-    def ranked(self, scores: Tensor, k: int, uniforms: Tensor | None) -> tuple[Tensor, Tensor]:
+    def rank_items(self, scores: Tensor, k: int, uniforms: Tensor | None) -> tuple[Tensor, Tensor]:
         """`k` different items (B, k) in the order shown, best first or drawn one after the other,
         and their propensities (B, k) float64.
 
@@ -196,41 +192,36 @@ class DecisionRule:
         if len(modes) == 1:
             return items, _conditional(logs, items).exp()
         follows = _next_best(by_score, items)
-        joint = [
+        exploiting, exploring = (
             math.log(share) + _conditional(logs, items, follows).cumsum(1) for share, logs in modes
-        ]
+        )
         start = torch.zeros(len(items), 1, dtype=torch.float64)
-        return items, torch.logaddexp(*joint).diff(dim=1, prepend=start).exp()
+        joint = torch.logaddexp(exploiting, exploring)
+        return items, joint.diff(dim=1, prepend=start).exp()
 
     def _modes(self, scores: Tensor) -> list[tuple[float, Tensor]]:
         """Ways in which a request may be answered: its share, and log-probabilities (B, n_items) of
         the first item."""
-        modes = []
+        modes: list[tuple[float, Tensor]] = []
         if self.explore < 1:
-            modes.append((1 - self.explore, self._exploiting(scores)))
+            if self.temperature == 0:
+                best = _best(scores).unsqueeze(1)
+                logs = torch.full_like(scores, -torch.inf).scatter(1, best, 0.0)
+            else:
+                drawn_from = _only_best(scores, self.top_k)
+                # Relative to the best, so that no temperature makes every score −∞.
+                relative = drawn_from - drawn_from.amax(-1, keepdim=True)
+                logs = (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
+            modes.append((1 - self.explore, logs))
         if self.explore > 0:
             allowed = _only_best(scores, self.explore_top)
             even = torch.zeros_like(allowed).masked_fill(torch.isneginf(allowed), -torch.inf)
             modes.append((self.explore, even.log_softmax(-1)))
         return modes
 
-    def _exploiting(self, scores: Tensor) -> Tensor:
-        """Log-probabilities (B, n_items) of a request that does not explore."""
-        if self.temperature == 0:
-            best = _best(scores).unsqueeze(1)
-            return torch.full_like(scores, -torch.inf).scatter(1, best, 0.0)
-        scores = _only_best(scores, self.top_k)
-        # Relative to the best, so that no temperature makes every score −∞.
-        relative = scores - scores.amax(-1, keepdim=True)
-        return (relative / max(self.temperature, _COLDEST)).log_softmax(-1)
 
-
-def _read_saved(value: object) -> DecisionRule:
-    if isinstance(value, DecisionRule):
-        return value
-    if not isinstance(value, Mapping):
-        raise InputError("its rule is not a decision rule")
-    return DecisionRule.from_dict(value, "the rule")
+def _read_saved(value: Any) -> DecisionRule:
+    return value if isinstance(value, DecisionRule) else DecisionRule.from_dict(value, "the rule")
 
 
 SavedRule = Annotated[

@@ -11,16 +11,15 @@ from torch import Tensor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import ItemHead
 from ucfrec.schema import FORBIDDEN, USER_IDS
 
 
 class PolicyActor:
-    """Simulates N episodes at once with one batched forward pass per step (an `Actor` of
-    `rollout`).
+    """Simulates N episodes at once with one forward pass per step (an `Actor` of `rollout`).
 
     Vector actions are taken as predicted. Items are chosen by the decision rule among those that
     the environment has and allows. Users who are in the training logs keep their logged features.
@@ -51,21 +50,22 @@ class PolicyActor:
             dropped: entries before those that the policy does not see.
         """
         policy, head = scorer.policy, scorer.policy.head
+        vector_size = 0 if isinstance(head, ItemHead) else len(head.scale)
+        self._n_items = len(head.bias) if isinstance(head, ItemHead) else 0
         self._scorer, self._item_states = scorer, item_states
         self._generator = torch.Generator().manual_seed(seed)
         places = np.arange(observation_size + len(dropped))
         self._observed = torch.from_numpy(np.setdiff1d(places, dropped)[:observation_size])
         self._item_ids = item_ids
+        self._user_ids: IdLookup | None = None
         has_users = item_states is not None and len(item_states.user_features) > 0
-        has_users = has_users and user_ids is not None and user_ids.dtype.kind in "iu"
-        self._user_ids = IdLookup(user_ids) if has_users and user_ids is not None else None
+        if has_users and user_ids is not None and user_ids.dtype.kind in "iu":
+            self._user_ids = IdLookup(user_ids)
         self._absent = None if item_ids is None else torch.from_numpy(item_ids < 0)
         self._forbidden: Tensor | None = None
         length = max(policy.config.context - 1, 1)
         if item_states is not None:
             length = max(length, item_states.window, scorer.reach)
-        self._n_items = len(head.bias) if isinstance(head, ItemHead) else 0
-        vector_size = 0 if isinstance(head, ItemHead) else len(head.scale)
         sessions = Sessions.begun(episodes, length, vector_size)
         states = torch.zeros(episodes, policy.config.context, len(policy.state_mean))
         self._sessions = replace(sessions, states=states)
@@ -93,12 +93,23 @@ class PolicyActor:
         Raises:
             InputError: items are forbidden, but the policy's actions are vectors.
         """
-        users, lookup = info.get(USER_IDS), self._user_ids
+        users, lookup, ids = info.get(USER_IDS), self._user_ids, self._item_ids
         if users is not None and lookup is not None:
             numbers = torch.from_numpy(lookup.numbers(users))
             self._sessions = replace(self._sessions, users=numbers)
-        forbidden = info.get(FORBIDDEN)
-        self._forbidden = None if forbidden is None else self._find_in_store(forbidden)
+        self._forbidden, forbidden = None, info.get(FORBIDDEN)
+        if forbidden is None:
+            return
+        if ids is None:
+            raise InputError(
+                "the environment forbids items, but the policy's actions are vectors; use a policy "
+                "trained on items"
+            )
+        # The store's index of each item; that of items it lacks, and of the padding −1, which reads
+        # the last entry, is n_items.
+        indices = np.full(max(forbidden.max(), ids.max()) + 2, len(ids))
+        indices[ids[ids >= 0]] = np.flatnonzero(ids >= 0)
+        self._forbidden = torch.from_numpy(indices[forbidden])
 
     @torch.no_grad()
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
@@ -124,28 +135,20 @@ class PolicyActor:
         self._sessions = replace(self._sessions, states=states)
         rows = torch.from_numpy(np.flatnonzero(live))
         sessions = self._sessions if live.all() else self._sessions.at(rows)
-        if self._n_items:
-            return self._choose_items(rows, sessions)
-        self._actions = torch.zeros_like(self._sessions.actions[:, -1])
-        self._actions[rows] = self._scorer.act(sessions)
-        return self._actions.numpy(), None
-
-    def _choose_items(self, rows: Tensor, sessions: Sessions) -> tuple[Array, Float32Array]:
-        """The environment's items (N,) and their probabilities (N,); live are the `rows` (M,),
-        with their sessions."""
-        forbidden = self._left_out()
-        chances = torch.ones(len(self._sessions.steps))
-        # The environment steps rows that are not live too, so they also need an allowed action.
-        allowed = None if forbidden is None else (~forbidden).int().argmax(1)
-        actions = torch.zeros_like(self._sessions.steps) if allowed is None else allowed
-        of_rows = None if forbidden is None else forbidden[rows]
-        actions[rows], chances[rows] = self._decide(rows, sessions, of_rows)
-        self._actions = actions
+        if not self._n_items:
+            self._actions = torch.zeros_like(self._sessions.actions[:, -1])
+            self._actions[rows] = self._scorer.act(sessions)
+            return self._actions.numpy(), None
+        excluded, excluded_in_rows = self._find_excluded(), None
+        chances, self._actions = torch.ones(len(live)), torch.zeros_like(self._sessions.steps)
+        if excluded is not None:
+            # The environment steps rows that are not live too, so they also need an allowed action.
+            self._actions, excluded_in_rows = (~excluded).int().argmax(1), excluded[rows]
+        self._actions[rows], chances[rows] = self._decide(rows, sessions, excluded_in_rows)
         if self._shown is not None:
-            self._shown[rows, actions[rows]] = True
-        played = actions.numpy()
-        indices = played if self._item_ids is None else self._item_ids[played]
-        return indices, chances.numpy().astype(np.float32)
+            self._shown[rows, self._actions[rows]] = True
+        items = self._actions.numpy()
+        return items if self._item_ids is None else self._item_ids[items], chances.numpy()
 
     def _decide(
         self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
@@ -161,7 +164,7 @@ class PolicyActor:
         """
         self._sessions = self._sessions.with_step(self._actions, torch.from_numpy(rewards))
 
-    def _left_out(self) -> Tensor | None:
+    def _find_excluded(self) -> Tensor | None:
         """(N, n_items) items that the environment lacks or forbids, or that were shown; None for
         none."""
         n, n_items = len(self._sessions.steps), self._n_items
@@ -172,17 +175,3 @@ class PolicyActor:
             forbidden = torch.zeros(n, n_items + 1, dtype=torch.bool)
             parts.append(forbidden.scatter_(1, self._forbidden, True)[:, :-1])
         return torch.stack(parts).any(0) if parts else None
-
-    def _find_in_store(self, items: IntArray) -> Tensor:
-        """The store's indices of the environment's items (N, L); n_items for items it lacks."""
-        ids = self._item_ids
-        if ids is None:
-            raise InputError(
-                "the environment forbids items, but the policy's actions are vectors; use a policy "
-                "trained on items"
-            )
-        numbers = np.full(max(items.max(), ids.max()) + 2, len(ids))
-        numbers[ids[ids >= 0]] = np.flatnonzero(ids >= 0)
-        # Index −1, the padding of `items`, reads the last entry.
-        numbers[-1] = len(ids)
-        return torch.from_numpy(numbers[items])

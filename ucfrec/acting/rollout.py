@@ -1,18 +1,17 @@
-"""Roll out episodes with one actor in many environments in parallel."""
+"""Roll out episodes with one actor in many environments in parallel; uniformly random actors."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.progress import progress
 from ucfrec.schema import FORBIDDEN, USER_IDS
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
 
 
 class Actor(Protocol):
@@ -46,6 +45,58 @@ class Informed(Protocol):
         """Record `info` (keys `USER_IDS` and `FORBIDDEN`); called before each `act`."""
 
 
+class Memoryless:
+    """An actor whose choice depends on the current observation only."""
+
+    def begin(self, rows: IntArray) -> None:
+        """Do nothing: there is no state to reset."""
+
+    def observe(self, actions: Array, rewards: Float32Array) -> None:
+        """Do nothing: there is no state to update."""
+
+
+class Uniform(Memoryless):
+    """Uniformly random actions: vectors in a box, or items of a catalogue with their propensity.
+
+    Raises:
+        InputError: the actions are vectors without finite bounds.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+        self._space = env.single_action_space
+        if isinstance(self._space, spaces.Box) and not self._space.is_bounded():
+            raise InputError(
+                "no vectors can be drawn uniformly, because the environment's actions have no "
+                "finite bounds; collect its logs with another policy, or bound its action space"
+            )
+        self._generator = np.random.default_rng([seed, 1])
+        self._forbidden: IntArray | None = None
+
+    def inform(self, info: Mapping[str, Any]) -> None:
+        """Read the (N, L) forbidden items of each session from `info`, if the environment masks
+        items."""
+        self._forbidden = info.get(FORBIDDEN)
+
+    def act(self, observations: Float32Array, live: BoolArray) -> tuple[Array, Float32Array | None]:
+        """Draw actions: (N, A) without propensities, or items (N,) with propensities (N,)."""
+        if isinstance(self._space, spaces.Box):
+            low, high = self._space.low, self._space.high
+            vectors = self._generator.uniform(low, high, size=(len(observations), *low.shape))
+            return vectors.astype(np.float32), None
+        assert isinstance(self._space, spaces.Discrete)
+        n_items, forbidden = int(self._space.n), self._forbidden
+        if forbidden is None:
+            chosen = self._generator.integers(n_items, size=len(observations))
+            return chosen, np.full(len(observations), 1.0 / n_items, dtype=np.float32)
+        # A rank among the allowed items is drawn, then raised by one per forbidden item up to it;
+        # lists of forbidden items are padded with −1.
+        n_allowed = n_items - (forbidden >= 0).sum(axis=1)
+        chosen = self._generator.integers(n_allowed)
+        for item in np.sort(np.where(forbidden < 0, n_items, forbidden), axis=1).T:
+            chosen += chosen >= item
+        return chosen, (1.0 / n_allowed).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of M episodes; row i of every array belongs to the same episode."""
@@ -71,13 +122,6 @@ class Step:
     user_ids: IntArray | None
     """(M,) users of the step; None if the environment does not report them (`USER_IDS`)."""
 
-    def select(self, rows: IntArray) -> "Step":
-        """The step with only `rows` (L,), indices into the M rows."""
-        columns: dict[str, Any] = {
-            name: None if column is None else column[rows] for name, column in vars(self).items()
-        }
-        return Step(**columns)
-
 
 @dataclass(frozen=True)
 class Episodes:
@@ -90,7 +134,7 @@ class Episodes:
 
 
 def rollout(
-    env: "VectorEnv[Any, Any, Any]",
+    env: VectorEnv[Any, Any, Any],
     actor: Actor,
     episodes: int,
     seed: int,
@@ -111,26 +155,51 @@ def rollout(
         InputError: the environment does not reset within the step, or forbids actions (`FORBIDDEN`)
             and the actor has no `inform`.
     """
-    _require_same_step_reset(env)
+    if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
+        raise InputError(
+            f"{type(env).__name__} does not reset in the same step; build it with "
+            "autoreset_mode=AutoresetMode.SAME_STEP"
+        )
+    observations, info = env.reset(seed=seed)
+    informed = actor if isinstance(actor, Informed) else None
+    if FORBIDDEN in info and informed is None:
+        raise InputError(
+            f"{type(env).__name__} forbids some actions, which {type(actor).__name__} ignores; "
+            "give it a method `inform`"
+        )
     n = env.num_envs
     returns = np.zeros(episodes, dtype=np.float64)
     lengths = np.zeros(episodes, dtype=np.int64)
-    observations, info = env.reset(seed=seed)
-    _require_informed(env, info, actor)
     actor.begin(np.arange(n))
     episode = np.arange(n)
     live = episode < episodes
     with progress(episodes, describe, "episodes") as bar:
         while live.any():
-            step, next_observations, next_info = _play_step(
-                env, actor, observations, info, episode, live
-            )
-            counted = step.select(np.flatnonzero(live))
-            returns[counted.episodes] += counted.rewards
-            lengths[counted.episodes] += 1
+            if informed is not None:
+                informed.inform(info)
+            actions, propensities = actor.act(observations, live)
+            next_observations, rewards, terminated, truncated, next_info = env.step(actions)
+            rewards = np.asarray(rewards, dtype=np.float32)
+            actor.observe(actions, rewards)
+            rows = np.flatnonzero(live)
+            returns[episode[rows]] += rewards[rows]
+            lengths[episode[rows]] += 1
             if on_step is not None:
-                on_step(counted)
-            ended = step.terminated | step.truncated
+                users = info.get(USER_IDS)
+                step = Step(
+                    rows=rows,
+                    episodes=episode[rows],
+                    observations=observations[rows],
+                    actions=actions[rows],
+                    rewards=rewards[rows],
+                    next_observations=_undo_reset(next_observations, next_info)[rows],
+                    propensities=None if propensities is None else propensities[rows],
+                    terminated=terminated[rows],
+                    truncated=truncated[rows],
+                    user_ids=None if users is None else users[rows],
+                )
+                on_step(step)
+            ended = terminated | truncated
             actor.begin(np.flatnonzero(ended))
             bar.update(int((ended & live).sum()))
             episode = np.where(ended, episode + n, episode)
@@ -139,64 +208,10 @@ def rollout(
     return Episodes(returns, lengths)
 
 
-def _play_step(
-    env: "VectorEnv[Any, Any, Any]",
-    actor: Actor,
-    observations: Float32Array,
-    info: Mapping[str, Any],
-    episode: IntArray,
-    live: BoolArray,
-) -> tuple[Step, Float32Array, dict[str, Any]]:
-    """One step of all N environments, and the observations and `info` of the next one.
-
-    `episode` (N,) is the index of each environment's episode.
-    """
-    if isinstance(actor, Informed):
-        actor.inform(info)
-    actions, propensities = actor.act(observations, live)
-    next_observations, rewards, terminated, truncated, next_info = env.step(actions)
-    rewards = np.asarray(rewards, dtype=np.float32)
-    actor.observe(actions, rewards)
-    step = Step(
-        rows=np.arange(env.num_envs),
-        episodes=episode,
-        observations=observations,
-        actions=actions,
-        rewards=rewards,
-        next_observations=_before_reset(next_observations, next_info),
-        propensities=propensities,
-        terminated=terminated,
-        truncated=truncated,
-        user_ids=info.get(USER_IDS),
-    )
-    return step, next_observations, next_info
-
-
-def _require_same_step_reset(env: "VectorEnv[Any, Any, Any]") -> None:
-    # Imported here because scoring logs and recommending run without gymnasium.
-    from gymnasium.vector import AutoresetMode
-
-    if env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
-        raise InputError(
-            f"{type(env).__name__} does not reset in the same step; build it with "
-            "autoreset_mode=AutoresetMode.SAME_STEP"
-        )
-
-
-def _require_informed(
-    env: "VectorEnv[Any, Any, Any]", info: Mapping[str, Any], actor: Actor
-) -> None:
-    if FORBIDDEN in info and not isinstance(actor, Informed):
-        raise InputError(
-            f"{type(env).__name__} forbids some actions, which {type(actor).__name__} ignores; "
-            "give it a method `inform`"
-        )
-
-
-def _before_reset(next_observations: Float32Array, info: Mapping[str, Any]) -> Float32Array:
+def _undo_reset(next_observations: Float32Array, info: Mapping[str, Any]) -> Float32Array:
     """Observations (N, O) after a step; of episodes that ended, the final one, not the reset's."""
     if "final_obs" not in info:
         return next_observations
-    before_reset, ended = next_observations.copy(), np.asarray(info["_final_obs"])
-    before_reset[ended] = np.stack(list(info["final_obs"][ended]))
-    return before_reset
+    final_observations, ended = next_observations.copy(), np.asarray(info["_final_obs"])
+    final_observations[ended] = np.stack(list(info["final_obs"][ended]))
+    return final_observations

@@ -5,24 +5,28 @@ scores. All operations can be exported to ONNX.
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.item_product import ItemProduct, Part
 from ucfrec.arrays import Float32Array, IntArray
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
+from ucfrec.policies.heads import ItemHead
+from ucfrec.user_model.fatigue import MainTags
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
 
@@ -30,9 +34,19 @@ _LOOKED_AT: Final = 64
 """Items of a decision that a lookahead asks about."""
 
 
-Engine = Callable[[Sessions, Tensor], Tensor]
-"""Gives the scores (1, n_items) of a single session, with what may not be shown, bool of that
-size."""
+class Part(NamedTuple):
+    """What the policy, or the reward model, adds to the scores of all items; or their sum."""
+
+    factors: Tensor
+    """(B, d) what multiplies the rows of the items' matrix."""
+    repeated: Tensor
+    """(B, N) what is added to the scores of the N items shown before."""
+    alike: Tensor
+    """(B, N) what the likeness of an item to these counts."""
+
+    def at(self, rows: slice) -> "Part":
+        """The sessions with the given numbers."""
+        return Part(self.factors[rows], self.repeated[rows], self.alike[rows])
 
 
 class Query(NamedTuple):
@@ -54,16 +68,14 @@ class Query(NamedTuple):
 
     def at(self, rows: slice) -> "Query":
         """The sessions with the given numbers."""
-        parts = (None if part is None else part.at(rows) for part in (self.policy, self.model))
-        policy, model = parts
         return Query(
             self.sessions.at(rows),
             self.states[rows],
             self.items[rows],
-            policy,
+            None if self.policy is None else self.policy.at(rows),
             None if self.outputs is None else self.outputs[rows],
             None if self.features is None else self.features[rows],
-            model,
+            None if self.model is None else self.model.at(rows),
         )
 
 
@@ -98,10 +110,10 @@ class Scorer:
         self.returns, self.reward_model = returns or ReturnToGo(), reward_model
         self.session_end = session_end
         self._outcomes: tuple[float, float] | None = None
-        if session_end is not None and reward_model is not None and bool(reward_model.binary):
+        if reward_model is not None and bool(reward_model.binary):
             self._outcomes = float(reward_model.reward_low), float(reward_model.reward_high)
-        self._items = ItemProduct(policy, reward_model, states)
-        self._engine: Engine | None = None
+        self._items = _ItemProduct(policy, reward_model, states)
+        self._engine: Callable[[Sessions, Tensor], Tensor] | None = None
         self._require_parts()
 
     def under(self, rule: DecisionRule) -> "Scorer":
@@ -115,8 +127,9 @@ class Scorer:
         scorer._require_parts()
         return scorer
 
-    def answering_one_with(self, engine: Engine) -> "Scorer":
-        """The same, but the scores of a single session are computed by `engine`."""
+    def answering_one_with(self, engine: Callable[[Sessions, Tensor], Tensor]) -> "Scorer":
+        """The same, but `engine` computes the scores (1, n_items) of a single session, given what
+        may not be shown, bool of that size."""
         scorer = copy.copy(self)
         scorer._engine = engine
         return scorer
@@ -173,12 +186,19 @@ class Scorer:
     def is_product(self) -> bool:
         """Whether the scores are a product with vectors of the items, but for tags and repetition:
         of a policy that has factors, under a rule without lookahead or policy weight."""
-        return self.has_factors and self.rule.policy_weight == 1 and not self.rule.looks_ahead
+        return self.has_factors and self._is_plain
+
+    @property
+    def _is_plain(self) -> bool:
+        return self.rule.policy_weight == 1 and not self.rule.looks_ahead
 
     def vectors(self) -> Float32Array:
-        """(n_items, d + 1) vectors of all items; their products with `multipliers` of factors are
-        most of the scores."""
-        return self._items.vectors(bool(self.rule.reward_weight))
+        """(n_items, d + 1) vectors of all items, the last column a bias; their products with the
+        factors of `weigh` and 1 are most of the scores."""
+        matrix, bias = self._items.rows(policy=True, rewards=bool(self.rule.reward_weight))
+        vectors = np.empty((len(bias), len(matrix) + 1), dtype=np.float32)
+        vectors[:, :-1], vectors[:, -1] = matrix.numpy().T, bias.numpy()
+        return vectors
 
     @torch.no_grad()
     def windows(self, sessions: Sessions) -> Windows:
@@ -197,7 +217,10 @@ class Scorer:
     @torch.no_grad()
     def act(self, sessions: Sessions) -> Tensor:
         """The policy's outputs at the last step, on the CPU: see `SequencePolicy.act`."""
-        return self.policy.act(self.windows(sessions).to(self.policy.state_mean.device)).cpu()
+        return self._act(self.windows(sessions))
+
+    def _act(self, windows: Windows) -> Tensor:
+        return self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
 
     @torch.no_grad()
     def query(
@@ -216,18 +239,18 @@ class Scorer:
         if self.has_factors:
             features, policy = self._items.policy_part(windows, sessions.shown)
         else:
-            outputs = self.policy.act(windows.to(self.policy.state_mean.device)).cpu()
+            outputs = self._act(windows)
         # A view of several windows would keep all of their states.
         states = windows.states[:, -1].contiguous()
         model = self._items.model_part(sessions, states) if rewards else None
-        items = self._items.shown(sessions.shown)
+        items = self._items.pad_items(sessions.shown)
         return Query(sessions, states, items, policy, outputs, features, model)
 
-    def weighted(self, query: Query) -> Part:
+    def weigh(self, query: Query) -> Part:
         """The parts of a query, weighted as the rule says."""
         weight = self.rule.reward_weight
         model = query.model if weight else None
-        return self._items.weighted(query.items, query.policy, model, weight)
+        return self._items.weigh(query.items, query.policy, model, weight)
 
     def scores(
         self,
@@ -272,13 +295,14 @@ class Scorer:
         empty: bool = False,
     ) -> Tensor:
         """`scores` of the sessions of a query."""
-        if self.rule.policy_weight == 1 and not self.rule.looks_ahead:
-            part, rewards = self.weighted(query), bool(self.rule.reward_weight)
-            outputs = query.outputs
-            scores = self._items.scores(query.items, part, outputs, self.has_factors, rewards)
+        if self._is_plain:
+            weight = self.rule.reward_weight
+            model = query.model if weight else None
+            scores = self._items.scores(query.items, query.policy, model, weight, query.outputs)
         else:
             scores = self._compose(query)
-        if not torch.compiler.is_exporting():
+        exporting = torch.compiler.is_exporting()
+        if not exporting:
             _require_scores(scores, empty=True)
         if left_out is not None:
             scores[left_out] = -torch.inf
@@ -288,17 +312,15 @@ class Scorer:
             left = scores.masked_fill(without, -torch.inf)
             # A filter gives way where nothing would remain.
             some = left.amax(1, keepdim=True) > -torch.inf
-            every = not torch.compiler.is_exporting() and bool(some.all())
-            scores = left if every else torch.where(some, left, scores)
+            scores = left if not exporting and bool(some.all()) else torch.where(some, left, scores)
         return scores if empty else _require_scores(scores, empty)
 
     @torch.no_grad()
     def rewards(self, sessions: Sessions) -> Tensor:
         """f̂_r (B, n_items), in the reward model's units, up to a constant per row."""
         states = sessions.windows(self.states, 1).states[:, -1]
-        items, part = self._items.shown(sessions.shown), self._items.model_part(sessions, states)
-        part = self._items.weighted(items, None, part, 1.0)
-        return self._items.scores(items, part, None, policy=False, rewards=True)
+        part = self._items.model_part(sessions, states)
+        return self._items.scores(self._items.pad_items(sessions.shown), None, part, 1.0)
 
     @torch.inference_mode()
     def scores_of_some(
@@ -308,32 +330,30 @@ class Scorer:
         others remain.
 
         Args:
-            part: of `weighted`.
+            part: of `weigh`.
             candidates: (B, C) int64.
-            products: (B, C) of `multipliers` of the part and the candidates' `vectors`.
+            products: (B, C) of the part's factors, and 1, with the candidates' `vectors`.
         """
         rewards = bool(self.rule.reward_weight)
-        scores = products + self._items.added(query.items, part, candidates, rewards)
+        scores = products + self._items.addends(query.items, part, candidates, rewards)
         for without in self._items.without_tags(self.rule, query.sessions.shown, candidates):
             scores = scores.masked_fill(without, -torch.inf)
         return scores
 
     def _compose(self, query: Query) -> Tensor:
         """w log π + β f̂_r, or with a lookahead w log π + β (r̂ + (1 − p_end) V), (B, n_items)."""
-        rule, product, scores = self.rule, self._items, torch.zeros(())
+        rule, items, scores = self.rule, query.items, torch.zeros(())
         if rule.policy_weight:
-            part = product.weighted(query.items, query.policy, None, 0.0)
-            of_policy = product.scores(query.items, part, query.outputs, self.has_factors, False)
+            of_policy = self._items.scores(items, query.policy, None, 0.0, query.outputs)
             scores = rule.policy_weight * of_policy
         if query.model is not None and rule.reward_weight:
-            part = product.weighted(query.items, None, query.model, 1.0)
-            odds = product.scores(query.items, part, None, policy=False, rewards=True)
+            odds = self._items.scores(items, None, query.model, 1.0)
             if rule.looks_ahead:
-                return self._ahead(scores, odds, query)
+                return self._add_lookahead(scores, odds, query)
             scores = scores + rule.reward_weight * odds
-        return scores.expand(query.items.shape[0], product.count).clone()
+        return scores.expand(items.shape[0], self._items.count).clone()
 
-    def _ahead(self, scores: Tensor, odds: Tensor, query: Query) -> Tensor:
+    def _add_lookahead(self, scores: Tensor, odds: Tensor, query: Query) -> Tensor:
         """Scores of the policy plus expected reward and lookahead, (B, n_items).
 
         Only the best items by policy and reward are asked whether they end the session; others
@@ -342,25 +362,243 @@ class Scorer:
         model, end = self.reward_model, self.session_end
         assert model is not None
         assert end is not None
-        users, shown = query.sessions.users, query.sessions.shown
-        tastes = model.tastes_after(shown.latest(model.reach))
+        users, recent = query.sessions.users, query.sessions.shown
+        tastes = model.tastes_after(recent.latest(model.reach))
         odds = odds + model.level(query.states, users, tastes).unsqueeze(1)
-        span = model.reward_high - model.reward_low
+        span, steps = model.reward_high - model.reward_low, query.sessions.steps
         weight, ahead = self.rule.reward_weight / span, self.rule.lookahead
-        rewards = model.expected(odds)
+        rewards = model.expect(odds)
         scores = scores + weight * rewards
         best = scores.topk(min(_LOOKED_AT, self._items.count), dim=1).indices
-        steps = query.sessions.steps
-        some, recent = rewards.gather(1, best), shown.latest(model.lags)
-        if self._outcomes is not None and end.uses_rewards:
-            rewarded = [torch.full_like(some, reward) for reward in self._outcomes]
-            low, high = end.of_items(recent, best, rewarded, steps)
+        some, recent = rewards.gather(1, best), recent.latest(model.lags)
+        if end.uses_rewards and self._outcomes is not None:
+            outcomes = [torch.full_like(some, reward) for reward in self._outcomes]
+            low, high = end.score_items(recent, best, outcomes, steps)
             ends = low + (high - low) * (some - model.reward_low) / span
         else:
-            (ends,) = end.of_items(recent, best, [some], steps)
+            (ends,) = end.score_items(recent, best, [some], steps)
         added = (weight * ahead * (1 - ends)).to(scores.dtype)
         worst = added.amin(1, keepdim=True)
         return (scores + worst).scatter_add(1, best, added - worst)
+
+
+class _ItemProduct:
+    """All items of a catalogue as a policy and a reward model see them, computed once.
+
+    Rows of the matrix are the policy's vectors, the directions that items without tags are alike
+    by, and the reward model's vectors and effects of items.
+    """
+
+    def __init__(
+        self, policy: SequencePolicy, model: ItemRewardModel | None, states: ItemStates | None
+    ) -> None:
+        self._policy, self._model, self._states = policy, model, states
+        head, kind = policy.head, type(policy)
+        self._head = head if isinstance(head, ItemHead) else None
+        exposure = None if self._head is None else self._head.exposure
+        self.lags = 0 if exposure is None else exposure.lags
+        self.own = (
+            self._head is None
+            or kind.act is not SequencePolicy.act
+            or kind.act_and_features is not SequencePolicy.act_and_features
+            or (
+                not (exposure is None or model is None)
+                and not _are_equal(exposure.likeness, model.likeness)
+            )
+        )
+        """Whether the policy scores items in a way of its own."""
+        self._exposure = None if self.own else exposure
+        likeness = [term.likeness for term in (self._exposure, model) if term is not None]
+        self._likeness = likeness[0] if likeness else None
+        self._by_direction = self._likeness is not None and not self._likeness.tags.shape[1]
+        self._columns = max(self.lags, 0 if model is None else model.lags)
+
+    @property
+    def count(self) -> int:
+        """n_items."""
+        assert self._states is not None
+        return len(self._states.embeddings)
+
+    @cached_property
+    def _features(self) -> Callable[[Windows], Tensor]:
+        return self._policy.acting_features()
+
+    @cached_property
+    def _matrix(self) -> tuple[Tensor, Tensor, tuple[int, int]]:
+        """The matrix (d, n_items), the policy's bias (n_items,), and how many of the first rows
+        are the policy's, and those or of likeness."""
+        blocks, bias = list[Tensor](), torch.zeros(())
+        with torch.no_grad():
+            if not self.own:
+                assert self._head is not None
+                blocks = [(self._head.project(self._head.embeddings) + self._head.correction).cpu()]
+                bias = self._head.bias.detach().cpu()
+            of_policy = sum(block.shape[1] for block in blocks)
+            if self._by_direction:
+                assert self._likeness is not None
+                blocks.append(self._likeness.directions.cpu())
+            of_likeness = sum(block.shape[1] for block in blocks)
+            if self._model is not None:
+                blocks += [self._model.vectors, self._model.item.unsqueeze(1)]
+            # A product with one row reads this layout twice as fast as vectors one after the
+            # other; NumPy asks for large pages, which are read faster.
+            sizes = [block.shape[1] for block in blocks]
+            matrix = torch.from_numpy(np.empty((sum(sizes), len(blocks[0])), dtype=np.float32))
+            for rows, block in zip(torch.split(matrix, sizes), blocks, strict=True):
+                rows.copy_(block.T)
+            return matrix, bias, (of_policy, of_likeness)
+
+    @cached_property
+    def _alike(self) -> Likeness | None:
+        """How alike items are, on the CPU."""
+        if self._likeness is None or self._likeness.tags.device.type == "cpu":
+            return self._likeness
+        return copy.deepcopy(self._likeness).cpu()
+
+    @cached_property
+    def _tags(self) -> Likeness:
+        """The tags that filters read."""
+        assert self._states is not None
+        if self._alike is not None and torch.equal(self._alike.tags, self._states.tags):
+            return self._alike
+        return Likeness.of(self._states)
+
+    @cached_property
+    def _main_tags(self) -> MainTags:
+        """The main tags that filters read."""
+        assert self._states is not None
+        return MainTags.of(self._states)
+
+    def pad_items(self, recent: Shown) -> Tensor:
+        """(B, N) the items that repetition and likeness refer to."""
+        return _pad(recent.items, self._columns, -1)
+
+    def policy_part(self, windows: Windows, recent: Shown) -> tuple[Tensor, Part]:
+        """The policy's features (B, d) and its part, from windows with their target returns."""
+        device = self._policy.state_mean.device
+        normalized = self._policy.normalize(windows.to(device))
+        features = self._features(normalized)
+        repeated = alike = features.new_zeros(features.shape[0], self._columns)
+        if self._exposure is not None:
+            exposed = Exposed(
+                _pad(recent.items, self.lags, -1).to(device),
+                _pad(recent.rewards, self.lags, 0).to(device),
+                normalized.returns_to_go[:, -1],
+            )
+            repeated, alike = (
+                _pad(weights, self._columns, 0) for weights in self._exposure.weights(exposed)
+            )
+        part = Part(features / features.shape[-1] ** 0.5, repeated, alike)
+        if device.type == "cpu":
+            return features, part
+        return features.cpu(), Part(part.factors.cpu(), part.repeated.cpu(), part.alike.cpu())
+
+    def model_part(self, sessions: Sessions, states: Tensor) -> Part:
+        """The reward model's part, in states (B, S) before the steps to decide."""
+        model, recent = self._model, sessions.shown
+        assert model is not None
+        query = model.query(states, sessions.users, model.tastes_after(recent))
+        _, repeated, alike = model.exposures(recent)
+        factors = F.pad(query, (0, 1), value=1.0)
+        return Part(factors, _pad(repeated, self._columns, 0), _pad(alike, self._columns, 0))
+
+    def _counts_shown(self, policy: bool, rewards: bool) -> bool:
+        """Whether what was shown counts."""
+        return self._likeness is not None and (rewards or (policy and self._exposure is not None))
+
+    def weigh(
+        self, items: Tensor, policy: Part | None, model: Part | None, reward_weight: float
+    ) -> Part:
+        """The weighted sum of the parts; without a part, the rows of its own are excluded."""
+        repeated = alike = torch.zeros_like(items, dtype=torch.float32)
+        factors = list[Tensor]()
+        if policy is not None:
+            factors.append(policy.factors)
+            repeated, alike = policy.repeated, policy.alike
+        if model is not None:
+            repeated = repeated + reward_weight * model.repeated
+            alike = alike + reward_weight * model.alike
+        if self._by_direction and self._counts_shown(policy is not None, model is not None):
+            assert self._alike is not None
+            factors.append(self._alike.profile(items, alike))
+        if model is not None:
+            factors.append(reward_weight * model.factors)
+        return Part(torch.cat(factors, 1) if factors else repeated[:, :0], repeated, alike)
+
+    def scores(
+        self,
+        items: Tensor,
+        policy: Part | None,
+        model: Part | None,
+        reward_weight: float,
+        outputs: Tensor | None = None,
+    ) -> Tensor:
+        """(B, n_items) of the parts, up to a constant per row.
+
+        Args:
+            items: (B, N) of `pad_items`.
+            outputs: (B, n_items) of a policy that scores items in a way of its own.
+        """
+        if policy is None and model is None:
+            assert outputs is not None
+            return outputs.clone()  # it may be what the policy keeps
+        part = self.weigh(items, policy, model, reward_weight)
+        matrix, bias = self.rows(policy is not None, model is not None)
+        scores = torch.addmm(bias if outputs is None else outputs, part.factors, matrix)
+        if not self._counts_shown(policy is not None, model is not None):
+            return scores
+        if self._alike is not None and not self._by_direction:
+            shared, sets = self._alike.to_sets(self._alike.profile(items, part.alike))
+            scores = scores.add_(shared.index_select(1, sets))
+        repeated = part.repeated.masked_fill(items < 0, 0.0)
+        return scores.scatter_add_(1, items.clamp(min=0), repeated)
+
+    def addends(self, items: Tensor, part: Part, candidates: Tensor, rewards: bool) -> Tensor:
+        """(B, C) what scores of the policy are more than products, for candidates (B, C)."""
+        added = torch.zeros(candidates.shape)
+        if not self._counts_shown(True, rewards):
+            return added
+        if self._alike is not None and not self._by_direction:
+            profile = self._alike.profile(items, part.alike)
+            added += self._alike.to_candidates(profile, candidates)
+        same = candidates.unsqueeze(2) == items.unsqueeze(1)
+        return added + (same * part.repeated.unsqueeze(1)).sum(2)
+
+    def without_tags(
+        self, rule: DecisionRule, recent: Shown, items: Tensor | None = None
+    ) -> Iterator[Tensor]:
+        """What each tag filter of the rule excludes, (B, n_items) bool, or (B, C) of items."""
+        if rule.tag_window:
+            latest = recent.items[:, : rule.tag_window]
+            profile = self._tags.profile(latest, torch.ones(latest.shape))
+            if items is None:
+                shared, sets = self._tags.to_sets(profile)
+                yield (shared > 0).index_select(1, sets)
+            else:
+                yield self._tags.to_candidates(profile, items) > 0
+        if rule.tag_run:
+            tired = self._main_tags.find_tired(recent, rule.tag_run).unsqueeze(1)
+            main = self._main_tags.tags
+            yield ((main if items is None else main[items]) == tired) & (tired >= 0)
+
+    def rows(self, policy: bool, rewards: bool) -> tuple[Tensor, Tensor]:
+        """The rows of the matrix that the factors multiply, and the bias."""
+        matrix, bias, (of_policy, of_likeness) = self._matrix
+        last = of_likeness if self._counts_shown(policy, rewards) else of_policy
+        rows = matrix[0 if policy else of_policy : len(matrix) if rewards else last]
+        return rows, bias if policy else torch.zeros(())
+
+
+def _are_equal(first: Likeness, second: Likeness) -> bool:
+    pairs = (first.tags, second.tags), (first.directions, second.directions)
+    return all(torch.equal(one.cpu(), another.cpu()) for one, another in pairs)
+
+
+def _pad(values: Tensor, length: int, padding: int) -> Tensor:
+    """The first `length` columns of values (B, N), with more columns where there are fewer."""
+    missing = max(0, length - values.shape[1])
+    values = values[:, :length]
+    return F.pad(values, (0, missing), value=padding) if missing else values
 
 
 def sessions_before(
@@ -387,7 +625,7 @@ def logged_scores(
 
 
 def _require_scores(scores: Tensor, empty: bool) -> Tensor:
-    """Check scores (B, n_items), which are returned.
+    """Scores (B, n_items), checked.
 
     Raises:
         InputError: those of some row are NaN, or infinitely high, or unless `empty` no item is

@@ -1,18 +1,22 @@
-"""Methods, tasks, budgets and cells: what the tables of a benchmark are made of."""
+"""Methods, tasks, budgets, and the cells that a plan makes of them: what tables consist of."""
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ucfrec.benchmark.grid import Measurement
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow, RowKey, Scalar
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.provenance import config_hash
+from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.shared_stages import OWN, SharedStages
+
+Presets = Mapping[str, Mapping[str, Any]]
+"""Defaults of settings, by table."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Method:
         return not self.tags or bool(store.item_states.tags.shape[1])
 
 
-def augmented_ucf(*settings: str, vectors: bool = True) -> Method:
+def make_augmented_ucf(*settings: str, vectors: bool = True) -> Method:
     """UCF with augmented states, as in the paper's tables, and more settings."""
     return Method("ucf", ("augment.copies=1", *settings), vectors=vectors)
 
@@ -115,7 +119,7 @@ class Budget:
         fewer = (self.fewer_seeds.get(name, self.seeds) for name in (task, method))
         return min(self.seeds, *fewer)
 
-    def narrowed(
+    def narrow(
         self,
         tasks: Sequence[str] = (),
         seeds: int | None = None,
@@ -182,8 +186,8 @@ class Cell:
         return resolve_config(self.policy, None, self.settings, self.training_seed, self.presets)
 
 
-def key(cell: Cell) -> RowKey:
-    """The key under which the cell's rows are stored."""
+def make_key(cell: Cell) -> RowKey:
+    """The key under which the cell's rows are stored; `run_grid` fills in `config_hash`."""
     conditions: dict[str, Scalar] = {**cell.conditions}
     if cell.budget:
         conditions |= {"budget": cell.budget, "episodes": cell.evaluation.episodes}
@@ -197,7 +201,7 @@ def key(cell: Cell) -> RowKey:
         log_seed=cell.log_seed,
         evaluation_seed=cell.evaluation.seed,
         conditions=conditions,
-        data_fingerprint=None if cell.store is None else opened(cell).record.fingerprint,
+        data_fingerprint=None if cell.store is None else open_store(cell).record.fingerprint,
     )
 
 
@@ -209,20 +213,105 @@ def training_config(cell: Cell) -> dict[str, Any] | None:
     return asdict(cell.config) | screening
 
 
-def measured_by(
-    measure: Callable[[Cell, RowKey], list[ResultRow]],
-    config: Callable[[Cell], Mapping[str, Any] | None] = training_config,
-) -> Measurement[Cell]:
-    """How cells are measured by `measure`, whose training has the configuration `config`."""
-    return Measurement(key, config, measure, made)
-
-
-def made(cell: Cell) -> list[Path]:
-    """Folders of the cell's run and of the stages that it shares."""
-    return [folder for folder in (cell.run, cell.shared.folder) if folder is not None]
-
-
-def opened(cell: Cell) -> EpisodeStore:
+def open_store(cell: Cell) -> EpisodeStore:
     """The store that the cell is trained on."""
     assert cell.store is not None
     return EpisodeStore.open(cell.store)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """How the cells of a benchmark are measured, by picklable (module-level) functions."""
+
+    measure: Callable[[Cell, RowKey], list[ResultRow]]
+    """Measures the cell; returns its rows, all with the given key. Runs with one thread."""
+    config: Callable[[Cell], Mapping[str, Any] | None] = training_config
+    """Training configuration of the cell; None if nothing is trained."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where and by which settings a benchmark trains."""
+
+    suite: str
+    """Suite of the rows."""
+    folder: Path
+    """Where runs and shared stages are kept."""
+    budget: Budget
+    settings: Callable[[str, Method], tuple[str, ...]]
+    """Settings of the training of a method, by its name."""
+    presets: Callable[[EpisodeStore, str], Presets] = lambda store, policy: {}
+    """Defaults of a policy's training on a store, below the settings."""
+
+    def list_trained(
+        self,
+        table: str,
+        task: Task,
+        methods: Mapping[str, Method],
+        evaluation: Evaluation | None = None,
+        conditions: Mapping[str, Scalar] | None = None,
+    ) -> Iterator[Cell]:
+        """One cell for each training seed of each method that supports the actions of the task.
+
+        Cells of equal trainings share a run.
+
+        Args:
+            evaluation: None for the budget's.
+        """
+        store = EpisodeStore.open(task.store)
+        for name, method in methods.items():
+            if not method.supports(store):
+                continue
+            training: dict[str, Any] = {
+                "policy": method.policy,
+                "settings": self.settings(name, method),
+                "presets": self.presets(store, method.policy),
+                # Where nothing but items was logged, there are no columns to screen.
+                "screening": method.screening if store.observation_size else None,
+            }
+            digest = config_hash({**training, "data": store.record.fingerprint})
+            place = folder_name("-".join([task.name, *map(str, task.conditions.values())]))
+            run = self.folder / "runs" / place / f"{folder_name(name)}-{digest}"
+            for seed in range(self.budget.seeds_of(task.name, name)):
+                yield Cell(
+                    suite=self.suite,
+                    table=table,
+                    budget=self.budget.name,
+                    task=task.name,
+                    method=name,
+                    environments=task.environments,
+                    evaluation=evaluation or self.budget.evaluation,
+                    log_seed=task.log_seed,
+                    training_seed=seed,
+                    store=task.store,
+                    run=run.with_name(f"{run.name}-{seed}"),
+                    shared=SharedStages(self.folder / "stages"),
+                    conditioned=method.conditioned,
+                    conditions={**task.conditions, **(conditions or {})},
+                    **training,
+                )
+
+    def list_built_in(
+        self, table: str, task: Task, methods: Mapping[str, Method]
+    ) -> Iterator[Cell]:
+        """One cell for each built-in policy of the task's environments.
+
+        Args:
+            methods: of the table; a built-in policy of the same name is distinguished from it.
+        """
+        for name in task.behaviors:
+            yield Cell(
+                suite=self.suite,
+                table=table,
+                budget=self.budget.name,
+                task=task.name,
+                method=f"{name} (simulator)" if name in methods else name,
+                policy=name,
+                environments=task.environments,
+                evaluation=self.budget.evaluation,
+            )
+
+
+def folder_name(name: str) -> str:
+    """The name of a task or method without characters that a path gives a meaning, such as "/"."""
+    return re.sub(r"[^\w,.= -]+", "-", name)

@@ -3,51 +3,44 @@
 import json
 import shutil
 import sys
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+from ucfrec.benchmark.cells import Cell, Measurement, make_key
 from ucfrec.errors import InputError
 from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes
 from ucfrec.progress import progress
 from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
-from ucfrec.results.row import ResultRow, RowKey
-from ucfrec.results.rows_file import append_rows, read_rows, remove_rows
-
-Cell = TypeVar("Cell")
+from ucfrec.results.rows import ResultRow, RowKey, append_rows, read_rows, remove_rows
 
 
 @dataclass(frozen=True)
-class Measurement(Generic[Cell]):
-    """How the cells of a benchmark are measured, by picklable (module-level) functions."""
-
-    key: Callable[[Cell], RowKey]
-    """Identifies the cell's rows among all others; `config_hash` is filled in by `run_grid`."""
-    config: Callable[[Cell], Mapping[str, Any] | None]
-    """Training configuration of the cell; None if nothing is trained."""
-    measure: Callable[[Cell, RowKey], list[ResultRow]]
-    """Measures the cell; returns its rows, all with the given key. Runs with one thread."""
-    made: Callable[[Cell], Sequence[Path]] = lambda cell: ()
-    """Folders of what a measurement makes and finds again: runs and shared stages."""
-
-
-@dataclass(frozen=True)
-class _Task(Generic[Cell]):
+class _Task:
     """A cell to be measured."""
 
     cell: Cell
     key: RowKey
     config: Mapping[str, Any] | None
-    measure: Callable[[Cell, RowKey], list[ResultRow]]
+    how: Measurement
     results: Path
+
+    def measure(self) -> list[ResultRow]:
+        """Measure the cell, append its rows and return them."""
+        reset_peak_memory()
+        rows = self.how.measure(self.cell, self.key)
+        peak = peak_memory_mib()
+        rows = [replace(row, peak_memory_mib=peak) for row in rows]
+        append_rows(self.results, rows, self.config)
+        return rows
 
 
 def run_grid(
-    cells: Sequence[Cell],
-    how: Measurement[Cell],
+    cells: Iterable[Cell],
+    how: Measurement,
     results: Path,
     workers: int,
     describe: str = "benchmark",
@@ -63,9 +56,8 @@ def run_grid(
     then the row's; a worker process has little else in it.
 
     Args:
-        cells: picklable cells.
         results: file of result rows (JSON lines); its other rows are kept. No other process may
-            fill it (`ucfrec.results.rows_file.benchmarking`).
+            fill it (`ucfrec.results.rows.benchmarking`).
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
         again: remove the rows, runs and shared stages of `cells` first. An interrupted call is
@@ -80,32 +72,43 @@ def run_grid(
     """
     if workers < 1:
         raise InputError(f"--workers is {workers}; at least one is needed")
-    tasks: dict[str, _Task[Cell]] = {}
+    tasks: dict[str, _Task] = {}
     for cell in cells:
-        config = how.config(cell)
-        if config is not None:
-            config = json.loads(json.dumps(config))  # tuples become lists
-        key = replace(how.key(cell), config_hash=None if config is None else config_hash(config))
-        tasks.setdefault(str(key), _Task(cell, key, config, how.measure, results))
+        # Of JSON, as a file of configurations has it.
+        config = json.loads(json.dumps(how.config(cell)))
+        key = replace(make_key(cell), config_hash=None if config is None else config_hash(config))
+        tasks.setdefault(str(key), _Task(cell, key, config, how, results))
     if again:
         remove_rows(results, [task.key for task in tasks.values()])
-        for folder in {folder for task in tasks.values() for folder in how.made(task.cell)}:
-            shutil.rmtree(folder, ignore_errors=True)
-    measured = read_rows(results)
-    rows = {name: [row for row in measured if t.key.covers(row)] for name, t in tasks.items()}
-    missing = [name for name in tasks if not rows[name]]
-    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
-    missing.sort(key=lambda name: -1 if (seed := tasks[name].key.training_seed) is None else seed)
+        for task in tasks.values():
+            for folder in (task.cell.run, task.cell.shared.folder):
+                if folder is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
+    earlier = read_rows(results)
+    rows = {name: [row for row in earlier if t.key.covers(row)] for name, t in tasks.items()}
+    missing = {name: task for name, task in tasks.items() if not rows[name]}
     print(
         f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
     )
-    if not missing:
-        return [row for group in rows.values() for row in group]
-    errors: list[str] = []
-    workers = min(workers, len(missing))
-    measure = _measure_in_processes if workers > 1 else _measure_here
-    outcomes = measure({name: tasks[name] for name in missing}, workers)
-    with closing(outcomes), progress(len(missing), describe, "cells") as bar:
+    if missing:
+        rows |= _measure_all(missing, workers, describe)
+    return [row for group in rows.values() for row in group]
+
+
+def _measure_all(
+    tasks: Mapping[str, _Task], workers: int, describe: str
+) -> dict[str, list[ResultRow]]:
+    """The rows of each task; raises an error at the end if one of them failed."""
+
+    def sort_key(item: tuple[str, _Task]) -> int:
+        # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
+        seed = item[1].key.training_seed
+        return -1 if seed is None else seed
+
+    errors, rows, workers = [], {}, min(workers, len(tasks))
+    ordered = dict(sorted(tasks.items(), key=sort_key))
+    outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
+    with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
         for name, outcome in outcomes:
             if isinstance(outcome, BaseException):
                 errors.append(f"{tasks[name].key}: {type(outcome).__name__}: {outcome}")
@@ -114,10 +117,10 @@ def run_grid(
             bar.update()
     if errors:
         raise InputError(
-            f"{len(errors)} of {len(missing)} cells failed; run the command again to retry "
-            f"them. The first: {errors[0]}"
+            f"{len(errors)} of {len(tasks)} cells failed; run the command again to retry them. The "
+            f"first: {errors[0]}"
         )
-    return [row for group in rows.values() for row in group]
+    return rows
 
 
 _Outcomes = Generator[tuple[str, list[ResultRow] | BaseException], None, None]
@@ -125,15 +128,15 @@ _Outcomes = Generator[tuple[str, list[ResultRow] | BaseException], None, None]
 resume from their checkpoints."""
 
 
-def _measure_in_processes(tasks: Mapping[str, _Task[Cell]], workers: int) -> _Outcomes:
+def _measure_in_processes(tasks: Mapping[str, _Task], workers: int) -> _Outcomes:
     with pool_of_processes(workers, _use_one_thread) as pool:
         with block_ctrl_c():
-            names = {pool.submit(_measure, task): name for name, task in tasks.items()}
+            names = {pool.submit(task.measure): name for name, task in tasks.items()}
         for done in as_completed(names):
             yield names[done], done.exception() or done.result()
 
 
-def _measure_here(tasks: Mapping[str, _Task[Cell]], workers: int) -> _Outcomes:
+def _measure_here(tasks: Mapping[str, _Task]) -> _Outcomes:
     import torch  # takes a second, and is not needed to print tables
 
     threads = torch.get_num_threads()
@@ -143,7 +146,7 @@ def _measure_here(tasks: Mapping[str, _Task[Cell]], workers: int) -> _Outcomes:
             try:
                 # What a library makes of an interruption is not a failure of the cell.
                 with interruptions_raised():
-                    rows = _measure(task)
+                    rows = task.measure()
             except Exception as error:
                 yield name, error
             else:
@@ -158,29 +161,18 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _measure(task: _Task[Cell]) -> list[ResultRow]:
-    """Measure a cell, append its rows and return them."""
-    reset_peak_memory()
-    rows = task.measure(task.cell, task.key)
-    peak = peak_memory_mib()
-    rows = [replace(row, peak_memory_mib=peak) for row in rows]
-    append_rows(task.results, rows, task.config)
-    return rows
-
-
-def chosen(known: Iterable[str], names: Sequence[str], what: str) -> list[str]:
-    """The names of `known` that are in `names`, in the order of `known`.
+def select_names(names: Iterable[str], selected: Sequence[str], what: str) -> list[str]:
+    """Those of `names` that are in `selected`, in their order; all if it is empty.
 
     Args:
-        names: selected names; empty for all.
         what: what the names stand for, for the message: "method", "table".
 
     Raises:
-        InputError: `names` has a name that `known` lacks.
+        InputError: `selected` has a name that `names` lacks.
     """
-    choices = list(known)
-    if unknown := [name for name in names if name not in choices]:
+    choices = list(names)
+    if unknown := [name for name in selected if name not in choices]:
         raise InputError(
             f"no {what} is called {', '.join(unknown)}; there are {', '.join(choices)}"
         )
-    return [name for name in choices if name in names or not names]
+    return [name for name in choices if name in selected or not selected]

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.benchmark.grid import Measurement, run_grid
+from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.benchmark.grid import run_grid, select_names
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
-from ucfrec.results.row import ResultRow
+from ucfrec.evaluation.simulator import Environment
+from ucfrec.results.rows import ResultRow
 
 Rows = Sequence[ResultRow]
 
@@ -52,7 +52,7 @@ class Benchmark:
     methods: Collection[str]
     """Names that `BenchmarkRequest.methods` may have."""
     plan: Callable[["BenchmarkRequest", Budget], Cells]
-    how: Measurement[Cell]
+    how: Measurement
 
 
 @dataclass(frozen=True)
@@ -64,17 +64,18 @@ class BenchmarkRequest:
     tables: Sequence[str]
     """Names of the tables to measure."""
     out: Path
-    """Folder for logs, stores and runs."""
+    """Folder for logs, stores, runs and result rows; resumed."""
     results: Path
     """File to which result rows are added."""
     workers: int
-    """Number of parallel processes."""
+    """Parallel processes, one thread each."""
     log_seed: int = 0
-    """Seed of the first simulated log of a task; the others have the seeds after it."""
+    """Seed of the first simulated log of a task; the others follow it."""
     logs: int | None = None
-    """Number of logs of each task; None for the budget's."""
+    """Logs of each task: simulated with as many seeds, or parts of a given log, 1 for all of it;
+    None for the budget's."""
     evaluation_seed: int | None = None
-    """Seed of the evaluation episodes; None stands for the budget's."""
+    """Seed of the evaluated episodes, the same for every training seed; None for the budget's."""
     environment: Environment | None = None
     """An environment that is measured instead of the suite's tasks; None for these."""
     tasks: Sequence[str] = ()
@@ -82,9 +83,9 @@ class BenchmarkRequest:
     methods: Sequence[str] = ()
     """Names of the only methods to measure; empty for all."""
     training_seeds: int | None = None
-    """Number of training seeds of each cell; None for the budget's."""
+    """Training seeds of every method, from 0; None for the budget's."""
     again: bool = False
-    """Whether cells that have rows are measured again."""
+    """Remove the rows and runs of the cells first; resume without it."""
 
 
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
@@ -96,14 +97,12 @@ def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
         InputError: the budget, a task or a method is unknown, another table than main is requested
             of a single environment, or cells failed.
     """
-    if request.budget not in suite.budgets:
-        budgets = ", ".join(suite.budgets)
-        raise InputError(f"unknown budget {request.budget}; choose one of {budgets}")
-    budget = suite.budgets[request.budget].narrowed(
+    select_names(suite.budgets, [request.budget], "budget")
+    select_names(suite.tasks, request.tasks, "task")
+    select_names(suite.methods, request.methods, "method")
+    budget = suite.budgets[request.budget].narrow(
         seeds=request.training_seeds, logs=request.logs, evaluation_seed=request.evaluation_seed
     )
-    _require_known("task", request.tasks, suite.tasks)
-    _require_known("method", request.methods, suite.methods)
     tables = list(request.tables)
     if request.environment is not None and not (tables := [t for t in tables if t == "main"]):
         raise InputError("--env gives the table main only; omit --table")
@@ -129,8 +128,3 @@ def show(suite: Benchmark, tables: Sequence[str], rows: Rows) -> str:
     """The tables that have rows in `rows`, as Markdown; nothing is measured."""
     by_table = {table: [row for row in rows if row.table == table] for table in tables}
     return "\n\n".join(suite.tables[t].show(group) for t, group in by_table.items() if group)
-
-
-def _require_known(kind: str, names: Sequence[str], choices: Collection[str]) -> None:
-    if unknown := [name for name in names if name not in choices]:
-        raise InputError(f"no {kind} is called {unknown[0]!r}; choose from {', '.join(choices)}")

@@ -1,22 +1,31 @@
-"""Tables of result rows: means and spreads over logs and seeds, and differences to a method."""
+"""Tables and plots of result rows: means and spreads over logs and seeds, and differences to a
+method."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from ucfrec.reporting.charts import LIGHT, PLAIN, save, styled
+from ucfrec.reporting.charts import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DISTRACTOR_NAMES: Final = ("no distractor", "distractor off", "distractor on")
 DISTRACTOR_RATES: Final = (None, 0.0, 1.0)
-"""Probability that the distractor is on in an evaluation; None: an environment without a
-distractor."""
+"""Probability that the distractor is on in an evaluation, for each of these names; None: an
+environment without a distractor."""
 OURS: Final = "ucf"
 MEAN: Final = "mean"
 NEAR: Final = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
 _BySeed = Mapping[tuple[int | None, int | None], float]
 """Values by the seeds of the log and of the training."""
-_SHOWN: Final = ("R_cum", "R_avg_pooled", "R_avg_episode", "length")
 
 
 def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
@@ -27,43 +36,52 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     of the same log and seed: mean ± standard error over the pairs, and in brackets over the means
     of logs, which counts what logs differ by.
     """
-    columns = (*_SHOWN, "coverage", "target", "estimate")
-    head = ("environment", "method", "logs × seeds", *columns, f"− {OURS}")
-    lines, rows = [], select_checkpoint(rows, checkpoint)
-    less = difference_to_ours(rows)
-    for (environment, method), group in grouped(rows, _line).items():
-        spread = [mean_and_sd(numbers(group, name)) for name in (*_SHOWN, "coverage")]
-        chosen = (_targets(group), mean_and_sd(numbers(group, "estimated_value")))
-        lines.append((environment, method, len(group), *spread, *chosen, less[environment, method]))
-    return markdown_table(head, lines)
+    rows = select_checkpoint(rows, checkpoint)
+    of_ours = grouped((row for row in rows if row.method == OURS), lambda row: row.environment)
 
+    def describe(group: Sequence[ResultRow]) -> list[str]:
+        targets = {f"{row.target_return:g}" for row in group if row.target_return is not None}
+        less = NONE
+        if group[0].method != OURS:
+            ours = _index_by_seeds(of_ours.get(group[0].environment, ()))
+            less = _format_difference(_subtract(_index_by_seeds(group), ours))
+        estimate = mean_and_sd(list_metric(group, "estimated_value"))
+        return [", ".join(sorted(targets, key=float)) or NONE, estimate, less]
 
-def difference_to_ours(rows: Sequence[ResultRow]) -> dict[tuple[str, str], str]:
-    """By (environment, method): its return less that of UCF, as in `method_table`; a dash for
-    UCF."""
-    texts: dict[tuple[str, str], str] = {}
-    for environment, group in grouped(rows, lambda row: str(row.environment)).items():
-        values = {
-            name: {_seeds(row): row.value for row in rows_of_method}
-            for name, rows_of_method in grouped(group, lambda row: row.method).items()
-        }
-        ours = values.get(OURS, {})
-        texts |= {
-            (environment, name): NONE if name == OURS else _format_difference(_less(seeds, ours))
-            for name, seeds in values.items()
-        }
-    return texts
+    columns = ("R_cum", "R_avg_pooled", "R_avg_episode", "length", "coverage")
+    more = ("target", "estimate", f"− {OURS}")
+    return _make_table(rows, "method", dict(zip(columns, columns, strict=True)), more, describe)
 
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
-    head = ("environment", "setting", "logs × seeds", "R_cum", "validation loss", "acceptance")
-    lines, metrics = [], ("R_cum", "validation_loss", "acceptance")
-    groups = grouped(select_checkpoint(rows, checkpoint), _line)
-    for (environment, method), group in groups.items():
-        spread = [mean_and_sd(numbers(group, name)) for name in metrics]
-        lines.append((environment, method, len(group), *spread))
-    return markdown_table(head, lines)
+    columns = {
+        "R_cum": "R_cum",
+        "validation loss": "validation_loss",
+        "acceptance": "acceptance",
+    }
+    return _make_table(select_checkpoint(rows, checkpoint), "setting", columns)
+
+
+def _make_table(
+    rows: Sequence[ResultRow],
+    name: str,
+    columns: Mapping[str, str],
+    more: Sequence[str] = (),
+    describe: Callable[[Sequence[ResultRow]], list[str]] = lambda group: [],
+) -> str:
+    """Mean and spread of metrics, one line per environment and method.
+
+    Args:
+        name: head of the column of methods.
+        columns: head of a column to its metric.
+        more: heads of the columns that `describe` makes of the rows of a line.
+    """
+    lines = []
+    for (environment, method), group in grouped(rows, lambda r: (r.environment, r.method)).items():
+        spread = [mean_and_sd(list_metric(group, metric)) for metric in columns.values()]
+        lines.append((environment, method, len(group), *spread, *describe(group)))
+    return markdown_table(("environment", name, "logs × seeds", *columns, *more), lines)
 
 
 def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
@@ -82,20 +100,17 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
     for (environment, quantile, method), group in sorted(
         groups.items(), key=lambda item: item[0][:2]
     ):
-        by_pair = [
-            {_seeds(row): row.value for row in group if row.conditions["distractor"] == rate}
-            for rate in DISTRACTOR_RATES
-        ]
-        pairs = [pair for pair in by_pair[0] if all(pair in values for values in by_pair)]
+        by_rate = grouped(group, lambda row: row.conditions["distractor"])
+        indexed = [_index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
+        pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
         if not pairs:  # an environment in which no distractor was planted
             continue
-        clean, off, on = ([values[pair] for pair in pairs] for values in by_pair)
+        clean, off, on = ([values[pair] for pair in pairs] for values in indexed)
         drop = [100 * (1 - with_it / without) for with_it, without in zip(off, clean, strict=True)]
         spread = [mean_and_sd(values) for values in (clean, off, on, drop)]
         lines.append((environment, f"{-quantile:g}", method, len(pairs), *spread))
     head = ("environment", "target quantile", "method", "logs × seeds")
-    columns = ("no distractor", "distractor off", "distractor on", "drop, %")
-    return markdown_table((*head, *columns), lines)
+    return markdown_table((*head, *DISTRACTOR_NAMES, "drop, %"), lines)
 
 
 def select_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[ResultRow]:
@@ -103,7 +118,7 @@ def select_checkpoint(rows: Sequence[ResultRow], checkpoint: str) -> list[Result
     return [row for row in rows if row.checkpoint in (None, checkpoint)]
 
 
-def numbers(rows: Sequence[ResultRow], name: str) -> list[float]:
+def list_metric(rows: Sequence[ResultRow], name: str) -> list[float]:
     """Values of metric `name` of the rows that have it."""
     return [row.metrics[name] for row in rows if name in row.metrics]
 
@@ -133,19 +148,14 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
         name: max((c[name].mean for c in cells.values() if c[name].count), default=0.0)
         for name in (*tasks, MEAN)
     }
-    return [
-        {
-            "method": method,
-            "seeds": _format_count([scores[task].count for task in tasks]),
-            **{name: _format_score(score, best[name]) for name, score in scores.items()},
-        }
-        for method, scores in cells.items()
-    ]
-
-
-def _format_count(counts: Sequence[int]) -> str:
-    fewest, most = min(filter(None, counts)), max(counts)
-    return str(most) if fewest == most else f"{fewest}–{most}"
+    lines = []
+    for method, of_method in cells.items():
+        counts = [of_method[task].count for task in tasks]
+        fewest, most = min(filter(None, counts)), max(counts)
+        seeds = str(most) if fewest == most else f"{fewest}–{most}"
+        texts = {name: _format_score(score, best[name]) for name, score in of_method.items()}
+        lines.append({"method": method, "seeds": seeds, **texts})
+    return lines
 
 
 def _format_score(scores: Summary, best: float) -> str:
@@ -156,7 +166,7 @@ def _format_score(scores: Summary, best: float) -> str:
     return f"**{text}**" if scores.mean >= best - NEAR * abs(best) else text
 
 
-def of_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
+def select_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Rows of the target return with the highest mean over seeds, for each dataset, method and
     checkpoint."""
     best: list[ResultRow] = []
@@ -166,7 +176,7 @@ def of_best_target(rows: Sequence[ResultRow]) -> list[ResultRow]:
     return best
 
 
-def over_seeds(
+def average_seeds(
     lines: Sequence[Mapping[str, Any]], by: Sequence[str], values: Sequence[str]
 ) -> list[dict[str, Any]]:
     """One line per combination of `by`: `values` as mean ± standard deviation over seeds.
@@ -175,16 +185,13 @@ def over_seeds(
         lines: as `ResultRow.as_line` returns them; a value may be missing or None.
         by: names of the columns to group by.
     """
-    groups = grouped(lines, lambda line: tuple(line[name] for name in by))
-    return [
-        {
-            **dict(zip(by, key, strict=True)),
-            **{
-                n: mean_and_sd(line[n] for line in group if line.get(n) is not None) for n in values
-            },
-        }
-        for key, group in groups.items()
-    ]
+    averages = []
+    for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items():
+        average: dict[str, Any] = dict(zip(by, key, strict=True))
+        for name in values:
+            average[name] = mean_and_sd(line[name] for line in group if line.get(name) is not None)
+        averages.append(average)
+    return averages
 
 
 def difference_table(
@@ -201,24 +208,29 @@ def difference_table(
     lines = []
     for method in dict.fromkeys(row.method for row in rows if row.method != first):
         of_tasks = [
-            _less(values.get((method, task), {}), values.get((first, task), {})) for task in tasks
+            _subtract(values.get((method, task), {}), values.get((first, task), {}))
+            for task in tasks
         ]
         if any(of_tasks):
-            texts = [*map(_format_difference, of_tasks), _format_signed(_summarise_tasks(of_tasks))]
+            mean = _format_signed(_summarise_tasks(of_tasks))
+            texts = [*map(_format_difference, of_tasks), mean]
             lines.append({"method": method, **dict(zip((*tasks, MEAN), texts, strict=True))})
     return lines
 
 
 def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
     """The metric, where a row has it, by seeds, of each method and task."""
+    rows = [row for row in rows if metric in row.metrics]
+    groups = grouped(rows, lambda row: (row.method, row.task))
+    return {pair: _index_by_seeds(group, metric) for pair, group in groups.items()}
+
+
+def _index_by_seeds(rows: Sequence[ResultRow], metric: str | None = None) -> _BySeed:
+    """A metric, or None for what a row is about, by the seeds of the log and of the training."""
     return {
-        pair: {_seeds(row): row.metrics[metric] for row in group if metric in row.metrics}
-        for pair, group in grouped(rows, lambda row: (row.method, row.task)).items()
+        (row.log_seed, row.training_seed): row.value if metric is None else row.metrics[metric]
+        for row in rows
     }
-
-
-def _seeds(row: ResultRow) -> tuple[int | None, int | None]:
-    return row.log_seed, row.training_seed
 
 
 def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
@@ -230,7 +242,7 @@ def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
     return summary([summary(task.mean for task in means).mean] if all(of_tasks) else [])
 
 
-def _less(values: _BySeed, reference: _BySeed) -> _BySeed:
+def _subtract(values: _BySeed, reference: _BySeed) -> _BySeed:
     """By how much `values` exceed those of the same seeds in `reference`; a value that no log or
     seed changes is compared with each."""
     if values.keys() == {(None, None)}:
@@ -254,10 +266,67 @@ def _format_signed(differences: Summary) -> str:
     return f"{differences.mean:+.3g}" if differences.count else NONE
 
 
-def _line(row: ResultRow) -> tuple[str, str]:
-    return str(row.environment), row.method
+def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:
+    """One plot per environment: return of every method, mean and standard deviation over seeds.
+
+    Args:
+        kind: what the files are called, before the environment.
+    """
+    return _plot_environments(kind, _draw_bars, rows, folder)
 
 
-def _targets(rows: Sequence[ResultRow]) -> str:
-    chosen = {f"{row.target_return:g}" for row in rows if row.target_return is not None}
-    return ", ".join(sorted(chosen, key=float)) or NONE
+def plot_distractor(rows: Sequence[ResultRow], folder: Path) -> list[Path]:
+    """One plot per environment with a distractor: returns without it, with it off, and with it on.
+
+    Only rows whose target return is the largest training return are shown.
+    """
+    rows = [row for row in rows if row.conditions["quantiles"] == "1"]
+    planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
+    return _plot_environments(
+        "distractor", _draw_triples, [r for r in rows if r.environment in planted], folder
+    )
+
+
+def _draw_bars(axes: "Axes", rows: Sequence[ResultRow]) -> None:
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    returns = [summary(row.value for row in group) for _, group in by_method]
+    colors = [OURS_COLOR if name == OURS else PLAIN for name, _ in by_method]
+    means, spreads = [r.mean for r in returns], [r.sd for r in returns]
+    axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
+    axes.set_xlabel("return per session (mean ± sd over training seeds)")
+
+
+def _draw_triples(axes: "Axes", rows: Sequence[ResultRow]) -> None:
+    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+    conditions = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS_COLOR, LIGHT), strict=True)
+    for index, (rate, label, color) in enumerate(conditions):
+        returns = [
+            summary(row.value for row in group if row.conditions["distractor"] == rate)
+            for _, group in by_method
+        ]
+        positions = np.arange(len(by_method)) + 0.25 * (1 - index)
+        means = [r.mean for r in returns]
+        axes.barh(positions, means, height=0.25, color=color, label=label)
+    axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
+    axes.set_xlabel("return per session (mean over training seeds)")
+    axes.legend()
+
+
+@styled
+def _plot_environments(
+    kind: str,
+    draw: Callable[["Axes", Sequence[ResultRow]], None],
+    rows: Sequence[ResultRow],
+    folder: Path,
+) -> list[Path]:
+    from matplotlib.figure import Figure
+
+    files = []
+    environments = grouped(select_checkpoint(rows, "best"), lambda row: row.environment)
+    for environment, group in environments.items():
+        figure, name = Figure(figsize=(5.2, 4.2)), f"{kind}-{environment}"
+        axes = figure.add_subplot()
+        axes.set_title(name)
+        draw(axes, group)
+        files += save(figure, folder, name)
+    return files

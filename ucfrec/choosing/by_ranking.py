@@ -1,4 +1,4 @@
-"""Choose the reward weight of a run by how it ranks the validation rows of its log.
+"""What rules would have done at logged steps, and the choice of a reward weight by it.
 
 Where the log has no true sessions there is nothing to simulate, but every row shows what a user
 liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
@@ -6,22 +6,29 @@ show, and overlaps with the log enough if it finds liked items better than the t
 do, by a standard error. The choice is repeated on two halves of the users.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
-from ucfrec.acting.scorer import Scorer
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice
-from ucfrec.choosing.logged import SHOWN, LoggedScores
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.acting.scorer import Query, Scorer, sessions_before
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, seen_before
+from ucfrec.progress import progress
+from ucfrec.results.statistics import effective_number
+from ucfrec.user_model.reward_report import draw_steps
 
+SHOWN = 10
+"""Items that a rule shows at a step."""
+_AT_ONCE = 256
 _FEWEST_STEPS, _MOST_STEPS = 4000, 20_000
 """Validation rows that are ranked at most, in large and in small catalogues …"""
 _SCORES = 2e8
@@ -30,6 +37,121 @@ _HALVINGS = 3
 """How often the interval between the best reward weight and the next larger one is halved."""
 _PRIOR = 10.0
 """Impressions at the mean rate that are added to those of an item."""
+
+
+class LoggedScores:
+    """Scores of all items at M logged steps by rules of one policy.
+
+    Policy and reward model are computed once for all rules of one target, and where the policy has
+    factors kept for rules that are asked for later: the outputs of others are as many as items.
+    """
+
+    def __init__(
+        self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
+    ) -> None:
+        self.view, self.episodes, self.steps = view, episodes, steps
+        self.items = self.read(schema.ITEM).astype(np.int64)
+        """(M,) logged."""
+        self.liked = liked_rewards(view, self.read(schema.REWARD))
+        """(M,) bool."""
+        owners = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
+        self.owners = owners.astype(np.int64)
+        """(E,) users of the episodes; the episodes, where users are not named."""
+        self._scorer = scorer
+        self._queries: dict[tuple[object, ...], Query] = {}
+
+    def read(self, column: str) -> Array:
+        """(M,) values of the steps."""
+        return self.view.step_values(column, self.episodes, self.steps)
+
+    @torch.no_grad()
+    def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
+        """Scores (B, n_items) by each rule of batches of the steps, and which steps they are."""
+        scorers = [self._scorer.under(rule) for rule in rules]
+        reach, widest = max((scorer.reach, number) for number, scorer in enumerate(scorers))
+        weighted = any(rule.reward_weight for rule in rules)
+        with progress(len(self.steps), "logged steps under each rule", "rows") as bar:
+            for first in range(0, len(self.steps), _AT_ONCE):
+                part = slice(first, min(first + _AT_ONCE, len(self.steps)))
+                episodes, steps = self.episodes[part], self.steps[part]
+                queries = self._queries if self._scorer.has_factors else {}
+                sessions: Sessions | None = None
+                scores = list[Tensor]()
+                for rule, scorer in zip(rules, scorers, strict=True):
+                    key = first, rule.target, rule.minimum_target, reach, weighted
+                    if key not in queries:
+                        sessions = sessions or sessions_before(
+                            scorers[widest], self.view, episodes, steps
+                        )
+                        query = scorer.query(sessions, rewards=weighted)
+                        # What has been read for the query is not needed again.
+                        queries[key] = query._replace(sessions=replace(sessions, states=None))
+                    seen = seen_before(self.view, episodes, steps) if rule.exclude_seen else None
+                    scores.append(scorer.scores_of(queries[key], excluded=seen))
+                yield part, scores
+                bar.update(part.stop - part.start)
+
+
+class LoggedEvidence:
+    """Validation sessions on which rules of one policy are compared with the log."""
+
+    def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
+        """Args:
+        view: validation episodes.
+        most: about the number of steps of the sessions that are drawn from many, by the seed.
+        """
+        order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
+        last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
+        view = view.select(np.sort(order[: last + 1]))
+        episodes, steps = view.all_steps()
+        self._logged = LoggedScores(scorer, view, episodes, steps)
+        self._propensities: Float64Array | None = None
+        if schema.PROPENSITY in view.record.columns:
+            propensities = self._logged.read(schema.PROPENSITY).astype(np.float64)
+            self._propensities = propensities if (propensities > 0).all() else None
+        self._users = np.unique(self._logged.owners, return_inverse=True)[1]
+
+    @property
+    def has_propensities(self) -> bool:
+        """Whether all steps have one."""
+        return self._propensities is not None
+
+    @property
+    def users(self) -> int:
+        """The number of users."""
+        return int(self._users.max(initial=-1)) + 1
+
+    def evaluate(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
+        """The evidence of each rule."""
+        shape = len(rules), len(self._logged.steps)
+        logs, hits = np.zeros(shape), np.zeros(shape, dtype=bool)
+        items = torch.from_numpy(self._logged.items).unsqueeze(1)
+        for part, scores in self._logged.score(rules):
+            for n, (rule, values) in enumerate(zip(rules, scores, strict=True)):
+                chances = rule.log_probabilities(values)
+                logs[n, part] = chances.gather(1, items[part])[:, 0].double().numpy()
+                top = best_items(values, min(SHOWN, values.shape[1]))
+                hits[n, part] = (top == items[part]).any(1).numpy()
+        return [self._weigh(logs[n], hits[n]) for n in range(len(rules))]
+
+    def _weigh(self, logs: Float64Array, hits: BoolArray) -> Evidence:
+        liked, view = self._logged.liked, self._logged.view
+        rate = float(hits[liked].mean()) if liked.any() else 0.0
+        likelihood = float(np.exp(logs.mean()))
+        if self._propensities is None:
+            return Evidence(rate, likelihood)
+        sums = np.bincount(self._logged.episodes, logs - np.log(self._propensities))
+        weights = np.exp(np.minimum(sums, 100.0))
+        above = np.bincount(self._users, weights * view.returns.astype(np.float64))
+        below = np.bincount(self._users, weights).astype(np.float64)
+        if not below.any():
+            return Evidence(rate, likelihood, 0.0)
+        halves = [half for half in (below[::2], below[1::2]) if len(half)]
+        effective_users = 2 * min(effective_number(half) for half in halves)
+        spread = float(sums[np.isfinite(sums)].var())
+        value = above.sum() / below.sum()
+        error = np.sqrt(np.square(above - value * below).sum()) / below.sum()
+        return Evidence(rate, likelihood, effective_users, spread, float(value), float(error))
 
 
 def choose_by_ranking(problem: Problem) -> RuleChoice:
@@ -41,84 +163,52 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     weights between the two are tried. The first candidates are the configured ones; of many
     validation rows, 4,000 to 20,000 are drawn.
     """
-    scorer, candidates = problem.scorer, list[_Candidate]()
-    rows = _Rows.of(problem.train, problem.validation, problem.seed)
-    scores = LoggedScores(scorer, rows.store, rows.episodes, rows.steps)
+    train, validation, scorer = problem.train, problem.validation, problem.scorer
+    n_items = len(train.item_states.embeddings)
+    most = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS))
+    episodes, steps = draw_steps(validation, most, problem.seed)
+    logged = LoggedScores(scorer, validation, episodes, steps)
+    users, candidates = logged.owners[logged.episodes], list[_Candidate]()
+    most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, n_items)).indices.numpy()
+    baseline = np.isin(logged.items, most_liked)
+    counts = TrainingCounts.of(validation)
+    impressions, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
+    rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
 
     def rank(weights: Sequence[float]) -> _Candidate:
-        for weight, top in zip(weights, _top_items(scorer, weights, scores), strict=True):
-            rule = replace(scorer.rule, reward_weight=weight)
-            candidates.append(_Candidate.of(rule, top, rows))
-        return _best(candidates)
+        rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
+        tops = list[list[Tensor]]()
+        for _, batch in logged.score(rules):
+            tops.append([best_items(values, min(SHOWN, n_items)) for values in batch])
+        for rule, *parts in zip(rules, *tops, strict=True):
+            top = torch.cat(parts).numpy()
+            hits = (top == logged.items[:, None]).any(1)
+            ahead = (hits.astype(np.float64) - baseline) * logged.liked
+            mean_rates = rates[top].mean(1)
+            candidates.append(_Candidate(rule, users, mean_rates, logged.liked, hits, ahead))
+        return _choose_best(candidates)
 
     best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
-        weight = best.weight
-        larger = [candidate for candidate in candidates if candidate.weight > weight]
+        larger = [candidate for candidate in candidates if candidate.weight > best.weight]
         nearest = min(larger, key=lambda candidate: candidate.weight, default=best)
         if nearest.overlaps:
             break
-        best = rank([(weight + nearest.weight) / 2])
+        best = rank([(best.weight + nearest.weight) / 2])
     halves = [
-        _best([candidate.select(rows.users % 2 == half) for candidate in candidates]).weight
+        _choose_best([candidate.select(users % 2 == half) for candidate in candidates]).weight
         for half in (0, 1)
     ]
+    warning = "; WARNING: no candidate does, this one is among those with the most hits"
     return RuleChoice(
         rule=best.rule,
         chosen_by="mean rate, on validation rows, of the ten items shown, among rules that find "
         "liked items better than the ten most liked ones do, by a standard error; no propensities "
         f"are used; halves of the users choose reward weights {halves[0]:g} and {halves[1]:g}",
         candidates=[candidate.summary for candidate in candidates],
-        warning=""
-        if best.overlaps
-        else "; WARNING: no candidate does, this one is among those with the most hits",
+        warning="" if best.overlaps else warning,
         details={"reward_weights_of_halves": halves},
     )
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """M validation rows: where they are, what was shown and liked, what the baseline hits."""
-
-    store: EpisodeStore
-    users: IntArray
-    """(M,) numbers of their users, or sessions where users are not named."""
-    episodes: IntArray
-    steps: IntArray
-    items: IntArray
-    liked: BoolArray
-    baseline: BoolArray
-    """Whether the item is one of the most liked training items."""
-    rates: Float64Array
-    """(n_items,) share of liked impressions of every item in the period, with ten at the mean."""
-
-    @classmethod
-    def of(cls, train: EpisodeStore, validation: EpisodeStore, seed: int) -> "_Rows":
-        numbers = np.arange(validation.n_steps)
-        most = int(np.clip(_SCORES / len(train.item_states.embeddings), _FEWEST_STEPS, _MOST_STEPS))
-        if len(numbers) > most:
-            numbers = np.random.default_rng(seed).choice(len(numbers), most, replace=False)
-            numbers.sort()
-        episodes, steps = validation.locate(numbers)
-        items = validation.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-        rewards = validation.step_values(schema.REWARD, episodes, steps)
-        counts = TrainingCounts.of(validation)
-        impressions, likes = counts.shown.double().numpy(), counts.liked.double().numpy()
-        rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
-        users = episodes
-        if validation.has_users:
-            users = validation.episode_values(schema.USER).astype(np.int64)[episodes]
-        most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, len(rates))).indices.numpy()
-        return cls(
-            store=validation,
-            users=users,
-            episodes=episodes,
-            steps=steps,
-            items=items,
-            liked=liked_rewards(validation, rewards),
-            baseline=np.isin(items, most_liked),
-            rates=rates,
-        )
 
 
 @dataclass(frozen=True)
@@ -129,19 +219,13 @@ class _Candidate:
     users: IntArray
     """(M,) whose rows they are."""
     rates: Float64Array
-    """(M,) mean rate of the items shown."""
+    """(M,) mean rate, in the period, of the items shown."""
     liked: BoolArray
     """(M,)."""
     hits: BoolArray
     """(M,) whether the row's item is among those shown."""
     ahead: Float64Array
     """(M,) 1 for a liked item that only the rule shows, −1 for one that only the baseline does."""
-
-    @classmethod
-    def of(cls, rule: DecisionRule, top: IntArray, rows: _Rows) -> "_Candidate":
-        hits = (top == rows.items[:, None]).any(1)
-        ahead = (hits.astype(np.float64) - rows.baseline) * rows.liked
-        return cls(rule, rows.users, rows.rates[top].mean(1), rows.liked, hits, ahead)
 
     def select(self, rows: BoolArray) -> "_Candidate":
         names = ("users", "rates", "liked", "hits", "ahead")
@@ -155,13 +239,12 @@ class _Candidate:
     def summary(self) -> RankedRule:
         count = max(1, int(self.liked.sum()))
         gain = float(self.ahead.sum()) / count
-        residuals = self.ahead - gain * self.liked
         return RankedRule(
             rule=self.rule,
             item_rate=float(self.rates.mean()) if len(self.rates) else 0.0,
             hits=float(self.hits[self.liked].sum()) / count,
             gain=gain,
-            gain_error=_error_of_sum(residuals, self.users) / count,
+            gain_error=self._error_of_sum(self.ahead - gain * self.liked) / count,
         )
 
     @property
@@ -172,17 +255,16 @@ class _Candidate:
     def levels_with(self, top: "_Candidate") -> bool:
         """Whether the rate is not below that of another rule by more than a standard error."""
         below = top.rates - self.rates
-        return not len(below) or bool(
-            below.sum() <= _error_of_sum(below - below.mean(), self.users)
-        )
+        return not len(below) or bool(below.sum() <= self._error_of_sum(below - below.mean()))
+
+    def _error_of_sum(self, values: Float64Array) -> float:
+        """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""
+        if not len(values):
+            return 0.0
+        return float(np.sqrt(np.square(np.bincount(self.users, values)).sum()))
 
 
-def _error_of_sum(values: Float64Array, users: IntArray) -> float:
-    """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""
-    return float(np.sqrt(np.square(np.bincount(users, values)).sum())) if len(users) else 0.0
-
-
-def _best(candidates: Sequence[_Candidate]) -> _Candidate:
+def _choose_best(candidates: Sequence[_Candidate]) -> _Candidate:
     """The rule to choose; if none overlaps enough, of those that hit as often as any."""
     allowed = [candidate for candidate in candidates if candidate.overlaps]
     if not allowed:
@@ -192,13 +274,3 @@ def _best(candidates: Sequence[_Candidate]) -> _Candidate:
     top = max(allowed, key=lambda candidate: candidate.summary.item_rate)
     level = [candidate for candidate in allowed if candidate.levels_with(top)]
     return max(level, key=lambda candidate: candidate.summary.hits)
-
-
-def _top_items(scorer: Scorer, weights: Sequence[float], scores: LoggedScores) -> list[IntArray]:
-    """The items (M, `SHOWN`) that are shown with each reward weight."""
-    rules = [replace(scorer.rule, reward_weight=weight) for weight in weights]
-    tops = [
-        [best_items(values, min(SHOWN, values.shape[1])) for values in batch]
-        for _, batch in scores.of(rules)
-    ]
-    return [torch.cat(parts).numpy() for parts in zip(*tops, strict=True)]

@@ -1,39 +1,41 @@
 """Choose the decision rule in sessions simulated in the user model.
 
 Simulated users have the fixed tastes of training users, which the policy does not know
-(`ucfrec.user_model.training_users`): rewards of the model that acts, which learns from the session,
-would pay a policy for its own guesses. What a model says of a policy holds only where the log
-supports it, so a candidate must keep to items that the training log shows often enough, and to more
-than a handful of them; where the log has propensities, it must also leave enough effective users to
+(`ucfrec.user_model.reward_fit`). What a model says of a policy holds only where the log supports
+it, so a candidate must keep to items that the training log shows often enough, and to more than a
+handful of them; where the log has propensities, it must also leave enough effective users to
 evaluate it off-policy.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, product
+from operator import attrgetter
+from typing import Any, Final
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Float64Array
-from ucfrec.choosing.candidates import NEAR_THE_LOG, lookaheads, near, unweighted, variants
+from ucfrec.acting.policy_actor import PolicyActor
+from ucfrec.acting.scorer import Scorer
+from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.choosing.by_ranking import LoggedEvidence
 from ucfrec.choosing.choice import (
-    FAR_OFF,
     Problem,
     RuleChoice,
     SimulatedRule,
     ValueEstimate,
-    describe_choice,
-    list_doubts,
 )
-from ucfrec.choosing.logged import LoggedEvidence
-from ucfrec.choosing.many_rules import Outcomes, roll_out
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.user_model.model import UserModel
-from ucfrec.user_model.simulator import UserSimulator, longest_session
-from ucfrec.user_model.training_users import draw_sessions, halve_users
+from ucfrec.episodes.windows import Sessions, Windows
+from ucfrec.progress import progress
+from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
+from ucfrec.user_model.reward_fit import draw_sessions
+from ucfrec.user_model.reward_report import halve_users
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
@@ -49,21 +51,106 @@ _ERRORS_BEHIND: Final = 3.0
 """… which are those that are so many standard errors behind the best."""
 _SEED_OF_REST: Final = 3
 """Added to the seed for the other sessions; 1 and 2 are for the halves of an estimate."""
-_LARGEST_ERROR: Final = FAR_OFF / 4
+_FAR_OFF: Final = 0.1
+"""Share of the estimated value by which it may be off and still be trusted."""
+_LARGEST_ERROR: Final = _FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
 """Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
 (Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
+_ROWS_AT_ONCE: Final = 256
+"""Rows of a forward pass, whose logits then stay in the processor's cache."""
+_NEAR_THE_LOG: Final = (
+    {"temperature": (1.0, 1.5, 2.0, 4.0, 8.0), "reward_weight": (0.0, 0.25, 0.5, 1.0)},
+    {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
+)
+"""Candidates where a rule must leave effective users of a log with propensities."""
+_value = attrgetter("value")
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What happened in n simulated sessions of one rule."""
+
+    returns: Float64Array
+    """(n,), in reward units."""
+    lengths: IntArray
+    """(n,), steps."""
+    items: IntArray
+    """(M,), all that were shown."""
+
+    def append(self, more: "Outcomes") -> "Outcomes":
+        return Outcomes(
+            np.concatenate([self.returns, more.returns]),
+            np.concatenate([self.lengths, more.lengths]),
+            np.concatenate([self.items, more.items]),
+        )
+
+
+class _ManyRules(PolicyActor):
+    """Acts by the rule of each session: n sessions by each of several scorers of one policy.
+
+    Every rule has a generator of its own, so that it draws what it would draw alone.
+    """
+
+    def __init__(self, scorers: Sequence[Scorer], n: int, store: EpisodeStore, seed: int) -> None:
+        states, rows = store.item_states, len(scorers) * n
+        users = np.arange(len(states.user_features))
+        super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
+        self._scorers = scorers
+        self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
+        self._rule = np.repeat(np.arange(len(scorers)), n)
+
+    def keep(self, rows: IntArray) -> None:
+        super().keep(rows)
+        self._rule = self._rule[rows]
+
+    def _decide(
+        self, rows: Tensor, sessions: Sessions, excluded: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        decisions = []
+        for batch in _batch_rules(self._rule[rows.numpy()]):
+            begin, windows = batch[0][1].start, list[Windows]()
+            # Windows depend on the rule's targets alone.
+            for _, rules in groupby(batch, lambda entry: self._targets(entry[0])):
+                group = list(rules)
+                part = slice(group[0][1].start, group[-1][1].stop)
+                windows.append(self._scorers[group[0][0]].windows(sessions.at(part)))
+            weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
+            together = sessions.at(slice(begin, batch[-1][1].stop))
+            query = self._scorer.query(together, Windows.joined(windows), weighted)
+            for number, part in batch:
+                scorer = self._scorers[number]
+                of_rule = query.at(slice(part.start - begin, part.stop - begin))
+                left_out = None if excluded is None else excluded[part]
+                scores = scorer.scores_of(of_rule, excluded=left_out)
+                decisions.append(scorer.rule.choose(scores, self._generators[number]))
+        items, chances = zip(*decisions, strict=True)
+        return torch.cat(items), torch.cat(chances)
+
+    def _targets(self, number: int) -> tuple[float | None, float | None]:
+        rule = self._scorers[number].rule
+        return rule.target, rule.minimum_target
+
+
+def _batch_rules(rules: IntArray) -> list[list[tuple[int, slice]]]:
+    """Whole rules of about `_ROWS_AT_ONCE` rows, and where they are among the sorted rules (M,)."""
+    numbers, first = np.unique(rules, return_index=True)
+    batches, size = [list[tuple[int, slice]]()], 0
+    for rule, begin, end in zip(numbers, first, [*first[1:], len(rules)], strict=True):
+        if size and size + end - begin > _ROWS_AT_ONCE:
+            batches.append([])
+            size = 0
+        batches[-1].append((int(rule), slice(int(begin), int(end))))
+        size += int(end - begin)
+    return batches
 
 
 class RuleSearch:
     """Simulates decision rules of one policy in a user model."""
 
     def __init__(self, problem: Problem) -> None:
-        """Args:
-        problem: the policy, the user model and the log; where users are new, training sessions are
-            begun, otherwise validation sessions.
-        """
+        """Where users are new, training sessions are begun, otherwise validation sessions."""
         self.problem, self.users, self._config = problem, problem.users, problem.config
         train, seed = problem.train, problem.seed
         new = self.users.reward_report.new_users
@@ -71,28 +158,27 @@ class RuleSearch:
         self._longest = longest_session(train.lengths)
         self._supported = train.item_counts() >= self._config.least_impressions
         self.least_items = float(min(self._config.least_items, self._supported.sum() / 4))
-        logged = problem.scorer, problem.validation
-        self._many, self._few = (LoggedEvidence(*logged, most, seed) for most in _LOGGED_STEPS)
+        self._many, self._few = (
+            LoggedEvidence(problem.scorer, problem.validation, most, seed) for most in _LOGGED_STEPS
+        )
         self.least_users = float(self._config.evidence if self._many.has_propensities else 0)
         """Effective users that a rule must leave; 0 without propensities."""
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
     def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
-        """Roll out each of the rules, side by side, all with the same draws.
+        """Roll out each of the rules, side by side, with the same draws, in `times` the sessions of
+        the configuration.
 
         A rule that is far behind the best one after a part of the sessions is not simulated in the
         rest; its value is that of the best one less the difference.
-
-        Args:
-            times: how many times the sessions of the configuration.
         """
         if not rules:
             return []
         n = times * self._config.sessions
         first = n // _FIRST_PART if n >= _FIRST_PART * _FEWEST else n
-        sessions = self._roll(rules, self._store, first, self.problem.seed)
+        sessions = self._roll_out(rules, self._store, first, self.problem.seed)
         self._sessions |= sessions
-        candidates = [self._summarise(rule, played) for rule, played in sessions.items()]
+        candidates = [self._summarise(rule, outcomes) for rule, outcomes in sessions.items()]
         if 0 < self.least_users < self._many.users:
             candidates = self._add_evidence(candidates)
         return candidates if first == n else self._simulate_rest(candidates, n - first)
@@ -101,18 +187,17 @@ class RuleSearch:
         """The rules in `n` more sessions, where they are not far behind the best one."""
         allowed = self._select_allowed(candidates)
         top = max(allowed or candidates, key=_value)
-        rules = [
-            candidate.rule
-            for candidate in candidates
-            if not (allowed and self._is_far_behind(top, candidate))
-        ]
+        near, least = list[DecisionRule](), self._config.tolerance * abs(top.value)
+        for candidate in candidates:
+            behind = max(_ERRORS_BEHIND * self._error(top, candidate), least)
+            if not allowed or top.value - candidate.value <= behind:
+                near.append(candidate.rule)
         first = len(self._sessions[top.rule].returns)
         store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
-        rest = self._roll(rules, store, n, self.problem.seed + _SEED_OF_REST)
-        whole = {rule: self._sessions[rule].followed_by(more) for rule, more in rest.items()}
+        more = self._roll_out(near, store, n, self.problem.seed + _SEED_OF_REST)
+        whole = {rule: self._sessions[rule].append(outcomes) for rule, outcomes in more.items()}
         self._sessions |= whole
-        best = self._summarise(top.rule, whole[top.rule])
-        results = list[SimulatedRule]()
+        best, results = self._summarise(top.rule, whole[top.rule]), list[SimulatedRule]()
         for candidate in candidates:
             if candidate.rule in whole:
                 result = self._summarise(candidate.rule, whole[candidate.rule])
@@ -122,10 +207,6 @@ class RuleSearch:
             value = best.value - (top.value - candidate.value)
             results.append(replace(candidate, value=value, error=error))
         return results
-
-    def _is_far_behind(self, top: SimulatedRule, candidate: SimulatedRule) -> bool:
-        error, least = self._error(top, candidate), self._config.tolerance * abs(top.value)
-        return top.value - candidate.value > max(_ERRORS_BEHIND * error, least)
 
     def _add_evidence(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The rules with their evidence: of many sessions, where it decides what is allowed and no
@@ -137,11 +218,11 @@ class RuleSearch:
             for logged, part in ((self._many, fast), (self._few, slow))
             if part
             for candidate, evidence in zip(
-                part, logged.of([item.rule for item in part]), strict=True
+                part, logged.evaluate([item.rule for item in part]), strict=True
             )
         ]
 
-    def _roll(
+    def _roll_out(
         self,
         rules: Sequence[DecisionRule],
         store: EpisodeStore,
@@ -149,13 +230,35 @@ class RuleSearch:
         seed: int,
         users: UserModel | None = None,
     ) -> dict[DecisionRule, Outcomes]:
-        """Simulate `n` sessions of each rule that begin as those of a store."""
+        """Simulate `n` sessions of each rule that begin as those of a store, none of which excludes
+        seen items; the seed is that of the draws of each rule."""
+        scorers = [self.problem.scorer.under(rule) for rule in rules]
         simulator = UserSimulator(
             users or self.users, store, n, self._longest, seed, times=len(rules)
         )
-        scorers = [self.problem.scorer.under(rule) for rule in rules]
-        sessions = roll_out(simulator, scorers, n, store.item_states, store.observation_size, seed)
-        return dict(zip(rules, sessions, strict=True))
+        actor = _ManyRules(scorers, n, store, seed)
+        live = np.arange(len(rules) * n)
+        returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
+        decisions = list[IntArray]()
+        with progress(len(live), "choose the rule", "sessions") as bar:
+            while len(live):
+                actor.inform({schema.USER_IDS: simulator.users})
+                items, _ = actor.act(simulator.observations(), np.ones(len(live), dtype=bool))
+                rewards, going = simulator.step(items)
+                actor.observe(items, rewards)
+                returns[live] += rewards
+                lengths[live] += 1
+                decisions.append(np.stack([live, items], axis=1))
+                bar.update(len(live) - len(going))
+                if len(going) < len(live):
+                    live = live[going]
+                    actor.keep(going)
+        numbers, items = np.concatenate(decisions).T
+        parts = [slice(number * n, (number + 1) * n) for number in range(len(rules))]
+        return {
+            rule: Outcomes(returns[part], lengths[part], items[numbers // n == number])
+            for number, (rule, part) in enumerate(zip(rules, parts, strict=True))
+        }
 
     def _summarise(self, rule: DecisionRule, sessions: Outcomes) -> SimulatedRule:
         shares = np.bincount(sessions.items) / len(sessions.items)
@@ -174,11 +277,6 @@ class RuleSearch:
         enough = candidate.items >= self.least_items
         return enough and candidate.support >= self._config.least_support
 
-    def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates; all that the log supports if it can evaluate none."""
-        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
-
     def is_allowed(self, candidate: SimulatedRule) -> bool:
         """Whether the log supports what the candidate did, and can evaluate it."""
         evidence = candidate.evidence
@@ -187,13 +285,18 @@ class RuleSearch:
         enough = candidate.effective_users >= self.least_users and evidence.spread <= _WIDEST
         return self.is_supported(candidate) and enough
 
+    def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
+        """The allowed candidates; all that the log supports if it can evaluate none."""
+        allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
+        return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
+
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
         """The best, the rule that the choice starts from, and those of the highest value among the
         allowed, in more sessions."""
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
-        ranked = (best, *self.find_start(candidates), *sorted(allowed, key=_value, reverse=True))
+        ranked = (best, *self._find_start(candidates), *sorted(allowed, key=_value, reverse=True))
         rules = dict.fromkeys(candidate.rule for candidate in ranked)
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
@@ -201,13 +304,13 @@ class RuleSearch:
         """The allowed candidates that cannot be told apart from the best: within the standard error
         of the difference over pairs of sessions, or the tolerance.
 
-        If the log can evaluate none, all that it supports are allowed; if it supports none, the
-        rule that the choice starts from, or the one with the most effective items.
+        If the log supports none, the rule that the choice starts from, or the one with the most
+        effective items.
         """
         allowed = self._select_allowed(candidates)
         if not allowed:
             most_varied = max(candidates, key=lambda candidate: candidate.items)
-            return self.find_start(candidates) or [most_varied]
+            return self._find_start(candidates) or [most_varied]
         top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
         return [
@@ -216,7 +319,7 @@ class RuleSearch:
             if top.value - candidate.value <= max(least, self._error(top, candidate))
         ]
 
-    def find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
+    def _find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The rule that the choice starts from, if it is a candidate."""
         return [candidate for candidate in candidates if candidate.rule == self.problem.start]
 
@@ -233,12 +336,22 @@ class RuleSearch:
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """Of those that cannot be told apart from the best, the rule that the choice starts from,
         or the one with the most support in the log: effective users, or without propensities the
-        likelihood; then the most hits."""
+        likelihood; then the most hits, if they differ by a percentage point; then the simplest.
+
+        A handful of effective users is no evidence, nor are fewer hits among few logged steps.
+        """
         level = self.level(candidates)
-        level = self.find_start(level) or level
+        level = self._find_start(level) or level
         complete = [candidate for candidate in level if candidate.evidence is not None]
-        lacking = [candidate for candidate in level if candidate.evidence is None]
-        return min([*complete, *self._add_evidence(lacking)], key=_least_evident)
+        unknown = [candidate for candidate in level if candidate.evidence is None]
+
+        def rank(candidate: SimulatedRule) -> tuple[float, ...]:
+            evidence, users = candidate.evidence, candidate.effective_users
+            assert evidence is not None
+            support = users if users >= _FEWEST else evidence.likelihood
+            return (-support, -round(evidence.hits, 2), *_simplicity(candidate))
+
+        return min([*complete, *self._add_evidence(unknown)], key=rank)
 
     def halves_agree(
         self, chosen: SimulatedRule, candidates: Sequence[SimulatedRule]
@@ -251,16 +364,16 @@ class RuleSearch:
         allowed = {item.rule for item in candidates if self.is_allowed(item)} | {chosen.rule}
         returns = [self._sessions[rule].returns[:n] for rule in allowed]
         returns = [values for values in returns if len(values) == n]
-        agree = []
-        for rows in (half == 0, half == 1):
+
+        def agrees(rows: Any) -> bool:
             top = max((values[rows] for values in returns), key=_mean)
             if len(top) < _FEWEST:
-                agree.append(True)
-                continue
+                return True
             mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
             margin = max(error, self._config.tolerance * abs(mean))
-            agree.append(bool(own_returns[rows].mean() >= mean - margin))
-        return agree[0], agree[1]
+            return bool(own_returns[rows].mean() >= mean - margin)
+
+        return agrees(half == 0), agrees(half == 1)
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
         """The return of a session under a rule, in sessions that did not choose it.
@@ -272,17 +385,24 @@ class RuleSearch:
         returns = np.concatenate([half.returns for half in halves])
         if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
             halves = [
-                half.followed_by(self._roll_half(rule, number, part=1))
+                half.append(self._roll_half(rule, number, part=1))
                 for number, half in enumerate(halves)
             ]
         values = _mean(halves[0].returns), _mean(halves[1].returns)
         value = sum(values) / 2
-        within = math.hypot(*(_standard_error(half.returns) for half in halves)) / 2
-        error = max(within, abs(values[0] - values[1]) / 2)
-        report = self.users.calibration_report
+        first, second = (_standard_error(half.returns) for half in halves)
+        error = max(math.hypot(first, second) / 2, abs(values[0] - values[1]) / 2)
+        report, training, doubts = self.users.calibration_report, self.users.training_users, []
         optimism = None if report is None else (report.optimism, report.optimism_error)
-        has_propensities = schema.PROPENSITY in self.problem.train.record.columns
-        doubts = list(list_doubts(value, error, self.users, has_propensities))
+        if error > _FAR_OFF * abs(value):
+            doubts.append(f"its error, {error:.2g}, is more than {_FAR_OFF:.0%} of it")
+        if report is not None and abs(report.optimism) > max(_FAR_OFF, report.optimism_error):
+            doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
+        weighted = training is not None and training.report.weighted
+        if not (weighted if report is None else report.weighted):
+            some = schema.PROPENSITY in self.problem.train.record.columns
+            lack = "some rows of the log have" if some else "the log has"
+            doubts.append(f"{lack} no propensities: its policy may have known more of the users")
         length = max(float(half.lengths.mean()) for half in halves)
         if length > (longest := self.problem.train.lengths.max()):
             doubts.append(f"its sessions have {length:.0f} steps, the longest in the log {longest}")
@@ -298,7 +418,7 @@ class RuleSearch:
         if report is not None:
             users = replace(users, calibration=report.halves[number])
         seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
-        return self._roll([rule], store, n, seed, users)[rule]
+        return self._roll_out([rule], store, n, seed, users)[rule]
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
@@ -317,8 +437,9 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     if problem.start is None:
         candidates = _search_all(search)
     else:
-        more = NEAR_THE_LOG if search.least_users else ()
-        candidates = search.simulate([*dict.fromkeys(near(problem.start, problem, more))])
+        more = _NEAR_THE_LOG if search.least_users else ()
+        rules = find_neighbours(problem.start, problem, more)
+        candidates = search.simulate([*dict.fromkeys(rules)])
     finalists = candidates
     if search.users.reward_report.new_users:
         finalists = search.finalists(candidates, search.best(candidates))
@@ -329,12 +450,12 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
-        chosen_by=describe_choice(search.users) + where,
+        chosen_by=_describe_choice(search.users) + where,
         candidates=[best if item.rule == best.rule else item for item in candidates],
         warning=_warning(search, best, estimate),
         estimate=estimate,
         details={
-            **search.users.report(),
+            **search.users.report,
             "least_items": search.least_items,
             "least_users": search.least_users,
             "halves_agree": list(agree),
@@ -342,25 +463,58 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
     )
 
 
+def _describe_choice(users: UserModel) -> str:
+    if users.training_users is None:
+        return (
+            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
+            "propensities are used"
+        )
+    report, calibration = users.training_users.report, users.calibration_report
+    whose = "new users" if users.reward_report.new_users else "validation users"
+    weights = "weighted by their propensities" if report.weighted else "without weights"
+    if calibration is not None and calibration.weighted:
+        weights += ", and calibrated by propensities"
+    return (
+        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
+        f"are fitted to {report.steps:,} training rows {weights}"
+    )
+
+
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """All candidates of the configuration that the best of the earlier ones leads to."""
     problem, config = search.problem, search.problem.config
-    candidates = search.simulate([*unweighted(problem)])
+    candidates = search.simulate([*_list_unweighted(problem)])
     first = search.best(candidates).rule
-    candidates += search.simulate([*variants(first, reward_weight=config.reward_weights)])
+    candidates += search.simulate([*_vary(first, reward_weight=config.reward_weights)])
     second = search.best(candidates).rule
     if search.users.session_end_report.kept != "constant":
         # More than randomness ends sessions.
         grid = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
-        candidates += search.simulate([*variants(second, lookahead=lookaheads(problem), **grid)])
+        candidates += search.simulate([*_vary(second, lookahead=_lookaheads(problem), **grid)])
     if problem.validation.item_states.tags.shape[1]:
-        candidates += _search_tag_windows(search, second)
+        longest, temperatures = problem.scorer.known, config.temperatures
+        windows = [window for window in config.tag_windows if 0 < window <= longest]
+        # At all temperatures: at a low one, the log may support what the policy shows only once
+        # some items are excluded.
+        rules = search.simulate([*_vary(second, temperature=temperatures, tag_window=windows)])
+        candidates += rules
+        if rules:
+            best = search.best(rules).rule
+            weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
+            more = _vary(best, tag_window=sorted({*windows}), reward_weight=weights)
+            candidates += search.simulate([*more])
         # Without a tag window, which may only have served to cause no fatigue.
-        candidates += _search_tag_runs(search, second)
+        runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
+        rules = search.simulate([*_vary(second, tag_run=runs)])
+        candidates += rules
+        if rules:
+            best, weights = search.best(rules).rule, [*config.reward_weights]
+            more = _vary(best, temperature=temperatures, reward_weight=weights)
+            candidates += search.simulate([*more])
     if search.least_users:
         done = {candidate.rule for candidate in candidates}
-        rules = (rule for grid in NEAR_THE_LOG for rule in variants(first, **grid))
-        candidates += search.simulate([rule for rule in rules if rule not in done])
+        near = [rule for grid in _NEAR_THE_LOG for rule in _vary(first, **grid)]
+        candidates += search.simulate([rule for rule in near if rule not in done])
     return candidates
 
 
@@ -384,35 +538,77 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
     return "".join(f"; WARNING: {warning}" for warning in warnings)
 
 
-def _search_tag_windows(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
-    """The rule with a tag window of items that are `known`, then with other reward weights.
+def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
+    """Rules of the policy alone, the highest temperature first."""
+    config, targets, policy = problem.config, problem.targets, problem.scorer.policy
+    for temperature in sorted(config.temperatures, reverse=True):
+        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
+            yield DecisionRule(target, temperature=temperature)
+            yield DecisionRule(target, minimum_target=target, temperature=temperature)
+        if policy.values is not None and policy.config.max_return:
+            yield DecisionRule(None, temperature=temperature)
 
-    At all temperatures: at a low one, the log may support what the policy shows only once some
-    items are excluded.
+
+def _vary(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
+    """The rule with every combination of other values of its fields."""
+    for combination in product(*values.values()):
+        variant = replace(rule, **dict(zip(values, combination, strict=True)))
+        if variant != rule:
+            yield variant
+
+
+def _lookaheads(problem: Problem) -> list[float]:
+    """Values of going on, in reward units; those that are not positive are left out."""
+    mean = float(problem.train.returns.sum(dtype="float64")) / problem.train.n_steps
+    return [value for factor in problem.config.lookaheads if (value := factor * mean) > 0]
+
+
+def find_neighbours(
+    rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
+) -> Iterator[DecisionRule]:
+    """The rule, rules with another target, and those with another of its numbers one candidate up
+    or down.
+
+    A rule without lookahead also gets one, with the middle weight of the policy, and loses it with
+    the middle reward weight.
+
+    Args:
+        more: further candidates of `temperature` and `reward_weight`.
     """
-    config, longest = search.problem.config, search.problem.scorer.known
-    windows = [window for window in config.tag_windows if 0 < window <= longest]
-    rules = variants(rule, temperature=config.temperatures, tag_window=windows)
-    candidates = search.simulate([*rules])
-    if not candidates:
-        return []
-    best = search.best(candidates).rule
-    weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
-    more = variants(best, tag_window=sorted({*windows}), reward_weight=weights)
-    return [*candidates, *search.simulate([*more])]
+    config, policy = problem.config, problem.scorer.policy
+    yield rule
+    for target in dict.fromkeys(problem.targets.values()):
+        yield replace(rule, target=target, minimum_target=None)
+        yield replace(rule, target=target, minimum_target=target)
+    if policy.values is not None and policy.config.max_return:
+        yield replace(rule, target=None, minimum_target=None)
+    grid: dict[str, Sequence[float]] = {
+        name: [*getattr(config, f"{name}s"), *(value for part in more for value in part[name])]
+        for name in ("temperature", "reward_weight")
+    }
+    if rule.looks_ahead:
+        grid |= {"lookahead": _lookaheads(problem), "policy_weight": config.policy_weights}
+        grid["reward_weight"] = config.lookahead_weights
+        weight = _middle(config.reward_weights)
+        yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
+    elif problem.users.session_end_report.kept != "constant":
+        middle = _middle(config.policy_weights)
+        for ahead, weight in product(_lookaheads(problem), config.lookahead_weights):
+            yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
+    if problem.validation.item_states.tags.shape[1]:
+        longest = problem.scorer.known
+        grid["tag_window"] = [0, *(steps for steps in config.tag_windows if steps <= longest)]
+        grid["tag_run"] = [0, *config.tag_runs] if problem.users.fatigue else [0]
+    for name, values in grid.items():
+        value = getattr(rule, name)
+        smaller = [candidate for candidate in values if candidate < value]
+        larger = [candidate for candidate in values if candidate > value]
+        nearest: list[Any] = [*sorted(smaller)[-1:], *sorted(larger)[:1]]
+        yield from (replace(rule, **{name: neighbour}) for neighbour in nearest)
 
 
-def _search_tag_runs(search: RuleSearch, rule: DecisionRule) -> list[SimulatedRule]:
-    """The rule with a tag run, if users have fatigue, then at other temperatures and reward
-    weights."""
-    config = search.problem.config
-    runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
-    candidates = search.simulate([*variants(rule, tag_run=runs)])
-    if not candidates:
-        return []
-    best = search.best(candidates).rule
-    weights = {"temperature": config.temperatures, "reward_weight": config.reward_weights}
-    return [*candidates, *search.simulate([*variants(best, **weights)])]
+def _middle(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
@@ -423,10 +619,6 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     )
 
 
-def _value(candidate: SimulatedRule) -> float:
-    return candidate.value
-
-
 def _mean(values: Float64Array) -> float:
     return float(values.mean()) if len(values) else 0.0
 
@@ -434,15 +626,3 @@ def _mean(values: Float64Array) -> float:
 def _standard_error(values: Float64Array) -> float:
     """Of the mean."""
     return float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
-
-
-def _least_evident(candidate: SimulatedRule) -> tuple[float, ...]:
-    """Orders rules by evidence, the most first; equal ones by `_simplicity`.
-
-    A handful of effective users is not evidence, and neither is a difference in hits below one
-    percentage point: few logged steps are compared.
-    """
-    evidence, users = candidate.evidence, candidate.effective_users
-    assert evidence is not None
-    support = users if users >= _FEWEST else evidence.likelihood
-    return (-support, -round(evidence.hits, 2), *_simplicity(candidate))

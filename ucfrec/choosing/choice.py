@@ -1,20 +1,17 @@
-"""The choice of a decision rule: its settings, what is chosen by, and what was chosen, and why."""
+"""The choice of a decision rule: its settings, what it is chosen by, and what was chosen."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.choosing.logged import Evidence
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.settings import Count, Share, Weight, settings_table
 from ucfrec.user_model.model import UserModel
 
-FAR_OFF: Final = 0.1
-"""Share of the estimated value by which it may be off and still be trusted."""
 _Temperature = Annotated[float, Field(ge=0, le=100)]
 _RewardWeight = Annotated[float, Field(ge=0, le=1000)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
@@ -79,19 +76,42 @@ class Problem:
     scorer: Scorer
     """The policy under its default rule, with the reward model of `users`."""
     users: UserModel
-    """The user model."""
     targets: Mapping[float, float]
     """Return (reward units) of each quantile in `config.quantiles`."""
     train: EpisodeStore
-    """Training episodes."""
     validation: EpisodeStore
-    """Validation episodes."""
     config: RuleConfig
-    """Candidates and conditions."""
     seed: int
-    """Of everything random."""
     start: DecisionRule | None = None
     """A rule near which to look for a better one; None to try all candidates."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What validation sessions show of a rule without any model of the users."""
+
+    hits: float
+    """Share of liked steps whose item is among the ten best."""
+    likelihood: float
+    """Geometric mean of the probabilities with which the rule shows what was logged."""
+    effective_users: float | None = None
+    """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
+    weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
+    the number. None without propensities."""
+    spread: float = 0.0
+    """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
+    than the weights how heavy their tail is: few sessions may lack the heavy ones."""
+    value: float | None = None
+    """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
+    error: float | None = None
+    """Its standard error over users."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95% interval of `value`."""
+        if self.value is None or self.error is None:
+            return None
+        return self.value - 1.96 * self.error, self.value + 1.96 * self.error
 
 
 @dataclass(frozen=True)
@@ -134,44 +154,6 @@ class ValueEstimate:
     """Why it cannot be trusted; empty if it can."""
 
 
-def list_doubts(
-    value: float, error: float, users: UserModel, has_propensities: bool
-) -> tuple[str, ...]:
-    """Why the estimated value may be off by more than a tenth.
-
-    Args:
-        has_propensities: whether the log has propensities, at least of some rows.
-    """
-    doubts, report, training = [], users.calibration_report, users.training_users
-    if error > FAR_OFF * abs(value):
-        doubts.append(f"its error, {error:.2g}, is more than {FAR_OFF:.0%} of it")
-    if report is not None and abs(report.optimism) > max(FAR_OFF, report.optimism_error):
-        doubts.append(f"the user model is off by {report.optimism:+.0%} on held-out rows")
-    weighted = training is not None and training.report.weighted
-    if not (weighted if report is None else report.weighted):
-        lack = "some rows of the log have" if has_propensities else "the log has"
-        doubts.append(f"{lack} no propensities: its policy may have known more of the users")
-    return tuple(doubts)
-
-
-def describe_choice(users: UserModel) -> str:
-    """What chooses a rule in simulated sessions, in words."""
-    if users.training_users is None:
-        return (
-            "mean return of sessions in the run's reward model, calibrated on validation rows; no "
-            "propensities are used"
-        )
-    report, calibration = users.training_users.report, users.calibration_report
-    whose = "new users" if users.reward_report.new_users else "validation users"
-    weights = "weighted by their propensities" if report.weighted else "without weights"
-    if calibration is not None and calibration.weighted:
-        weights += ", and calibrated by propensities"
-    return (
-        f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
-        f"are fitted to {report.steps:,} training rows {weights}"
-    )
-
-
 @dataclass(frozen=True)
 class RankedRule:
     """A rule and how it ranks validation rows."""
@@ -193,12 +175,11 @@ class RuleChoice:
 
     rule: DecisionRule
     chosen_by: str
-    """What chose it, in words."""
     candidates: Sequence[SimulatedRule | RankedRule]
     estimate: ValueEstimate | None = None
     """Its value; None for a rule that was not simulated."""
     warning: str = ""
-    """What is wrong with the rule, in words; empty if nothing is."""
+    """What is wrong with the rule; empty if nothing is."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """What else the choice rests on, as a JSON object."""
 
@@ -210,4 +191,4 @@ class RuleChoice:
 
     def list_candidates(self) -> list[dict[str, Any]]:
         """The candidates as JSON objects."""
-        return [{**asdict(each), "rule": each.rule.as_dict()} for each in self.candidates]
+        return [{**asdict(entry), "rule": entry.rule.as_dict()} for entry in self.candidates]

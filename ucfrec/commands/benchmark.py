@@ -1,81 +1,143 @@
-"""`ucfrec benchmark`: measure every method of a benchmark suite and print its tables."""
+"""`ucfrec benchmark`: measure every method of a benchmark suite and print its tables; and the
+options of all commands that measure the cells of a benchmark."""
 
-import argparse
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.benchmark.grid import chosen
-from ucfrec.commands.grid_options import (
-    budget_options,
-    grid_options,
-    results_given,
-    rows_explained,
-    rows_given,
-)
-from ucfrec.commands.options import env_options, environment_given, option
+from ucfrec.commands.options import ARGUMENT, SEED, Group, Table
+from ucfrec.commands.shared_options import EnvironmentOptions
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
-from ucfrec.results.rows_file import benchmarking
+from ucfrec.results.rows import ResultRow, benchmarking, latest, read_rows
 
 if TYPE_CHECKING:
-    from ucfrec.benchmark.suite import Benchmark
+    from ucfrec.benchmark.cells import Cell, Measurement
+    from ucfrec.benchmark.suite import Benchmark as Suite
+
+_LOGS = Group("logs and seeds")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec benchmark`."""
-    option(
-        parser,
-        "suite",
-        str,
-        "recommendation, or a suite of another installed package (entry point ucfrec.benchmarks)",
-        "SUITE",
-    )
-    text = "measure and print only this table; repeatable (default: all tables)"
-    option(parser, "--table", str, text, action="append", default=[])
-    budget_options(parser)
-    logs = parser.add_argument_group("logs")
-    option(
-        logs,
-        "--logs",
-        int,
-        "logs of each task; simulated with N seeds, or N parts of a given log, 1 for all "
-        "of it (default: set by --budget)",
-        "N",
-    )
-    option(logs, "--log-seed", 0, "seed of the first simulated log; the others follow it")
-    env_options(
-        parser,
-        required=False,
-        use="; its main table is measured instead of the suite's tasks, on logs of its mixture or, "
-        "where it has none, of random actions (default: the suite's tasks)",
-    )
-    grid_options(parser, "runs/benchmark", os.cpu_count() or 1)
+class GridOptions(Table):
+    """Where result rows are, and how they are measured."""
+
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
+
+    out: Path = Path("runs/benchmark")
+    results: Annotated[Path | None, "JSONL"] = None
+    """File of result rows; measured cells are read from it, new ones appended to it (default:
+    results.jsonl in --out)"""
+    workers: int = os.cpu_count() or 1
+    again: bool = False
+    show_only: bool = False
+    """Print the tables from the rows in --results without measuring anything."""
+
+    @property
+    def rows_file(self) -> Path:
+        """The file of result rows."""
+        return self.results or self.out / "results.jsonl"
+
+    def explain_rows(self) -> AbstractContextManager[None]:
+        """For the block that prints rows: with --show-only, an `InputError` says what they lack.
+        Rows that were just measured lack nothing: there an error is ours, and keeps its trace."""
+        if not self.show_only:
+            return nullcontext()
+        remedy = "measure its rows again, or name another file with --results"
+        return damage_explained(self.rows_file, remedy)
+
+    def read_rows(self, suite: str, tables: Sequence[str] = ()) -> list[ResultRow]:
+        """The last rows of each measurement in the file.
+
+        Args:
+            tables: tables of the suite; empty for all.
+        """
+        rows = [row for row in latest(read_rows(self.rows_file)) if row.suite == suite]
+        if rows := [row for row in rows if not tables or row.table in tables]:
+            return rows
+        raise InputError(
+            f"{self.rows_file} has no rows of {', '.join([suite, *tables])}; name a file that has "
+            "them with --results"
+        )
+
+    def make_rows(
+        self,
+        suite: str,
+        tables: Sequence[str],
+        list_cells: "Callable[[], Iterable[Cell]]",
+        how: "Measurement",
+        describe: str = "",
+    ) -> list[ResultRow]:
+        """The rows that a command shows: with --show-only those of the file, else those of cells,
+        which are measured where they have none.
+
+        Args:
+            tables: tables of the suite; empty for all.
+            list_cells: lists what to measure; writes the stores that it needs.
+            describe: name of the benchmark in progress output; "" for `suite`.
+
+        Raises:
+            InputError: as `read_rows`, as `list_cells`, or as `run_grid`.
+        """
+        if self.show_only:
+            return self.read_rows(suite, tables)
+        from ucfrec.benchmark.grid import run_grid
+
+        file, describe = self.rows_file, describe or suite
+        with benchmarking(file):
+            return run_grid(list_cells(), how, file, self.workers, describe, self.again)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec benchmark`: measure what is missing, then print the tables."""
-    from ucfrec.benchmark.suite import BenchmarkRequest, measure, show
+class Benchmark(EnvironmentOptions, GridOptions):
+    """`ucfrec benchmark`."""
 
-    suite: Benchmark = load_plugin("benchmarks", options.suite)
-    tables, results = chosen(suite.tables, options.table, "table"), results_given(options)
-    if options.show_only:
-        with rows_explained(options):
-            print(show(suite, tables, rows_given(options, options.suite, tables)))
-        return
-    request = BenchmarkRequest(
-        budget=options.budget,
-        tables=tables,
-        out=options.out,
-        results=results,
-        workers=options.workers,
-        log_seed=options.log_seed,
-        logs=options.logs,
-        evaluation_seed=options.evaluation_seed,
-        environment=environment_given(options) if options.env else None,
-        tasks=options.tasks,
-        methods=options.methods,
-        training_seeds=options.training_seeds,
-        again=options.again,
-    )
-    with benchmarking(results):
-        print(measure(suite, request))
-    print(f"\nrows: {results}")
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
+
+    suite: Annotated[str, ARGUMENT, "SUITE"]
+    """recommendation, or a suite of another installed package (entry point ucfrec.benchmarks)"""
+    table: Sequence[str] = ()
+    """Measure and print only this table; repeatable (default: all tables)"""
+    budget: Literal["small", "full"] = "small"
+    """small (for two CPU cores), full (larger logs, more seeds and training steps)"""
+    task: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this task; repeatable (default: all of the budget)"""
+    method: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this method; repeatable (default: all of the budget)"""
+    env: str | None = None
+    """Simulator or gymnasium:ID; its main table is measured instead of the suite's tasks, on logs
+    of its mixture or, where it has none, of random actions (default: the suite's tasks)"""
+    logs: Annotated[int | None, _LOGS, "N"] = None
+    log_seed: Annotated[int, _LOGS] = 0
+    training_seeds: Annotated[int | None, _LOGS, "N"] = None
+    evaluation_seed: Annotated[int | None, _LOGS, SEED, "SEED"] = None
+
+    def execute(self) -> None:
+        """Measure what is missing, then print the tables."""
+        from ucfrec.benchmark.grid import select_names
+        from ucfrec.benchmark.suite import BenchmarkRequest, measure, show
+
+        suite: Suite = load_plugin("benchmarks", self.suite)
+        tables = select_names(suite.tables, self.table, "table")
+        if self.show_only:
+            with self.explain_rows():
+                print(show(suite, tables, self.read_rows(self.suite, tables)))
+            return
+        request = BenchmarkRequest(
+            tables=tables,
+            results=self.rows_file,
+            environment=self.make_environment(self.env) if self.env else None,
+            tasks=self.task,
+            methods=self.method,
+            **{name: getattr(self, name) for name in _SAME},
+        )
+        with benchmarking(self.rows_file):
+            print(measure(suite, request))
+        print(f"\nrows: {self.rows_file}")
+
+
+_SAME = (
+    *("budget", "out", "workers", "log_seed", "logs", "evaluation_seed", "training_seeds"),
+    "again",
+)
+"""Options that are fields of `BenchmarkRequest`."""

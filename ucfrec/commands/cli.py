@@ -1,6 +1,6 @@
 """The command-line parser, which imports only the module of the called command.
 
-Command modules import heavy dependencies inside `run`, so that `--help` answers at once and no
+These modules import heavy dependencies inside `run`, so that `--help` answers at once and no
 command loads what only another one needs.
 """
 
@@ -15,10 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module, metadata
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final
 
 from ucfrec import __version__
-from ucfrec.commands.options import FieldHelp
+from ucfrec.commands.options import Table, add_options
 from ucfrec.errors import InputError, InputNote, explain_os_error, one_line
 from ucfrec.files.remote import local_paths
 from ucfrec.processes import Interrupted, interruptions_raised
@@ -31,11 +31,19 @@ class Program:
     name: str
     summary: str
     package: str
-    """Package with one module per command, each with `add_options(parser)` and `run(options)`."""
+    """Package with the modules of the commands, each a `Table` called as the command."""
     commands: Mapping[str, str]
     """Command name to its one-line summary in `--help`."""
     sections: Mapping[str, str] = field(default_factory=dict)
     """First command of each section of `--help` to the title of the section."""
+    modules: Mapping[str, str] = field(default_factory=dict)
+    """Command name to its module, if that has another name."""
+
+    def find_table(self, command: str) -> type[Table]:
+        """The table of a command."""
+        module = import_module(f"{self.package}.{self.modules.get(command, command)}")
+        table: type[Table] = getattr(module, command.capitalize())
+        return table
 
 
 UCFREC = Program(
@@ -68,6 +76,13 @@ UCFREC = Program(
         "benchmark": "measure every method and print tables; resumes",
     },
     {"prepare": "from logs to recommendations", "join": "every day", "demo": "advanced"},
+    {
+        **dict.fromkeys(("report", "promote", "verify"), "runs"),
+        **dict.fromkeys(("join", "compare"), "update"),
+        **dict.fromkeys(("tune", "screen"), "train"),
+        **dict.fromkeys(("evaluate", "collect"), "simulate"),
+        **{"score": "ope", "explore": "serve", "export": "recommend", "datasets": "prepare"},
+    },
 )
 
 
@@ -93,8 +108,9 @@ def run(program: Program, arguments: Sequence[str] | None) -> int:
         with interruptions_raised(), notes_on_one_line(program.name):
             options = build_parser(program, arguments).parse_args(arguments)
             name = f"{program.name} {options.command}"
+            table = program.find_table(options.command)
             with local_paths(options) as options:
-                _module(program, options.command).run(options)
+                table.read(options).execute()
             sys.stdout.flush()
     except Interrupted as interruption:
         if sys.stderr.isatty():
@@ -125,13 +141,13 @@ def explanation(error: BaseException) -> str | None:
     if isinstance(error, ModuleNotFoundError) and (extra := _extra_with(error.name or "")):
         return f"{error.name} is not installed; install ucfrec[{extra}]"
     text = str(error)
-    if isinstance(error, MemoryError) or any(phrase in text for phrase in _NO_MEMORY):
+    if isinstance(error, MemoryError) or re.search(_NO_MEMORY, text):
         reason = f" ({text:.120})" if text else ""
         return (
             f"memory is exhausted{reason}; close other programs, raise the limit (ulimit -v), or "
             "use smaller settings"
         )
-    if any(phrase in text for phrase in _NO_SPACE):
+    if re.search(_NO_SPACE, text):
         return f"no space is left on a disk ({text:.120}); free space and run again"
     return None
 
@@ -140,22 +156,21 @@ def _extra_with(module: str) -> str | None:
     """The smallest extra of ucfrec that brings a module which has the name of its distribution."""
     name = re.escape(module.partition(".")[0].replace("_", "-"))
     extras: dict[str, list[str]] = {}
-    for each in metadata.requires("ucfrec") or ():
-        if found := re.search(r"; extra == .(?!dev|docs)(\w+).", each):
-            extras.setdefault(found[1], []).append(each)
-    offered = re.compile(rf"{name}\b[^-]", re.IGNORECASE)
-    having = [extra for extra, own in extras.items() if any(map(offered.match, own))]
-    return min(having, key=lambda extra: len(extras[extra]), default=None)
+    for requirement in metadata.requires("ucfrec") or ():
+        if match := re.search(r"; extra == .(?!dev|docs)(\w+).", requirement):
+            extras.setdefault(match[1], []).append(requirement)
+    brings = re.compile(rf"{name}\b[^-]", re.IGNORECASE)
+    suitable = [extra for extra, packages in extras.items() if any(map(brings.match, packages))]
+    return min(suitable, key=lambda extra: len(extras[extra]), default=None)
 
 
 _NO_MEMORY: Final = (
-    *("DefaultCPUAllocator", "std::bad_alloc", "out of memory", "Out of Memory"),
-    *("cannot allocate memory", "Cannot allocate memory", "can't start new thread"),
-    *("failed to map segment", "could not allocate", "malloc of size"),
-    "could not create a primitive",
+    "DefaultCPUAllocator|std::bad_alloc|out of memory|Out of Memory|[cC]annot allocate memory|"
+    "can't start new thread|failed to map segment|could not allocate|malloc of size|"
+    "could not create a primitive"
 )
 """How libraries that raise other errors than `MemoryError` say that there is no memory."""
-_NO_SPACE: Final = ("No space left on device", "Disk quota exceeded", "File too large")
+_NO_SPACE: Final = "No space left on device|Disk quota exceeded|File too large"
 """How libraries that raise other errors than `OSError` say that a disk is full."""
 
 
@@ -164,13 +179,13 @@ def notes_on_one_line(name: str) -> Iterator[None]:
     """Print each `InputNote` as one line on stderr; other warnings as always."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", InputNote)
-        shown = warnings.showwarning
+        show_other = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        def show(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
             if issubclass(category, InputNote):
                 print(one_line(f"{name}: note: {message}"), file=sys.stderr)
             else:
-                shown(message, category, *where, **more)
+                show_other(message, category, *where, **how)
 
         warnings.showwarning = show
         yield
@@ -181,9 +196,13 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
 
     Options of the other commands would need their modules, whose imports take seconds.
     """
+    lines = [program.summary]
+    for name, summary in program.commands.items():
+        lines += [f"\n{program.sections[name]}:"] if name in program.sections else []
+        lines.append(f"  {name:<12}{summary}")
     parser = argparse.ArgumentParser(
         prog=program.name,
-        description=f"{program.summary}\n{_list_commands(program)}",
+        description="\n".join(lines),
         epilog=f"{program.name} COMMAND --help describes a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="%(prog)s [options] COMMAND …",
@@ -197,18 +216,8 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
     for name, summary in program.commands.items():
         command = commands.add_parser(name, description=summary, prog=f"{program.name} {name}")
         if name == called:
-            _module(program, name).add_options(command)
-            command.usage = command.usage or command.describe_usage()
+            add_options(command, program.find_table(name))
     return parser
-
-
-def _list_commands(program: Program) -> str:
-    lines = []
-    for name, summary in program.commands.items():
-        if title := program.sections.get(name):
-            lines.append(f"\n{title}:")
-        lines.append(f"  {name:<12}{summary}")
-    return "\n".join(lines)
 
 
 class _ShowAll(argparse.Action):
@@ -220,13 +229,10 @@ class _ShowAll(argparse.Action):
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Reads the help of an option from the docstring of a field where it is shown."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return action.help.read() if isinstance(action.help, FieldHelp) else action.help
+    """Does not break options at hyphens."""
 
     def _split_lines(self, text: str, width: int) -> list[str]:
-        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+        return textwrap.wrap(text, width, break_on_hyphens=False)
 
 
 class _CommandParser(argparse.ArgumentParser):
@@ -254,18 +260,6 @@ class _CommandParser(argparse.ArgumentParser):
         finally:
             self._intermixed = False
 
-    def describe_usage(self) -> str:
-        """The positional arguments and the options that are required."""
-        words = []
-        for action in self._actions:
-            name = str(action.metavar or action.dest.upper())
-            if not action.option_strings:
-                name += "..." if action.nargs in ("+", "*") else ""
-                words.append(f"[{name}]" if action.nargs in ("?", "*") else name)
-            elif action.required:
-                words.append(f"{action.option_strings[0]} {name}")
-        return " ".join(["%(prog)s", *words, "[options]"])
-
     def format_help(self, everything: bool = False) -> str:
         """The help; without `everything`, options of titled groups by name only, and of the others
         what comes before a semicolon."""
@@ -278,7 +272,13 @@ class _CommandParser(argparse.ArgumentParser):
             if everything or group in (self._positionals, self._optionals):
                 formatter.start_section(group.title)
                 formatter.add_text(group.description if everything else None)
-                formatter.add_arguments(actions if everything else _shorten(actions))
+                for action in actions:
+                    if everything:
+                        formatter.add_argument(action)
+                    elif "--help" not in action.option_strings:
+                        short = copy.copy(action)
+                        short.help = (action.help or "").partition(";")[0]
+                        formatter.add_argument(short)
                 formatter.end_section()
             elif actions:
                 names = ", ".join(action.option_strings[0] for action in actions)
@@ -289,27 +289,6 @@ class _CommandParser(argparse.ArgumentParser):
             formatter.end_section()
         formatter.add_text(self.epilog)
         return formatter.format_help()
-
-
-def _shorten(actions: list[argparse.Action]) -> Iterator[argparse.Action]:
-    """The actions, those for help apart, with the part of their help before a semicolon."""
-    for action in actions:
-        if "--help" not in action.option_strings:
-            short = copy.copy(action)
-            short.help = (action.help or "").partition(";")[0]
-            yield short
-
-
-class _Command(Protocol):
-    """Interface of a command module."""
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None: ...
-
-    def run(self, options: argparse.Namespace) -> None: ...
-
-
-def _module(program: Program, command: str) -> _Command:
-    return cast(_Command, import_module(f"{program.package}.{command.replace('-', '_')}"))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """`ucfrec demo`: every step from `collect` to `report`, on the logs of two simulated
 environments."""
 
-import argparse
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
@@ -9,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ucfrec.commands.options import option
+from ucfrec.commands.options import Table
 from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress, progress
 
 if TYPE_CHECKING:
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
 
 ENVIRONMENTS = ("synthetic-taobao", "synthetic-catalog")
 SHARED = "dt+shared"
@@ -70,41 +69,40 @@ FULL = DemoConfig(
 """Sizes at which the methods differ as in the documentation: a quarter of an hour on two cores."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec demo`."""
-    option(
-        parser,
-        "--out",
-        Path,
-        "folder for logs, stores, runs and the report; resumed (default: demo-out, or "
-        "demo-out-full with --full)",
-    )
-    option(parser, "--seed", 0, "seed of the logs and trainings")
-    text = "four times the sessions, five times the training steps and all methods"
-    option(parser, "--full", False, f"{text} (default: two minutes of one core)")
+class Demo(Table):
+    """`ucfrec demo`."""
 
+    out: Path | None = None
+    """Folder for logs, stores, runs and the report; resumed (default: demo-out, or demo-out-full
+    with --full)"""
+    seed: int = 0
+    """Seed of the logs and trainings."""
+    full: bool = False
+    """Four times the sessions, five times the training steps and all methods (default: two minutes
+    of one core)"""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec demo`; print its result table and what it shows."""
-    config = FULL if options.full else DemoConfig()
-    out = options.out or Path("demo-out-full" if options.full else "demo-out")
-    _say(
-        f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
-        f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
-        f"simulators. Everything goes to {out}."
-    )
-    from ucfrec.files.locks import lock_path, remove_leftovers
-    from ucfrec.reporting.tables import evaluation_table
+    def execute(self) -> None:
+        """Print the result table and what it shows."""
+        from ucfrec.files.locks import lock_path, remove_leftovers
+        from ucfrec.reporting.tables import evaluation_table
 
-    with lock_path(out, "filled"):
-        remove_leftovers(out.parent)
-        rows = demo(out, options.seed, config)
-    _say(f"\n{evaluation_table(rows)}\n")
-    _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
-    for environment in ENVIRONMENTS:
-        _say(conclusion(environment, {r.method: r for r in rows if r.environment == environment}))
-    _say(f"Report with all curves and tables: {out / 'report.html'}")
-    _say("Next: ucfrec prepare --help, for a log of your own; docs/quickstart.md has every step.")
+        config = FULL if self.full else DemoConfig()
+        out = self.out or Path("demo-out-full" if self.full else "demo-out")
+        _say(
+            f"Demo: collect {config.sessions:,} sessions in each of two simulators, train "
+            f"{len(config.methods)} policies\non these logs alone, then evaluate them in the "
+            f"simulators. Everything goes to {out}."
+        )
+        with lock_path(out, "filled"):
+            remove_leftovers(out.parent)
+            rows = demo(out, self.seed, config)
+        _say(f"\n{evaluation_table(rows)}\n")
+        _say("What this shows (return: sum of the rewards of a session; [95% interval]):")
+        for environment in ENVIRONMENTS:
+            by_method = {row.method: row for row in rows if row.environment == environment}
+            _say(conclusion(environment, by_method))
+        _say(f"Report with all curves and tables: {out / 'report.html'}")
+        _say("Next: ucfrec prepare --help, for your own log; docs/quickstart.md has every step.")
 
 
 def _say(text: str) -> None:
@@ -114,41 +112,39 @@ def _say(text: str) -> None:
 
 def conclusion(environment: str, rows: "Mapping[str, ResultRow]") -> str:
     """What the rows of an environment, by method, show, in words."""
+    values = {method: _describe_value(row) for method, row in rows.items()}
     lines = [
-        f"- {environment}: logged sessions have {_value(rows['logging'])}, random actions "
-        f"{_value(rows['random'])}, the best",
-        f"  possible ones {_value(rows['optimal'])}. From the log alone, UCF reaches "
-        f"{_value(rows['ucf'])}.",
+        f"- {environment}: logged sessions have {values['logging']}, random actions "
+        f"{values['random']}, the best\n  possible ones {values['optimal']}. From the log alone, "
+        f"UCF reaches {values['ucf']}."
     ]
     if SHARED in rows:
-        lines += [
-            "  Every method can use the shared components (exposure features, reward weight,",
-            f"  selected decision rule). With them, DT has {_value(rows[SHARED])}: "
-            f"{_compared(rows[SHARED], rows['dt'], 'DT without them')},",
-            f"  {_value(rows['dt'])}. UCF, which has them too, is "
-            f"{_compared(rows['ucf'], rows[SHARED], 'DT with them')}.",
-        ]
+        lines.append(
+            "  Every method can use the shared components (exposure features, reward weight,\n"
+            f"  selected decision rule). With them, DT has {values[SHARED]}: "
+            f"{_compare(rows[SHARED], rows['dt'], 'DT without them')},\n"
+            f"  {values['dt']}. UCF, which has them too, is "
+            f"{_compare(rows['ucf'], rows[SHARED], 'DT with them')}."
+        )
     else:
         lines.append(
             f"  Actions are vectors, so there are no shared components: UCF is "
-            f"{_compared(rows['ucf'], rows['dt'], 'DT')}, {_value(rows['dt'])}."
+            f"{_compare(rows['ucf'], rows['dt'], 'DT')}, {values['dt']}."
         )
     return "\n".join(lines)
 
 
-def _value(row: "ResultRow") -> str:
+def _describe_value(row: "ResultRow") -> str:
     low, high = row.interval or (row.value, row.value)
     return f"{row.value:.3g} [{low:.3g}, {high:.3g}]"
 
 
-def _compared(one: "ResultRow", other: "ResultRow", name: str) -> str:
+def _compare(row: "ResultRow", reference: "ResultRow", name: str) -> str:
     """How a return compares with another one, by 95% intervals that do not overlap."""
-    (low, high), (other_low, other_high) = (
-        row.interval or (row.value, row.value) for row in (one, other)
-    )
-    if low > other_high:
+    (low, high), (least, most) = (r.interval or (r.value, r.value) for r in (row, reference))
+    if low > most:
         return f"above {name}"
-    return f"below {name}" if high < other_low else f"level with {name} (the intervals overlap)"
+    return f"below {name}" if high < least else f"level with {name} (the intervals overlap)"
 
 
 def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
@@ -163,63 +159,54 @@ def demo(out: Path, seed: int, config: DemoConfig) -> "list[ResultRow]":
         of `ENVIRONMENTS`.
     """
     from ucfrec.evaluation.collect import collect_store
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_behavior
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.reporting.page import write_report
-    from ucfrec.results.rows_file import write_results
+    from ucfrec.results.rows import write_results
 
     for number, environment in enumerate(ENVIRONMENTS, 1):
         _say(f"Logs of {environment} ({number} of {len(ENVIRONMENTS)}) …")
         collect_store(Environment(environment), out / environment, config.sessions, seed)
     jobs = [
-        (environment, name)
-        for name in reversed(config.methods)
-        for environment in ENVIRONMENTS
-        if name in config.names(environment)
+        (environment, name) for environment in ENVIRONMENTS for name in config.names(environment)
     ]
-    # One thread each: at this size two trainings side by side beat one on two threads.
+    # The longest ones first. One thread each: at this size two trainings side by side beat one on
+    # two threads.
+    jobs.sort(key=lambda job: -config.methods.index(job[1]))
     workers = min(len(jobs), os.cpu_count() or 1)
+    rows: dict[tuple[str, str], ResultRow] = {}
     with pool_of_processes(workers) as pool:
         with block_ctrl_c():
-            started = [
-                pool.submit(_learn, out / environment, name, seed, config)
-                for environment, name in jobs
-            ]
+            futures = {pool.submit(_learn, out / job[0], job[1], seed, config): job for job in jobs}
         _say(f"Training {len(jobs)} policies, {workers} at a time …")
         with progress(len(jobs), "train and evaluate", "policies") as bar:
-            for finished in as_completed(started):
-                row = finished.result()
-                _say(f"  {row.environment}, {row.method}: return {_value(row)}")
+            for future in as_completed(futures):
+                row = rows[futures[future]] = future.result()
+                _say(f"  {row.environment}, {row.method}: return {_describe_value(row)}")
                 bar.update()
-        learned = {job: future.result() for job, future in zip(jobs, started, strict=True)}
-    rows = []
+    ordered, runs = [], []
     for environment in ENVIRONMENTS:
         for name, behavior in BEHAVIORS.items():
             row = evaluate_behavior(
                 Environment(environment), behavior, config.episodes, EVALUATION_SEED + seed
             )
-            learned[environment, name] = replace(row, method=name)
-        order = ("random", "logging", *config.names(environment), "optimal")
-        rows += [learned[environment, name] for name in order]
-    write_results(out / "results.json", rows)
-    runs = [
-        out / environment / name
-        for environment in ENVIRONMENTS
-        for name in config.names(environment)
-    ]
+            rows[environment, name] = replace(row, method=name)
+        names = config.names(environment)
+        ordered += [rows[environment, name] for name in ("random", "logging", *names, "optimal")]
+        runs += [out / environment / name for name in names]
+    write_results(out / "results.json", ordered)
     items = out / "synthetic-catalog" / "logs" / "items.parquet"
     write_report(out / "report.html", runs, [out / "results.json"], items)
-    return rows
+    return ordered
 
 
 def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow":
-    """Train and evaluate the method `name` in the environment `folder.name`, in a worker
-    process."""
+    """Train and evaluate a method in the environment `folder.name`, in a worker process."""
     import torch
 
     from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.evaluation.environment import Environment
     from ucfrec.evaluation.evaluate import evaluate_policy
+    from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
     from ucfrec.runs.run import train_run
     from ucfrec.runs.shared_stages import SharedStages
@@ -230,14 +217,8 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     size = [f"policy.dim={config.dim}"]
     size += [] if policy == "bc" else [f"policy.context={config.context}"]
     resolved = resolve_config(policy, None, [*config.settings, *size, *settings], seed)
-    shared = SharedStages(folder / "stages")
+    run, shared = folder / name, SharedStages(folder / "stages")
     with label_progress(f"{folder.name}, {name}"):
-        train_run(EpisodeStore.open(folder / "store"), folder / name, resolved, shared=shared)
-        trained = TrainedPolicy.load(folder / name)
-        return evaluate_policy(
-            Environment(folder.name),
-            trained,
-            name,
-            config.episodes,
-            EVALUATION_SEED + seed,
-        )
+        train_run(EpisodeStore.open(folder / "store"), run, resolved, shared=shared)
+        trained, environment = TrainedPolicy.load(run), Environment(folder.name)
+        return evaluate_policy(environment, trained, name, config.episodes, EVALUATION_SEED + seed)

@@ -1,148 +1,155 @@
-"""`ucfrec ope`: the return of a policy, estimated from logs alone."""
+"""`ucfrec ope`: the return of a policy, estimated from logs alone; `score`: what it needs of the
+policy."""
 
-import argparse
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import (
-    log_options,
-    logs_given,
-    memory_option,
-    option,
-    rule_given,
-    rule_options,
-    runs_given,
-    table_options,
-    table_values,
+from ucfrec.commands.options import OUTPUT, Group, settings_given
+from ucfrec.commands.shared_options import (
+    LogOptions,
+    RuleOptions,
+    RunArgument,
+    SparkOption,
+    find_runs,
 )
 from ucfrec.errors import InputError
+from ucfrec.files.remote import origin
 
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.score import LoggedSessions
-    from ucfrec.off_policy.selection import Choice
+    from ucfrec.off_policy.selection import Selection
     from ucfrec.off_policy.verdict import Verdict
-    from ucfrec.results.row import ResultRow
+    from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
-_TABLE: Final = "ucfrec.off_policy.evaluate:EstimateOptions"
-_FIELDS: Final = {
-    "discount": float,
-    "pages": bool,
-    "reward_range": tuple,
-    "wanted_lift": float,
-    "item_groups": int,
-    "estimate_propensities": bool,
-    "filter_seen": bool,
-}
+
+_ESTIMATED: Final = Group("what is estimated")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec ope`."""
-    memory_option(log_options(parser))
-    rule_options(parser)
-    option(
-        parser,
-        "--targets",
-        str,
-        "compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1",
-        "RETURN,…",
-    )
-    text = "compare drawing items at these temperatures; 0 takes the best: 0,0.5,1"
-    option(parser, "--temperatures", str, text, "T,…")
-    option(
-        parser,
-        "--scored",
-        False,
-        "LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: "
-        "one row per session is in memory, and there are no reward models (DM, FQE, DR)",
-    )
-    group = parser.add_argument_group("what is estimated")
-    fields = {"discount": float, "pages": bool, "reward_range": tuple}
-    fields |= {
-        "filter_seen": bool,
-        "wanted_lift": float,
-        "item_groups": int,
-        "estimate_propensities": bool,
-    }
-    table_options(group, _TABLE, fields, wanted_lift="lift")
-    text = "treat each session as one of another user, for logs without user ids (as in obd)"
-    option(group, "--anonymous", False, text)
-    option(parser, "--seed", 0, "of folds and bootstrap")
-    option(parser, "--json", Path, "write the result rows here")
-    parser.usage = "%(prog)s RUN... [LOGS...] [options]"
-    parser.epilog = (
+class Ope(RuleOptions, LogOptions):
+    """`ucfrec ope`."""
+
+    described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
+    usage = "%(prog)s RUN... [LOGS...] [options]"
+    epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
         "targets or rules are ranked, with a band that holds all at once."
     )
 
+    targets: Annotated[str | None, "RETURN,…"] = None
+    """Compare these target returns, or quantiles of the training returns; 5,10 or q0.5,q1"""
+    temperatures: Annotated[str | None, "T,…"] = None
+    """Compare drawing items at these temperatures; 0 takes the best: 0,0.5,1"""
+    scored: bool = False
+    """LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: one row
+    per session is in memory, and there are no reward models (DM, FQE, DR)"""
+    seed: int = 0
+    """Of the folds and the bootstrap."""
+    json: Path | None = None
+    """Write the result rows here."""
+    discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
+    pages: Annotated[bool, _ESTIMATED] = False
+    reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
+    filter_seen: Annotated[bool, _ESTIMATED] = False
+    lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
+    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
+    logged return"""
+    item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
+    estimate_propensities: Annotated[bool, _ESTIMATED] = False
+    anonymous: Annotated[bool, _ESTIMATED] = False
+    """Treat each session as one of another user, for logs without user ids (as in obd)"""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec ope`: print the estimates and the verdict of every candidate.
+    def execute(self) -> None:
+        """Print the estimates and the verdict of every candidate."""
+        from ucfrec.logs.summary import format_summary
+        from ucfrec.off_policy import evaluate
+        from ucfrec.off_policy.selection import choose, names_of
+        from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
+        from ucfrec.results.rows import write_results
+        from ucfrec.runs.trained_policy import TrainedPolicy
 
-    Raises:
-        InputError: no run or no log is named, or one of them cannot be used.
-    """
-    from ucfrec.off_policy.evaluate import EstimateOptions
-    from ucfrec.off_policy.selection import choose, names_of
-    from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
-    from ucfrec.results.rows_file import write_results
-    from ucfrec.runs.trained_policy import TrainedPolicy
+        runs, logs = find_runs(self.logs)
+        settings = settings_given(self, evaluate.EstimateOptions)
+        if self.lift is not None:
+            settings["wanted_lift"] = self.lift
+        options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
+        if self.scored and not logs:
+            raise InputError("--scored needs what ucfrec score wrote; name it after the run")
+        if self.scored and self.filter_seen:
+            raise InputError(
+                "--scored takes probabilities as they are; give --filter-seen to score"
+            )
+        # On the test split, the weights that have not learned from it.
+        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        candidates = [(policy, self._make_rules(policy)) for policy in policies]
+        parts = ("run", "target return", "temperature")
+        names = names_of(
+            [
+                dict(zip(parts, (str(p.folder), rule.target, rule.temperature), strict=True))
+                for p, rules in candidates
+                for rule in rules
+            ]
+        )
+        reports: dict[str, OffPolicyReport] = {}
+        for policy, rules in candidates:
+            reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+            with nullcontext() if self.scored else reading as logged:
+                if logged is not None and logs:
+                    print(format_summary(logged.report))
+                elif logged is not None:
+                    store = logged.store
+                    sizes = f"{store.n_episodes:,} sessions, {store.n_steps:,} steps"
+                    print(f"test split of {store.path}: {sizes}")
+                for rule in rules:
+                    name = names[len(reports)]
+                    if len(names) > 1:
+                        print(f"\n{name}:")
+                    reports[name] = estimate_return(
+                        (policy, rule),
+                        [Path(log) for log in logs] if logged is None else logged,
+                        logs or [TEST_SPLIT],
+                        options=options,
+                        seed=self.seed,
+                        checkpoint=self.checkpoint,
+                    )
+                    print(_describe(reports[name]))
+        columns: dict[str, dict[str, object]] = {name: {"candidate": name} for name in reports}
+        if len(reports) > 1:
+            choice = choose(reports, self.seed)
+            print(_describe_choice(choice))
+            columns = {name: {"candidate": name, **choice.columns(name)} for name in reports}
+        if self.json is not None:
+            rows = [
+                row.extended(columns[name])
+                for name, report in reports.items()
+                for row in (*report.rows, *report.step_rows)
+            ]
+            write_results(self.json, rows)
 
-    runs = runs_given(options)
-    estimates = EstimateOptions(
-        users_known=not options.anonymous, **table_values(options, "EstimateOptions")
-    )
-    if options.scored and not options.logs:
-        raise InputError("--scored needs what ucfrec score wrote; name it after the run")
-    if options.scored and estimates.filter_seen:
-        raise InputError("--scored takes probabilities as they are; give --filter-seen to score")
-    # On the test split, the weights that have not learned from it.
-    split = not options.logs
-    policies = [TrainedPolicy.load(run, options.checkpoint, split=split) for run in runs]
-    rules = [_rules(options, policy) for policy in policies]
-    pairs = [(policy, rule) for policy, own in zip(policies, rules, strict=True) for rule in own]
-    names = iter(names_of([_distinguish(policy, rule) for policy, rule in pairs]))
-    reports: dict[str, OffPolicyReport] = {}
-    for policy, own in zip(policies, rules, strict=True):
-        with _read_logs(options, policy) as logged:
-            for rule in own:
-                name = next(names)
-                if len(pairs) > 1:
-                    print(f"\n{name}:")
-                reports[name] = estimate_return(
-                    (policy, rule),
-                    logged,
-                    options.logs or [TEST_SPLIT],
-                    options=estimates,
-                    seed=options.seed,
-                    checkpoint=options.checkpoint,
-                )
-                print(_describe(reports[name]))
-    choice = choose(reports, options.seed) if len(reports) > 1 else None
-    if choice is not None:
-        print(_describe_choice(choice))
-    if options.json is not None:
-        rows = [
-            row.extended({"candidate": name, **({} if choice is None else choice.columns(name))})
-            for name, report in reports.items()
-            for row in (*report.rows, *report.step_rows)
+    def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":
+        """The different rules to evaluate: the run's own with the parts that the options name."""
+        base = self.make_rule(trained)
+        targets, temperatures = [base.target], [base.temperature]
+        if self.targets is not None:
+            targets = [_read_target(part.strip(), trained) for part in self.targets.split(",")]
+        try:
+            if self.temperatures is not None:
+                temperatures = [float(part) for part in self.temperatures.split(",")]
+        except ValueError:
+            raise InputError(
+                f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
+            ) from None
+        rules = [
+            replace(base, target=target, temperature=temperature)
+            for target in targets
+            for temperature in temperatures
         ]
-        write_results(options.json, rows)
-
-
-def _distinguish(trained: "TrainedPolicy", rule: "DecisionRule") -> dict[str, object]:
-    """What may differ from other candidates, by name."""
-    return {
-        "run": str(trained.folder),
-        "target return": rule.target,
-        "temperature": rule.temperature,
-    }
+        return list({rule.hash: rule for rule in rules}.values())
 
 
 def _describe(report: "OffPolicyReport") -> str:
@@ -171,12 +178,12 @@ def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object
     return format_rows(lines, columns)
 
 
-def _describe_choice(choice: "Choice") -> str:
+def _describe_choice(choice: "Selection") -> str:
     """The candidates in order, and which comes first."""
     from ucfrec.reporting.tables import text_table
 
     lines = []
-    if choice.selection is not None:
+    if choice.standings:
         rows = [
             (
                 standing.name,
@@ -184,7 +191,7 @@ def _describe_choice(choice: "Choice") -> str:
                 f"{standing.probability_best:.2f}",
                 str(standing.rank),
             )
-            for standing in choice.selection.standings
+            for standing in choice.standings
         ]
         lines.append("\nvalue per session, with a 95% band that holds all of them at once:")
         lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))
@@ -203,57 +210,6 @@ def _next_step(verdict: "Verdict") -> str:
     return "next: log more sessions, or compare other policies, --targets or --temperatures"
 
 
-@contextmanager
-def _read_logs(
-    options: argparse.Namespace, trained: "TrainedPolicy"
-) -> "Iterator[LoggedSessions | Sequence[Path]]":
-    """What the policy is evaluated on: the logs, or else the test split of its store."""
-    from ucfrec.logs.summary import format_summary
-    from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
-
-    if options.scored:
-        yield options.logs
-        return
-    if not options.logs:
-        logged = held_out_sessions([trained])
-        store = logged.store
-        print(f"test split of {store.path}: {store.n_episodes:,} sessions, {store.n_steps:,} steps")
-        yield logged
-        return
-    files, mapping = logs_given(options, trained)
-    limit = options.memory_limit
-    with read_logged_sessions(trained, files, mapping, True, limit) as logged:
-        print(format_summary(logged.report))
-        yield logged
-
-
-def _rules(options: argparse.Namespace, trained: "TrainedPolicy") -> "list[DecisionRule]":
-    """The decision rules to evaluate: the run's own with the parts that the options name.
-
-    Raises:
-        InputError: one of `--targets` is neither a number nor a quantile, or a temperature is no
-            number.
-    """
-    base = rule_given(options, trained)
-    targets: list[float | None] = [base.target]
-    if options.targets is not None:
-        targets = [_read_target(part.strip(), trained) for part in options.targets.split(",")]
-    temperatures = [base.temperature]
-    if options.temperatures is not None:
-        try:
-            temperatures = [float(part) for part in options.temperatures.split(",")]
-        except ValueError:
-            raise InputError(
-                f"--temperatures {options.temperatures} are not numbers; write e.g. 0,0.5,1"
-            ) from None
-    rules = [
-        replace(base, target=target, temperature=temperature)
-        for target in targets
-        for temperature in temperatures
-    ]
-    return list({rule.hash: rule for rule in rules}.values())
-
-
 def _read_target(part: str, trained: "TrainedPolicy") -> float:
     """A target return: a number in units of the reward, or `q` and a quantile."""
     quantile = part.startswith("q")
@@ -267,3 +223,49 @@ def _read_target(part: str, trained: "TrainedPolicy") -> float:
             "write e.g. 5,10 or q0.5,q0.9"
         )
     return trained.target_return(value) if quantile else value
+
+
+class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
+    """`ucfrec score`."""
+
+    described_by = "ucfrec.python_api.recommender:Recommender.score"
+
+    filter_seen: bool = False
+    out: Annotated[Path, OUTPUT]
+    """Parquet file (with --engine spark: folder) to write."""
+    engine: Literal["torch", "spark"] = "torch"
+    """What computes the probabilities: this process; or Spark's workers, each for some of the
+    users, which write the parts of a folder --out"""
+
+    def execute(self) -> None:
+        """Write the policy's probability of every logged choice as Parquet."""
+        from ucfrec.files.parquet import write_frames
+        from ucfrec.logs.summary import format_report
+        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        trained = TrainedPolicy.load(self.run, self.checkpoint)
+        rule = self.make_rule(trained)
+        if (master := self.find_spark()) is not None:
+            from ucfrec.off_policy.scored import score_with_spark
+
+            files, mapping = self.find_logs(self.logs, trained, [self.out])
+            sessions = score_with_spark(
+                trained,
+                files,
+                mapping,
+                self.out,
+                master,
+                checkpoint=self.checkpoint,
+                rule=rule,
+                filter_seen=self.filter_seen,
+                memory_limit=self.memory_limit,
+            )
+            print(f"{origin(self.out)}: {sessions:,} sessions")
+            return
+        with self.read_sessions([trained], self.logs, self.out) as logged:
+            print(format_report(logged.report))
+            frames = score(trained, logged, rule, self.filter_seen)
+            unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}
+            rows = write_frames(self.out, frames, about_scores(trained, rule) | unknown)
+        print(f"\n{origin(self.out)}: {rows:,} rows")

@@ -1,89 +1,62 @@
 """`ucfrec rank`: how policies rank what users were shown and clicked later."""
 
-import argparse
-from contextlib import ExitStack
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from ucfrec.commands.options import (
-    keep_seen_option,
-    log_options,
-    logs_given,
-    option,
-    rule_given,
-    rule_options,
-    runs_given,
-)
-from ucfrec.errors import InputError
+from ucfrec.commands.options import POSITIVE
+from ucfrec.commands.shared_options import LogOptions, RuleOptions, find_runs
 
 if TYPE_CHECKING:
-    from ucfrec.results.table import Ranking
+    from ucfrec.results.rows import Ranking
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec rank`."""
-    log_options(parser)
-    option(parser, "--k", 10, "items recommended at each step")
-    keep_seen_option(parser)
-    rule_options(parser)
-    option(parser, "--seed", 0, "seed of the bootstrap over users and of the random baseline")
-    option(
-        parser,
-        "--liked",
-        str,
-        "what counts as liked, a truth value over the column reward, e.g. 'reward >= 4'; "
-        "(default: at least 60%% of the way from the lowest training reward to the highest, or to "
-        "two standard deviations above the mean, if that is less)",
-        "SQL",
-    )
-    option(parser, "--json", Path, "also write the rows, with intervals, as JSON", "FILE")
-    parser.usage = "%(prog)s RUN... [LOGS...] [options]"
-    parser.epilog = (
+class Rank(LogOptions, RuleOptions):
+    """`ucfrec rank`."""
+
+    described_by = "ucfrec.python_api.recommender:Recommender.rank"
+    usage = "%(prog)s RUN... [LOGS...] [options]"
+    epilog = (
         "Without LOGS, the policies rank the test split of the store of the first run. Matrix "
         "factorisation, a baseline, needs ucfrec[rank]."
     )
 
+    k: Annotated[int, POSITIVE] = 10
+    keep_seen: bool = False
+    """Also recommend items that the user has seen; (default: leave them out)"""
+    seed: int = 0
+    liked: Annotated[str | None, "SQL"] = None
+    json: Annotated[Path | None, "FILE"] = None
+    """Also write the rows, with intervals, as JSON."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec rank` and print one row per policy.
+    def execute(self) -> None:
+        """Print one row per policy."""
+        from ucfrec.evaluation.ranking_table import require_one_catalogue
+        from ucfrec.logs.summary import format_summary
+        from ucfrec.provenance import shorten_paths
+        from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
+        from ucfrec.runs.trained_policy import TrainedPolicy
 
-    Raises:
-        InputError: a run or log cannot be used, the runs have different stores, or there is no
-            test split to rank that none of the runs was trained on.
-    """
-    from ucfrec.evaluation.ranking_table import require_one_catalogue
-    from ucfrec.logs.summary import format_summary
-    from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
-    from ucfrec.provenance import shorten_paths
-    from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
-    from ucfrec.runs.trained_policy import TrainedPolicy
-
-    runs = runs_given(options)
-    if options.k < 1:
-        raise InputError(f"--k is {options.k}; recommend at least 1 item")
-    policies = [TrainedPolicy.load(run, options.checkpoint, split=not options.logs) for run in runs]
-    require_one_catalogue(policies)
-    with ExitStack() as stack:
-        if options.logs:
-            files, mapping = logs_given(options, policies[0])
-            logged = stack.enter_context(read_logged_sessions(policies[0], files, mapping))
-            print(format_summary(logged.report), end="\n\n")
-        else:
-            logged = held_out_sessions(policies)
-        ranking = rank_policies(
-            [(policy, rule_given(options, policy)) for policy in policies],
-            logged,
-            ", ".join(map(shorten_paths, options.logs)) or TEST_SPLIT,
-            k=options.k,
-            filter_seen=not options.keep_seen,
-            liked=options.liked,
-            seed=options.seed,
-            checkpoint=options.checkpoint,
-        )
-    print(_describe(ranking))
-    if options.json is not None:
-        ranking.save(options.json)
-    print(_conclude(ranking, runs[0]))
+        runs, logs = find_runs(self.logs)
+        policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
+        require_one_catalogue(policies)
+        with self.read_sessions(policies, logs, self.json) as logged:
+            if logs:
+                print(format_summary(logged.report), end="\n\n")
+            ranking = rank_policies(
+                [(policy, self.make_rule(policy)) for policy in policies],
+                logged,
+                ", ".join(map(shorten_paths, logs)) or TEST_SPLIT,
+                k=self.k,
+                filter_seen=not self.keep_seen,
+                liked=self.liked,
+                seed=self.seed,
+                checkpoint=self.checkpoint,
+            )
+        print(_describe(ranking))
+        if self.json is not None:
+            ranking.save(self.json)
+        print(_conclude(ranking, runs[0]))
 
 
 def _describe(ranking: "Ranking") -> str:
@@ -110,15 +83,11 @@ def _describe(ranking: "Ranking") -> str:
 
 def _conclude(ranking: "Ranking", run: Path) -> str:
     """What the rows show, in two lines: the best by liked items, and what to do next."""
-    rows, metric = ranking.rows, "hit_rate_liked"
-    rates = {
-        n: rate
-        for n, row in enumerate(rows)
-        if (rate := row.metrics.get(metric)) is not None and rate == rate
-    }
+    rates = {n: row.metrics.get("hit_rate_liked", math.nan) for n, row in enumerate(ranking)}
+    rates = {n: rate for n, rate in rates.items() if not math.isnan(rate)}
     if 0 not in rates:
         return "\nno step was liked; next: name what counts as liked with --liked"
-    best = max(rates, key=lambda n: rates[n])
+    rows, best = ranking.rows, max(rates, key=lambda n: rates[n])
     if not rates[best]:
         return "\nno method lists an item that was liked; next: a larger --k, or --keep-seen"
     first = f"; {rows[0].method} has {rates[0]:.3f}" if best else ""

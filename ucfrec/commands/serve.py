@@ -1,24 +1,15 @@
-"""`ucfrec serve`: answer requests for recommendations over HTTP."""
+"""`ucfrec serve`: answer requests over HTTP; `explore`: try policies out in the browser."""
 
-import argparse
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import (
-    answer_options,
-    exposures_given,
-    option,
-    responder_given,
-    rule_options,
-    table_options,
-    table_values,
-)
+from ucfrec.commands.options import ARGUMENT, POSITIVE, Group, Table, settings_given
+from ucfrec.commands.shared_options import AnswerOptions
 from ucfrec.errors import InputError, InputNote
 from ucfrec.processes import Interrupted
 
@@ -28,163 +19,180 @@ if TYPE_CHECKING:
     import uvicorn
 
     from ucfrec.recommending.responder import Responder
-    from ucfrec.recommending.workers import Parent
+    from ucfrec.recommending.server import Parent
 _STOPPED: Final = "ucfrec serve: stopped"
-_LIMITS: Final = "ucfrec.recommending.web:ServerLimits"
+_SERVER: Final = Group("the server")
+_OWN_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec serve`."""
-    option(
-        parser,
-        "run",
-        Path,
-        "run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec "
-        "promote` made current answers, and is followed",
-        "RUN",
-    )
-    option(
-        parser,
-        "--split",
-        str,
-        "answer with several runs of the folder RUN, each for its share of the users; e.g. "
-        "run1=0.9,run2=0.1; the exposures have the arm (default: one run answers all)",
-        "A=SHARE,B=SHARE",
-    )
-    text = "address to listen on; one that is not this machine's own exposes the server to the "
-    option(parser, "--host", "127.0.0.1", f"{text}network")
-    option(parser, "--port", 8080, "0 for a free one")
-    answer_options(parser, "DIR")
-    rule_options(parser)
-    server = parser.add_argument_group("the server")
-    option(
-        server,
-        "--allowed-hosts",
-        str,
-        "answer only requests whose header Host names one of these: names, addresses, "
-        "*.example.org, or * for any (default: this machine's own names where --host is 127.0.0.1, "
-        "localhost or ::1, otherwise any)",
-        "HOST[,HOST…]",
-    )
-    text = "processes that answer on the address, each with the run in its memory"
-    option(server, "--workers", 1, text, "N")
-    text = "threads per forward pass (default: one per core, divided by --workers)"
-    option(server, "--threads", int, text, "N")
-    table_options(server, _LIMITS, {"batch": int, "queue": int}, "max-")
-    table_options(server, _LIMITS, {"timeout": float})
+class Serve(AnswerOptions):
+    """`ucfrec serve`."""
 
+    described_by = "ucfrec.recommending.web:ServerLimits"
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec serve` until Ctrl-C or TERM, after which requests in flight are answered.
+    run: Annotated[Path, ARGUMENT, "RUN"]
+    """Run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec promote`
+    made current answers, and is followed"""
+    split: Annotated[str | None, "A=SHARE,B=SHARE"] = None
+    """Answer with several runs of the folder RUN, each for its share of the users; e.g.
+    run1=0.9,run2=0.1; the exposures have the arm (default: one run answers all)"""
+    host: str = "127.0.0.1"
+    """Address to listen on; one that is not this machine's own exposes the server to the network"""
+    port: int = 8080
+    """0 for a free one."""
+    allowed_hosts: Annotated[str | None, _SERVER, "HOST[,HOST…]"] = None
+    """Answer only requests whose header Host names one of these: names, addresses, *.example.org,
+    or * for any (default: this machine's own names where --host is 127.0.0.1, localhost or ::1,
+    otherwise any)"""
+    engine: Annotated[Literal["torch", "onnxruntime"], _SERVER] = "torch"
+    """What computes the network of requests that are not batched; onnxruntime is faster, but needs
+    ucfrec[export] and some 10 seconds at the start"""
+    workers: Annotated[int, _SERVER, "N"] = 1
+    """Processes that answer on the address, each with the run in its memory."""
+    threads: Annotated[int | None, _SERVER, POSITIVE, "N"] = None
+    """Threads per forward pass (default: one per core, divided by --workers)"""
+    max_batch: Annotated[int | None, _SERVER, "N"] = None
+    max_queue: Annotated[int | None, _SERVER, "N"] = None
+    timeout: Annotated[float | None, _SERVER, "TIMEOUT"] = None
 
-    Raises:
-        InputError: the run cannot be used or has no checksums, a file of it was changed, the extra
-            `serve` is not installed, or the address cannot be listened on.
-    """
-    from ucfrec.recommending.workers import MOST, Workers
+    def execute(self) -> None:
+        """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
+        from ucfrec.recommending.server import MOST, Workers
 
-    if not 1 <= options.workers <= MOST:
-        raise InputError(f"--workers is {options.workers}; give a number from 1 to {MOST}")
-    from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
+        if not 1 <= self.workers <= MOST:
+            raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
+        from ucfrec.recommending.server import PrintingServer, listening_socket, ready_line
 
-    address = listening_socket(options.host, options.port)
-    if options.workers == 1:
-        _serve(options, address, PrintingServer)
-        return
-    with address as listening, Workers(partial(_work, options), listening) as workers:
-        what = workers.start(options.workers)
-        print(ready_line(what, listening), flush=True)
+        address = listening_socket(self.host, self.port)
+        if self.workers == 1:
+            self._serve(address, PrintingServer)
+            return
+        with address as listening, Workers(self._work, listening) as workers:
+            what = workers.start(self.workers)
+            print(ready_line(what, listening), flush=True)
+            try:
+                workers.keep()
+            except Interrupted:
+                workers.end()
+                print(_STOPPED, file=sys.stderr)
+
+    def _serve(
+        self,
+        address: "AbstractContextManager[socket.socket]",
+        make_server: "Callable[[uvicorn.Config, str], uvicorn.Server]",
+    ) -> None:
+        """Answer requests in this process.
+
+        Args:
+            make_server: makes the server, given what it answers with.
+        """
+        import torch
+
+        from ucfrec.recommending.responder import Served, parse_split
+        from ucfrec.recommending.server import server_config
+        from ucfrec.recommending.web import ServerLimits, application
+        from ucfrec.runs.record import RUN, verified
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        several, threads = self.workers > 1, self.threads
+        if threads is None and several:
+            threads = max(1, torch.get_num_threads() // self.workers)
+        if threads is not None:
+            torch.set_num_threads(threads)
+        settings = settings_given(self, ServerLimits, "max_")
+        limits = ServerLimits(**settings, **settings_given(self, ServerLimits))
+
+        def make(run: Path) -> "Responder":
+            verified(run)
+            return self.make_responder(TrainedPolicy.load(run, self.checkpoint))
+
+        shares = None if self.split is None else parse_split(self.split)
+        folder = self.run.resolve()
+        if shares is None and (folder / RUN).is_file():
+            folder, shares = folder.parent, {folder.name: 1.0}
+        with (
+            closing(Served(make, folder, shares)) as served,
+            self.open_exposures(served.trained) as exposures,
+        ):
+            if shares is None:
+                served.follow()
+            hosts = list_hosts(self.allowed_hosts, self.host)
+            config = server_config(
+                application(served, limits, hosts, exposures, several),
+                timeout_graceful_shutdown=int(limits.timeout) + 1,
+                workers=self.workers,
+            )
+            with address as listening:
+                try:
+                    make_server(config, f"ucfrec serve: {served.trained!r}").run([listening])
+                except Interrupted:
+                    # What was asked of a server that is stopped is done.
+                    if not several:
+                        print(_STOPPED, file=sys.stderr)
+
+    def _work(self, listening: "socket.socket", parent: "Parent") -> None:
+        """Answer requests in one of several processes."""
+        from ucfrec.commands.cli import explanation, notes_on_one_line
+        from ucfrec.recommending.server import Server
+
+        def make_server(config: "uvicorn.Config", what: str) -> Server:
+            server = Server(config, lambda _: parent.ready(what))
+            parent.ends(server)
+            return server
+
         try:
-            workers.keep()
-        except Interrupted:
-            workers.end()
-            print(_STOPPED, file=sys.stderr)
+            with notes_on_one_line("ucfrec serve"):
+                if not parent.first:
+                    warnings.simplefilter("ignore", InputNote)
+                self._serve(listening, make_server)
+        except Exception as error:
+            why = explanation(error)
+            if why is None:
+                traceback.print_exc()
+            parent.failed(why or "a worker failed; see the traceback")
 
 
-def _serve(
-    options: argparse.Namespace,
-    address: "AbstractContextManager[socket.socket]",
-    server: "Callable[[uvicorn.Config, str], uvicorn.Server]",
-) -> None:
-    """Answer requests in this process.
+def list_hosts(hosts: str | None, address: str) -> tuple[str, ...]:
+    """What the header `Host` may be: a page of the web cannot reach a server of this machine by a
+    name of its own (DNS rebinding).
 
     Args:
-        server: makes the server, given what it answers with.
+        hosts: names or addresses with commas between them; None for those that suit the address.
     """
-    import torch
+    if hosts is not None:
+        return tuple(host.strip() for host in hosts.split(","))
+    return _OWN_NAMES if address in _OWN_NAMES else ("*",)
 
-    from ucfrec.recommending.served import Served, parse_split
-    from ucfrec.recommending.server import server_config
-    from ucfrec.recommending.web import ServerLimits, application
-    from ucfrec.runs.record import RUN, verified
-    from ucfrec.runs.trained_policy import TrainedPolicy
 
-    several = options.workers > 1
-    threads = options.threads
-    if threads is None and several:
-        threads = max(1, torch.get_num_threads() // options.workers)
-    if threads is not None:
-        if threads < 1:
-            raise InputError(f"--threads is {threads}; give 1 or more")
-        torch.set_num_threads(threads)
-    limits = ServerLimits(**table_values(options, "ServerLimits"))
+class Explore(Table):
+    """`ucfrec explore`."""
 
-    def make(run: Path) -> "Responder":
-        verified(run)
-        return responder_given(options, TrainedPolicy.load(run, options.checkpoint))
+    epilog = "Answers this machine only. Needs ucfrec[serve]."
 
-    shares = None if options.split is None else parse_split(options.split)
-    folder = options.run.resolve()
-    if shares is None and (folder / RUN).is_file():
-        folder, shares = folder.parent, {folder.name: 1.0}
-    with (
-        closing(Served(make, folder, shares)) as served,
-        exposures_given(options, served.trained) as exposures,
-    ):
-        if shares is None:
-            served.follow()
-        config = server_config(
-            application(served, limits, _allowed_hosts(options), exposures, several),
-            timeout_graceful_shutdown=int(limits.timeout) + 1,
-            workers=options.workers,
-        )
-        with address as listening:
+    runs: Annotated[Sequence[Path], ARGUMENT, "RUN"]
+    """Run folder of `ucfrec train`; two are shown side by side."""
+    items: Annotated[Path | None, "FILE"] = None
+    """Item features to show: Parquet or CSV with a column item_id; title (or name) and image_url
+    (or image) are shown as such (default: none)"""
+    results: Annotated[Sequence[Path], "FILE…"] = ()
+    """Results of `ucfrec ope --json` and `ucfrec evaluate --json`, for the verdict (default:
+    none)"""
+    port: int = 8081
+    """0 for a free one."""
+
+    def execute(self) -> None:
+        """Show policies until Ctrl-C or TERM."""
+        from ucfrec.exploring.page import Explorer, application
+        from ucfrec.recommending.server import PrintingServer, listening_socket, server_config
+        from ucfrec.reporting.training import read_features
+        from ucfrec.runs.trained_policy import TrainedPolicy
+
+        features = None if self.items is None else read_features(self.items)
+        runs = [TrainedPolicy.load(run) for run in self.runs]
+        explorer = Explorer(runs, features, self.results)
+        config = server_config(application(explorer, ("localhost", "127.0.0.1", "[::1]")))
+        with listening_socket("127.0.0.1", self.port) as listening:
             try:
-                server(config, f"ucfrec serve: {served.trained!r}").run([listening])
+                PrintingServer(config, "ucfrec explore", page="/").run([listening])
             except Interrupted:
-                # What was asked of a server that is stopped is done.
-                if not several:
-                    print(_STOPPED, file=sys.stderr)
-
-
-def _work(options: argparse.Namespace, listening: "socket.socket", parent: "Parent") -> None:
-    """Answer requests in one of several processes."""
-    from ucfrec.commands.cli import explanation, notes_on_one_line
-    from ucfrec.recommending.server import Server
-
-    def server(config: "uvicorn.Config", what: str) -> Server:
-        made = Server(config, lambda _: parent.ready(what))
-        parent.ends(made)
-        return made
-
-    try:
-        with notes_on_one_line("ucfrec serve"):
-            if not parent.first:
-                warnings.simplefilter("ignore", InputNote)
-            _serve(options, listening, server)
-    except Exception as error:
-        why = explanation(error)
-        if why is None:
-            traceback.print_exc()
-        parent.failed(why or "a worker failed; see the traceback")
-
-
-_OWN_NAMES = ("localhost", "127.0.0.1", "::1")
-
-
-def _allowed_hosts(options: argparse.Namespace) -> tuple[str, ...]:
-    """What the header `Host` may be: a page of the web cannot reach a server of this machine by a
-    name of its own (DNS rebinding)."""
-    if options.allowed_hosts is not None:
-        return tuple(host.strip() for host in options.allowed_hosts.split(","))
-    return _OWN_NAMES if options.host in _OWN_NAMES else ("*",)
+                print("ucfrec explore: stopped", file=sys.stderr)

@@ -1,89 +1,70 @@
 """`ucfrec settings`: list every training setting with its default, range and meaning."""
 
-import argparse
 import inspect
 import shutil
 import textwrap
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Annotated, Any, Final
 
-from ucfrec.commands.options import option
+from ucfrec.commands.options import Names, Table
 from ucfrec.policies.registry import policy_names
-
-if TYPE_CHECKING:
-    from ucfrec.settings import Setting
 
 _NARROWEST: Final = 40
 """Terminal columns that the meaning needs; with fewer it goes on a line of its own below."""
-_BENEATH: Final = " " * 6
 _WIDEST: Final = 160
 """Most terminal columns of a line."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec settings`."""
-    text = f"policy whose settings to list: {', '.join(policy_names())}"
-    option(parser, "--policy", str, f"{text} (default: ucf)", "NAME", default="ucf")
+class Settings(Table):
+    """`ucfrec settings`."""
 
+    policy: Annotated[str, "NAME", Names(policy_names)] = "ucf"
+    """Policy whose settings to list."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec settings`."""
-    print(settings_text(options.policy, shutil.get_terminal_size().columns))
+    def execute(self) -> None:
+        """Print them."""
+        print(settings_text(self.policy, shutil.get_terminal_size().columns))
 
 
 def settings_text(policy: str, width: int) -> str:
-    """Every setting of a training of `policy`, one section per table.
-
-    Raises:
-        InputError: no policy has this name.
-    """
+    """Every setting of a training of `policy`, one section per table."""
     from ucfrec.runs.config import TABLES, resolve_config
     from ucfrec.settings import describe
 
     config, width = resolve_config(policy), min(width, _WIDEST)
-    tables = {name: list(describe(name, getattr(config, name))) for name in TABLES}
-    cells = [_cells(setting) for settings in tables.values() for setting in settings]
-    widths = [max(len(row[i]) for row in cells) for i in range(3)]
+    rows = {
+        name: [
+            ((each.key, _format_toml(each.value), each.allowed), each.meaning)
+            for each in describe(name, getattr(config, name))
+        ]
+        for name in TABLES
+    }
+    columns = zip(*(cells for table in rows.values() for cells, _ in table), strict=True)
+    widths = [max(map(len, column)) for column in columns]
     text = textwrap.wrap(
         f"Settings of `ucfrec train --policy {policy}`: --set KEY=VALUE, or a TOML file "
         "(--config FILE) with a table for each section.",
         width,
     )
-    for name, settings in tables.items():
-        text += ["", *textwrap.wrap(f"[{name}]  {_summary(getattr(config, name))}", width)]
-        for setting in settings:
-            text += _lines(_cells(setting), widths, width)
+    for name, table in rows.items():
+        summary = inspect.cleandoc(type(getattr(config, name)).__doc__ or "").partition("\n\n")[0]
+        text += ["", *textwrap.wrap(f"[{name}]  {summary}", width)]
+        for cells, meaning in table:
+            padded = (cell.ljust(size) for cell, size in zip(cells, widths, strict=True))
+            start = "  " + "  ".join(padded)
+            indent = len(start) + 2
+            if width - indent < _NARROWEST:
+                text.append(start.rstrip())
+                start, indent = "", 6
+            first, *others = textwrap.wrap(meaning, width - indent) or [""]
+            text.append(f"{start}  {first}" if start else " " * indent + first)
+            text += [" " * indent + line for line in others]
     return "\n".join(text)
 
 
-def _summary(table: Any) -> str:
-    """First paragraph of the docstring of the table's class."""
-    return inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
-
-
-def _cells(setting: "Setting") -> tuple[str, str, str, str]:
-    return setting.key, _as_toml(setting.value), setting.allowed, setting.meaning
-
-
-def _as_toml(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     """A value as `--set` takes it; "unset" for None."""
-    if value is None:
-        return "unset"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_format_toml, value))}]"
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_as_toml, value))}]"
-    return str(value)
-
-
-def _lines(cells: Sequence[str], widths: Sequence[int], width: int) -> Iterator[str]:
-    *columns, meaning = cells
-    start = "  " + "  ".join(cell.ljust(size) for cell, size in zip(columns, widths, strict=True))
-    beside = len(start) + 2
-    if width - beside < _NARROWEST:
-        yield start.rstrip()
-        yield from (_BENEATH + line for line in textwrap.wrap(meaning, width - len(_BENEATH)))
-        return
-    first, *rest = textwrap.wrap(meaning, width - beside) or [""]
-    yield f"{start}  {first}"
-    yield from (" " * beside + line for line in rest)
+    return "unset" if value is None else str(value)

@@ -1,153 +1,205 @@
-"""`ucfrec train`: train a policy on an episode store."""
+"""`ucfrec train`: train a policy on an episode store; `tune` and `screen`: choose its settings and
+columns."""
 
-import argparse
-import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import INPUT_FOLDER, option, setting_option
+from ucfrec.commands.options import ARGUMENT, INPUT_FOLDER, POSITIVE, Names, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.policies.registry import policy_names
 
 if TYPE_CHECKING:
-    from ucfrec.episodes.store import EpisodeStore
+    from ucfrec.runs.record import RunRecord
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `ucfrec train`."""
-    training_options(parser)
-    option(
-        parser,
-        "--refit",
-        Path,
-        "go on training this finished run on all rows of the store, with its settings and "
-        "decision rule, in another folder (default: a new training)",
-        "RUN",
-    )
-    option(
-        parser,
-        "--no-refit",
-        False,
-        "keep the weights of the training rows; (default: once everything is chosen, go on "
-        "learning from all rows; `rank` and `ope` on the test split use the weights before that)",
-    )
-    option(
-        parser,
-        "--evidence",
-        int,
-        "effective users that the decision rule must leave in the validation sessions; where "
-        "the log has propensities, so that `ope` can estimate its value; 0 for any (default: 200)",
-        "N",
-    )
+class TrainingOptions(Table):
+    """Options of `train` of `ucfrec` and of other programs."""
+
+    epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
+
+    store: Annotated[Path, ARGUMENT, INPUT_FOLDER, "STORE"]
+    """Episode store to train on; also at s3://, gs://, hdfs://, …"""
+    out: Annotated[Path, "RUN"]
+    """Folder of the run; an unfinished run in it is resumed."""
+    policy: Annotated[str, "NAME", Names(policy_names)] = "ucf"
+    """Policy."""
+    config: Annotated[Path | None, "TOML"] = None
+    """File of settings with one table per section (default: none)"""
+    set: Annotated[Sequence[str], "TABLE.FIELD=VALUE"] = ()
+    """One setting, e.g. train.steps=2000; overrides --config; repeatable (default: none)"""
+    seed: int = 0
+    """Seed of weights and batches."""
+    threads: Annotated[int | None, POSITIVE] = None
+    """CPU threads (default: all cores)"""
+    screen: Literal["drop", "copies"] | None = None
+    """What to do with observation columns without effect; train without them, or add copies of the
+    sessions that intervene on them (default: not screened)"""
 
 
-def training_options(
-    parser: argparse.ArgumentParser, policies: Sequence[str] | None = None
-) -> None:
-    """Add the options of `train` for `ucfrec` and for other programs with this command.
+class Train(TrainingOptions):
+    """`ucfrec train`."""
 
-    Args:
-        policies: names of those that the program trains, others are refused; None for all.
-    """
-    parser.epilog = "Every setting, its range and meaning: ucfrec settings --policy NAME"
-    text = "episode store to train on; also at s3://, gs://, hdfs://, …"
-    option(parser, "store", INPUT_FOLDER, text, "STORE")
-    text = "folder of the run; an unfinished run in it is resumed"
-    option(parser, "--out", Path, text, "RUN", required=True)
-    names = ", ".join(policies or policy_names())
-    text = f"policy: {names} (default: ucf)"
-    option(parser, "--policy", str, text, "NAME", default="ucf", choices=policies)
-    text = "file of settings with one table per section (default: none)"
-    option(parser, "--config", Path, text, "TOML")
-    setting_option(parser, "one setting, e.g. train.steps=2000; overrides --config; repeatable")
-    option(parser, "--seed", 0, "seed of weights and batches")
-    option(parser, "--threads", int, "CPU threads (default: all cores)")
-    option(
-        parser,
-        "--screen",
-        ["drop", "copies"],
-        "what to do with observation columns without effect; train without them, or add "
-        "copies of the sessions that intervene on them (default: not screened)",
-    )
+    refit: Annotated[Path | None, "RUN"] = None
+    """Go on training this finished run, with its settings and decision rule, on all rows, in --out
+    (default: a new training)"""
+    no_refit: bool = False
+    """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
+    `ope` on the test split use the weights before that)"""
+    evidence: Annotated[int | None, "N"] = None
+    """Effective users that the decision rule must leave in the validation sessions; where the log
+    has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""
 
+    def execute(self) -> None:
+        """Train, in this process or as one of those of `torchrun`."""
+        import torch
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec train`.
+        from ucfrec.episodes.store import EpisodeStore
+        from ucfrec.fitting.distributed import joined, leads, wait
+        from ucfrec.python_api.training import train_policy
+        from ucfrec.reporting.model_card import write_card
+        from ucfrec.runs.config import resolve_config
+        from ucfrec.runs.refit import refit
 
-    Raises:
-        InputError: the store or a setting cannot be used, or --out holds a different run.
-    """
-    import torch
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        with joined():
+            if not leads():
+                warnings.simplefilter("ignore", InputNote)  # the leader prints them
+                wait()  # until the leader has begun the run
+            store = EpisodeStore.open(self.store)
+            if self.refit is None:
+                evidence = [] if self.evidence is None else [f"rule.evidence={self.evidence}"]
+                settings = [*self.set, *evidence]
+                config = resolve_config(self.policy, self.config, settings, self.seed)
+                record = train_policy(store, self.out, config, self.screen, not self.no_refit)
+            elif self.config or self.set or self.screen or self.evidence is not None:
+                raise InputError(
+                    "--refit takes all settings of the run; omit --config, --set, --screen and "
+                    "--evidence"
+                )
+            else:
+                record = refit(store, self.refit, self.out)
+                if leads():
+                    write_card(self.out)
+            if leads():
+                self._describe(record)
 
-    from ucfrec.fitting.distributed import joined
+    def _describe(self, record: "RunRecord") -> None:
+        from ucfrec.files.record import CARD
+        from ucfrec.fitting.metrics_log import read_metrics
+        from ucfrec.runs.record import REFIT, RUN, read_record
 
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    with joined():
-        _train(options)
-
-
-def _train(options: argparse.Namespace) -> None:
-    from ucfrec.episodes.store import EpisodeStore
-    from ucfrec.fitting.distributed import leads, wait
-    from ucfrec.fitting.metrics_log import read_metrics
-    from ucfrec.reporting.model_card import write_card
-    from ucfrec.runs.config import resolve_config
-    from ucfrec.runs.record import REFIT, RUN, read_record
-    from ucfrec.runs.refit import refit
-    from ucfrec.runs.screened import train_screened
-
-    if not leads():
-        warnings.simplefilter("ignore", InputNote)  # the leader prints them
-        wait()  # until the leader has begun the run
-    store = EpisodeStore.open(options.store)
-    if options.refit is not None:
-        settings = (options.config, options.set or None, options.screen, options.evidence)
-        if any(setting is not None for setting in settings):
-            raise InputError(
-                "--refit takes all settings of the run; omit --config, --set, --screen and "
-                "--evidence"
+        print(record.describe(read_metrics(self.out / "policy")))
+        if (self.out / REFIT / RUN).exists():
+            whole = read_record(self.out / REFIT)
+            print(f"refit         {whole.train_steps:,} rows, all of the store")
+        print(f"\nrun: {self.out} (TensorBoard can open it)\nmodel card: {self.out / CARD}")
+        if record.rule is None:
+            print(f"next: ucfrec evaluate {self.out} --env NAME, in a simulator of these actions")
+        else:
+            print(
+                f"next: ucfrec ope {self.out}, its value on the test split of the store\n"
+                f"      ucfrec recommend {self.out} LOGS --out FILE, the next items of every user"
             )
-        record = refit(store, options.refit, options.out)
-    else:
-        if options.evidence is not None:
-            options.set.append(f"rule.evidence={options.evidence}")
-        config = resolve_config(options.policy, options.config, options.set, options.seed)
-        record = train_screened(store, options.out, config, options.screen)
-    if options.no_refit:
-        shutil.rmtree(options.out / REFIT, ignore_errors=True)
-    elif options.refit is None:
-        _refit(store, options.out)
-    if not leads():
-        return
-    card = write_card(options.out)
-    print(record.describe(read_metrics(options.out / "policy")))
-    if (options.out / REFIT / RUN).exists():
-        whole = read_record(options.out / REFIT)
-        print(f"refit         {whole.train_steps:,} rows, all of the store")
-    print(f"\nrun: {options.out} (TensorBoard can open it)\nmodel card: {card}")
-    if record.rule is None:
-        print(f"next: ucfrec evaluate {options.out} --env NAME, in a simulator of these actions")
-    else:
+
+
+class Tune(Table):
+    """`ucfrec tune`."""
+
+    epilog = "Needs ucfrec[tune] (Optuna). The test split stays unseen."
+
+    store: Annotated[Path, ARGUMENT, "STORE"]
+    """Episode store to train on."""
+    out: Annotated[Path, "DIR"]
+    """Folder of the search; an unfinished search in it is resumed."""
+    policy: Annotated[Sequence[str], "NAME", Names(policy_names)] = ()
+    """Policy (default: ucf); repeatable to search the policy too; one of"""
+    trials: Annotated[int, "N"] = 30
+    """Trainings that the search has at the end."""
+    metric: Literal["value", "ndcg", "gauc"] = "value"
+    """What is maximised: the return of a session in the user model, or NDCG or GAUC on validation
+    rows"""
+    k: Annotated[int, POSITIVE] = 10
+    """Items recommended, of --metric ndcg."""
+    space: Annotated[Path | None, "TOML"] = None
+    """Settings to search, one table per section; each a list of choices or {low = …, high = …, log
+    = true} (default: learning rate, steps, width, dropout, context, exposure features and
+    augmentation of networks, neighbours of item-knn; with ndcg and gauc also the reward weight)"""
+    set: Annotated[Sequence[str], "TABLE.FIELD=VALUE"] = ()
+    """A setting that all trials have, e.g. train.steps=2000; repeatable (default: none)"""
+    workers: Annotated[int, "N"] = 1
+    """Trainings side by side, each in a process."""
+    no_pruning: bool = False
+    """Train every trial to its end; (default: end those whose validation loss is above the median
+    of earlier ones)"""
+    seed: int = 0
+    """Seed of the search and of every training."""
+
+    def execute(self) -> None:
+        """Print the best settings."""
+        from ucfrec.reporting.tables import text_table
+        from ucfrec.runs.config import settings_given
+        from ucfrec.tuning.space import Search, read_space
+        from ucfrec.tuning.study import (
+            BEST,
+            BEST_TOML,
+            PAGE,
+            Plan,
+            importances,
+            list_finished,
+            tune,
+        )
+
+        search = Search(
+            tuple(dict.fromkeys(self.policy or ["ucf"])),
+            settings_given(self.set),
+            self.metric == "value",
+            self.seed,
+            None if self.space is None else read_space(self.space),
+        )
+        plan = Plan(self.store, self.out, search, self.metric, self.k, not self.no_pruning)
+        study = tune(plan, self.trials, self.workers)
+        best, weights = study.best_trial, importances(study)
+        lines = [
+            (
+                name,
+                f"{value:.4g}" if isinstance(value, float) else value,
+                f"{weights.get(name, 0):.2f}",
+            )
+            for name, value in best.params.items()
+        ]
+        print(text_table(("setting", "best", "importance"), lines))
         print(
-            f"next: ucfrec ope {options.out}, its value on the test split of the store\n"
-            f"      ucfrec recommend {options.out} LOGS --out FILE, the next items of every user"
+            f"\n{self.metric} {study.best_value:.6g} in trial {best.number}, of "
+            f"{len(list_finished(study))} trials; selected on validation rows\n"
+            f"settings: {self.out / BEST_TOML}\nall trials: {self.out / PAGE}\n"
+            f"next: ucfrec ope {self.out / BEST}, its value on the test split, which no trial has "
+            "seen"
         )
 
 
-def _refit(store: "EpisodeStore", run: Path) -> None:
-    """Let the run go on learning from all rows; processes of `torchrun` do not."""
-    from ucfrec.fitting import distributed
-    from ucfrec.runs.refit import refit_within
+class Screen(Table):
+    """`ucfrec screen`."""
 
-    if distributed.processes() == 1:
-        refit_within(store, run)
-    elif distributed.leads():
-        warnings.warn(
-            "several processes do not learn from all rows; run the same command in one process, "
-            "which then only does that",
-            InputNote,
-            stacklevel=2,
-        )
+    store: Annotated[Path, ARGUMENT, INPUT_FOLDER, "STORE"]
+    """Episode store to screen."""
+    seed: int = 0
+    """Seed of the predictors."""
+    json: Annotated[Path | None, "FILE"] = None
+    """Write the report here (default: none)"""
+
+    def execute(self) -> None:
+        """Print which logged observation columns have no effect."""
+        from dataclasses import asdict
+
+        from ucfrec.episodes.store import EpisodeStore
+        from ucfrec.files.atomic import write_json
+        from ucfrec.provenance import provenance
+        from ucfrec.runs.screened import screen_store
+
+        report = screen_store(EpisodeStore.open(self.store), self.seed)
+        print(report.describe())
+        if self.json is not None:
+            write_json(self.json, asdict(report) | provenance())

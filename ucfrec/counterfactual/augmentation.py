@@ -1,37 +1,162 @@
-"""Counterfactual copies of the training episodes: reward model, generator, gates (Algorithm 1)."""
+"""Counterfactual copies of the training episodes: reward model, generator, gates (Algorithm 1).
 
-from collections.abc import Sequence
-from dataclasses import replace
+Rewards, actions, next states and returns-to-go of an edited copy are those of its source (paper
+appendix H); an action copy ends with another action and its counterfactual reward.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
+from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.counterfactual.action_augmentation import ActionGenerator, logged_actions
-from ucfrec.counterfactual.clusters import ActionSupport
-from ucfrec.counterfactual.generators import CSGConfig, make_generator, state_clusters
-from ucfrec.counterfactual.reward_model import CRMConfig, EffectsMean, EffectTransitions
-from ucfrec.counterfactual.reward_model_fit import Read, fit_crm, sample_steps, sample_transitions
-from ucfrec.counterfactual.state_augmentation import (
-    AugmentationReport,
-    AugmentConfig,
-    augment,
-    candidates,
+from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.counterfactual.generators import (
+    ActionSupport,
+    CSGConfig,
+    Generator,
+    StateClusters,
+    make_generator,
+    state_clusters,
+)
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    EffectsMean,
+    read_transitions,
+)
+from ucfrec.counterfactual.reward_model_fit import (
+    CRMReport,
+    fit_crm,
+    fit_warning,
+    sample_steps,
+    sample_transitions,
 )
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
+from ucfrec.files.record import Undefinable
 from ucfrec.processes import random_state_kept
+from ucfrec.settings import Count, Quantile, settings_table
+from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 
 CRM: Final = "crm"
 """Folder of the reward model."""
 MODELS: Final = ("item-reward", CRM, "csg")
-"""Folders of the checkpoints of `counterfactual_augmentation`; which of them there are depends on
-the settings."""
+"""Folders of the checkpoints of `augment_episodes`; which of them there are depends on the
+settings."""
 _CPU: Final = torch.device("cpu")
+_CHUNK, _ACTION_CHUNK = 8192, 4096
+_ACTION_STREAM = 1
+"""Keeps the draws of actions apart from others with the same seed."""
+_DELTA_LEVEL = "0.95"
+_ROUNDING = 1e-9
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_BINS = 20
+
+
+@settings_table("augment")
+class AugmentConfig:
+    """How many copies are made, with other states or other actions, and of which steps.
+
+    The paper's Algorithm 5 is `copies=K, edits_per_copy=1, reward_quantile=0`: each of K accepted
+    proposals makes a separate copy. The default is appendix H: few copies that contain every
+    accepted edit.
+    """
+
+    copies: Annotated[int, Field(ge=0, le=1000)] = 1
+    """Maximum number of augmented episodes of each episode, whose states differ; 0 for none."""
+    actions: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Number of other actions to propose at each step: a copy of the episode up to this step ends
+    with the other action and its counterfactual reward, where the reward model is accurate enough.
+    With neither actions nor copies, no reward model is fitted."""
+    edits_per_copy: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Maximum number of edited steps in a copy; 0 means no limit."""
+    reward_quantile: Quantile = 0.3
+    """Steps with a reward below this quantile are neither edited nor given other actions."""
+    epsilon_r: Annotated[float, Field(ge=0, le=1e15)] | None = None
+    """ε_r, tolerance of the reward gate in reward units; unset, 0.1 × standard deviation of the
+    rewards."""
+    max_steps: Count = 2_000_000
+    """Maximum number of steps to propose edits for; from a larger store, episodes are sampled."""
+
+    @property
+    def augments(self) -> bool:
+        """Whether there are copies of any kind."""
+        return self.copies > 0 or self.actions > 0
+
+
+@dataclass(frozen=True)
+class MoveReport:
+    """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
+
+    edits: int
+    """Number of accepted edits."""
+    length_quantiles: dict[str, float]
+    """Quantiles of ‖Δ‖₂ by level; empty without edits."""
+    histogram_edges: tuple[float, ...]
+    """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
+    histogram_counts: tuple[int, ...]
+    """Number of edits in each bin."""
+    mean_move_ratio: Undefinable
+    """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
+    effective_rank: float
+    """exp of the entropy of the spectrum of E[ΔΔᵀ]: effective number of directions of the moves."""
+    dimensions: int
+    """Number of state dimensions that vary in the training data; bounds the effective rank."""
+
+
+@dataclass(frozen=True)
+class ActionReport:
+    """Other actions that were proposed, and their counterfactual rewards."""
+
+    proposals: int
+    """Number of other actions proposed."""
+    reproduced: float
+    """Share of them at steps whose logged reward the reward model reproduces within ε_r."""
+    copies: int
+    """Number of action copies: those that, at such steps, change the reward by more than δ."""
+    mean_change: Undefinable
+    """Mean change of the reward in the copies, in reward units; 0 without copies."""
+    earns_more: Undefinable
+    """Share of the copies with a higher reward than the logged action; 0 without copies."""
+
+
+@dataclass(frozen=True)
+class AugmentationReport:
+    """Number and kind of the edits, and the bound of Proposition 1 on their effect."""
+
+    copies: int
+    """Number of augmented episodes."""
+    proposals: int
+    """Number of proposed edits."""
+    acceptance: float
+    """Share of proposals that passed both gates."""
+    moves: MoveReport
+    """Statistics of the accepted edits."""
+    epsilon_r: float
+    """Tolerance of the reward gate, in reward units."""
+    delta: float
+    """δ: the 95% quantile of |f̂_r(s, a, z) − r| on held-out steps, in reward units."""
+    bound: float
+    """δ + ε_r, in reward units: largest change of the true reward by an edit (Proposition 1)."""
+    verdict: str
+    """A sentence on whether the bound is informative."""
+    warnings: tuple[str, ...]
+    """Warnings of a reward model that predicts nothing, latent collapse, latent leak and edit
+    collapse."""
+    reward_model: CRMReport
+    """Quality of the reward model."""
+    actions: ActionReport | None = None
+    """Action copies; None if no other action was proposed."""
 
 
 def require_rewards_vary(train: EpisodeStore) -> None:
@@ -51,7 +176,7 @@ def require_rewards_vary(train: EpisodeStore) -> None:
 
 
 @random_state_kept()
-def counterfactual_augmentation(
+def augment_episodes(
     train: EpisodeStore,
     validation: EpisodeStore,
     crm_config: CRMConfig,
@@ -60,7 +185,7 @@ def counterfactual_augmentation(
     folder: Path,
     seed: int,
     device: torch.device = _CPU,
-) -> tuple[Overlay, AugmentationReport]:
+) -> tuple[AugmentedEpisodes, AugmentationReport]:
     """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1).
 
     Args:
@@ -73,14 +198,14 @@ def counterfactual_augmentation(
         InputError: all training rewards are equal, or there are no held-out steps.
     """
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
+    item_rewards: ItemRewardModel | None = None
     mean: EffectsMean | None = None
-    read: Read = EpisodeStore.transitions
     if crm_config.mean == "effects" and train.has_items:
-        model, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
-        mean, read = EffectsMean(model), EffectTransitions(model)
-    sampled = sample_steps(train, limit, seed)
-    training = read(train, *sampled)
-    held_out = sample_transitions(validation, limit // 10, seed, read)
+        item_rewards, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
+        mean = EffectsMean(item_rewards)
+    sampled_episodes, sampled_steps = sample_steps(train, limit, seed)
+    training = read_transitions(train, sampled_episodes, sampled_steps, item_rewards)
+    held_out = sample_transitions(validation, limit // 10, seed, item_rewards)
     crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
@@ -89,43 +214,395 @@ def counterfactual_augmentation(
     if config.actions or csg_config.kind == "tangent":
         clusters = state_clusters(training, crm, csg_config, seed)
     generator = make_generator(training, crm, csg_config, folder / "csg", seed, clusters)
-    overlay, report = augment(train, crm, crm_report, generator, config, seed, read)
+    episodes, report = edit_states(train, crm, crm_report, generator, config, seed, item_rewards)
     if clusters is None or not config.actions:
-        return overlay, report
+        return episodes, report
     states = crm.normalised_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
-    support = ActionSupport(labels, logged_actions(train, *sampled))
-    actions = ActionGenerator(train, crm, clusters, support, report.epsilon_r, report.delta, read)
-    places = candidates(train, config, np.random.default_rng(seed))
-    copies, actions_report = actions.propose(*places, config.actions, seed)
-    return overlay.joined(copies), replace(report, actions=actions_report)
+    support = ActionSupport(labels, logged_actions(train, sampled_episodes, sampled_steps))
+    actions = ActionGenerator(
+        train, crm, clusters, support, report.epsilon_r, report.delta, item_rewards
+    )
+    copied, steps = find_candidates(train, config, np.random.default_rng(seed))
+    copies, actions_report = actions.propose(copied, steps, config.actions, seed)
+    return episodes.join(copies), replace(report, actions=actions_report)
+
+
+def find_candidates(
+    view: EpisodeStore, config: AugmentConfig, rng: np.random.Generator
+) -> tuple[IntArray, IntArray]:
+    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes.
+
+    Args:
+        view: the training episodes.
+        rng: draws episodes if there are too many steps.
+    """
+    order = rng.permutation(view.n_episodes)
+    count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
+    sampled = np.sort(order[: max(1, int(count))])
+    lengths = view.lengths[sampled]
+    episodes, steps = np.repeat(sampled, lengths), _ranges(np.zeros_like(lengths), lengths)
+    rewards = view.step_values(schema.REWARD, episodes, steps)
+    high = rewards >= np.quantile(rewards, config.reward_quantile)
+    return episodes[high], steps[high]
+
+
+def _ranges(starts: IntArray, lengths: IntArray) -> IntArray:
+    """The concatenated ranges start, start + 1, …, start + length − 1."""
+    ends = np.cumsum(lengths)
+    return np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - ends + lengths, lengths)
+
+
+# Other states.
+
+
+def edit_states(
+    view: EpisodeStore,
+    crm: CausalRewardModel,
+    crm_report: CRMReport,
+    generator: Generator,
+    config: AugmentConfig,
+    seed: int,
+    item_rewards: ItemRewardModel | None = None,
+) -> tuple[AugmentedEpisodes, AugmentationReport]:
+    """Copy episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`).
+
+    Args:
+        view: the training episodes.
+        config: numbers of copies and edits, and the gate.
+        item_rewards: see `read_transitions`.
+    """
+    rng, random = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    # The gates are evaluated in float64 on the stored float32 values, so that a later check of the
+    # edits confirms every one.
+    exact, moves = copy.deepcopy(crm).double(), MoveStatistics(view.state_size)
+    epsilon_r = 0.1 * float(crm.reward_std) if config.epsilon_r is None else config.epsilon_r
+    rho_high = generator.band[1]
+
+    @torch.no_grad()
+    def edit(episodes: IntArray, steps: IntArray, number: int = 0) -> _Edits:
+        """Propose one edit at each of the given steps; returns the accepted ones, in order."""
+        accepted = np.zeros(len(steps), dtype=bool)
+        states = [np.zeros((0, view.state_size), np.float32)]
+        for start in range(0, len(steps), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            factual = read_transitions(view, episodes[rows], steps[rows], item_rewards)
+            factual = factual.to(crm.device)
+            s, a, r = factual.states, factual.actions, factual.rewards
+            proposed = generator.propose(s, a, crm.abduct(s, a, r), random)
+            s, a, r = s.double(), a.double(), r.double()
+            factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
+            gates = (epsilon_r * (1 - _ROUNDING), rho_high * (1 - _ROUNDING))
+            passed = accept(exact, factual, z, proposed.double(), *gates)
+            moves.add(exact.moves(s[passed], proposed[passed].double()).cpu())
+            accepted[rows] = passed.cpu().numpy()
+            states.append(proposed[passed].cpu().numpy())
+        moves.proposals += len(steps)
+        copies = np.full(int(accepted.sum()), number)
+        return _Edits(episodes[accepted], copies, steps[accepted], np.concatenate(states))
+
+    episodes, steps = find_candidates(view, config, rng)
+    if config.edits_per_copy:
+        rounds = list(_fill_copies(edit, episodes, steps, config, rng))
+    else:
+        rounds = [edit(episodes, steps, number) for number in range(config.copies)]
+    rounds.append(edit(episodes[:0], steps[:0]))
+    edits = _Edits(*(np.concatenate(column) for column in zip(*rounds, strict=True)))
+    copies = max(config.copies, 1)
+    copy_keys, edit_copy = np.unique(edits.episode * copies + edits.copy, return_inverse=True)
+    order = np.lexsort((edits.step, edit_copy))
+    augmented = AugmentedEpisodes(
+        copy_source=view.episode_ids[copy_keys // copies],
+        edit_copy=edit_copy[order],
+        edit_step=edits.step[order],
+        edit_state=edits.state[order],
+    )
+    report = moves.report(rho_high, int((crm.state_std > 0).sum()))
+    return augmented, _report(len(copy_keys), moves.proposals, report, epsilon_r, crm_report)
+
+
+class _Edits(NamedTuple):
+    """M accepted edits: position of the episode in the view, copy, step, state (M, S)."""
+
+    episode: IntArray
+    copy: IntArray
+    step: IntArray
+    state: Float32Array
+
+
+def accept(
+    crm: CausalRewardModel,
+    factual: Transitions,
+    z: Tensor,
+    proposals: Tensor,
+    epsilon_r: float,
+    rho_high: float,
+) -> Tensor:
+    """Which proposals pass both gates of Eq. 4 (Algorithm 4).
+
+    Args:
+        factual: M logged steps.
+        z: (M, latent_dim) disturbances abduced from them.
+        proposals: (M, S) counterfactual states.
+        epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
+        rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
+
+    Returns:
+        (M,) bool.
+    """
+    change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
+    length = crm.moves(factual.states, proposals).norm(dim=1)
+    passed: Tensor = (change <= epsilon_r) & (length <= rho_high)
+    return passed
+
+
+def _fill_copies(
+    edit: Callable[[IntArray, IntArray], _Edits],
+    episodes: IntArray,
+    steps: IntArray,
+    config: AugmentConfig,
+    rng: np.random.Generator,
+) -> Iterator[_Edits]:
+    """Propose at each episode's steps in random order until its copies are full (Algorithm 5).
+
+    In each round every episode proposes as many edits as its copies still need, so no edit is
+    proposed that the algorithm, which proceeds one step at a time, would not propose.
+    """
+    order = np.lexsort((rng.random(len(steps)), episodes))
+    unique_episodes, counts = np.unique(episodes, return_counts=True)
+    first = np.cumsum(counts) - counts
+    proposed, accepted = np.zeros_like(counts), np.zeros_like(counts)
+    while True:
+        needed = config.copies * config.edits_per_copy - accepted
+        new_proposals = np.minimum(needed, counts - proposed)
+        if not new_proposals.any():
+            return
+        rows = order[_ranges(first + proposed, new_proposals)]
+        edits = edit(episodes[rows], steps[rows])
+        index = np.searchsorted(unique_episodes, edits.episode)
+        new_edits = np.bincount(index, minlength=len(counts))
+        number = _ranges(accepted, new_edits)
+        yield edits._replace(copy=number // config.edits_per_copy)
+        proposed, accepted = proposed + new_proposals, accepted + new_edits
+
+
+class MoveStatistics:
+    """Counts proposals, and accumulates statistics of moves (M, S) without keeping the moves."""
+
+    def __init__(self, size: int) -> None:
+        self._total = torch.zeros(size, dtype=torch.float64)
+        self._moments = torch.zeros(size, size, dtype=torch.float64)
+        self._lengths = [torch.zeros(0, dtype=torch.float64)]
+        self.proposals = 0
+
+    def add(self, moves: Tensor) -> None:
+        """Add the moves Δ (M, S) of M accepted edits."""
+        moves = moves.double()
+        self._total += moves.sum(dim=0)
+        self._moments += moves.T @ moves
+        self._lengths.append(moves.norm(dim=1))
+
+    def report(self, rho_high: float, dimensions: int) -> MoveReport:
+        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0.
+
+        Args:
+            rho_high: upper end of the histogram of lengths.
+        """
+        lengths = torch.cat(self._lengths).numpy()
+        counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
+        levels = _QUANTILES if len(lengths) else ()
+        ratio, rank = math.nan, 0.0
+        if lengths.sum() > 0:
+            ratio = float(self._total.norm()) / lengths.sum()
+            spectrum = torch.linalg.eigvalsh(self._moments).clamp(min=0)
+            share = spectrum / spectrum.sum()
+            rank = float(torch.exp(-torch.special.xlogy(share, share).sum()))
+        return MoveReport(
+            edits=len(lengths),
+            length_quantiles={f"{q:g}": float(np.quantile(lengths, q)) for q in levels},
+            histogram_edges=tuple(edges.tolist()),
+            histogram_counts=tuple(counts.tolist()),
+            mean_move_ratio=ratio,
+            effective_rank=rank,
+            dimensions=dimensions,
+        )
+
+
+def _report(
+    copies: int, proposals: int, moves: MoveReport, epsilon_r: float, crm_report: CRMReport
+) -> AugmentationReport:
+    delta = crm_report.delta[_DELTA_LEVEL]
+    bound = delta + epsilon_r
+    deviations = bound / crm_report.reward_std
+    if proposals == 0:
+        verdict = "no state is edited"
+    elif moves.edits == 0:
+        verdict = (
+            "no edit was accepted: the reward model's median error on held-out steps is "
+            f"{crm_report.delta['0.5']:.3g}, or the generator changes the predicted reward"
+        )
+    elif deviations >= 1:
+        verdict = (
+            f"the bound means nothing: it allows a change of {bound:.3g}, {deviations:.1f} "
+            "standard deviations of the reward; the reward model is too inaccurate"
+        )
+    else:
+        verdict = (
+            f"an accepted edit changes the true reward by at most {bound:.3g} ({deviations:.2f} "
+            "standard deviations), provided that the reward model is as accurate at edited states "
+            "as on 95% of held-out steps"
+        )
+    warnings = [fit_warning(crm_report.r2_without_z), crm_report.warning]
+    if moves.edits and moves.mean_move_ratio > 0.5:
+        warnings.append(
+            f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "
+            f"to all states (effective rank {moves.effective_rank:.1f} of {moves.dimensions})"
+        )
+    return AugmentationReport(
+        copies=copies,
+        proposals=proposals,
+        acceptance=moves.edits / max(1, proposals),
+        moves=moves,
+        epsilon_r=epsilon_r,
+        delta=delta,
+        bound=bound,
+        verdict=verdict,
+        warnings=tuple(filter(None, warnings)),
+        reward_model=crm_report,
+    )
 
 
 def interventions(
     view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
-) -> Overlay:
+) -> AugmentedEpisodes:
     """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
 
     Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
     an intervention that stays put; copies 1, 3, … at every step.
-
-    Args:
-        view: a view without an overlay.
     """
     rng = np.random.default_rng(seed)
     episodes, steps = view.all_steps()
     states = view.windows(episodes, steps, 1).states[:, 0].numpy()
     edited = []
-    for copy in range(copies):
-        by_episode = rng.integers(len(steps), size=view.n_episodes)[episodes]
-        sources = by_episode if copy % 2 == 0 else rng.integers(len(steps), size=len(steps))
+    for copy_number in range(copies):
+        sources = rng.integers(len(steps), size=view.n_episodes)[episodes]
+        if copy_number % 2:
+            sources = rng.integers(len(steps), size=len(steps))
         changed = states.copy()
         changed[:, list(dimensions)] = states[sources][:, list(dimensions)]
         edited.append(changed)
     numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
-    return Overlay(
+    return AugmentedEpisodes(
         copy_source=np.tile(view.episode_ids, copies),
         edit_copy=numbers.reshape(-1),
         edit_step=np.tile(steps, copies),
         edit_state=np.concatenate(edited),
     )
+
+
+# Other actions.
+
+
+@dataclass(frozen=True)
+class ActionGenerator:
+    """Proposes other actions at logged steps, with their counterfactual rewards.
+
+    For a logged step (s, a, r), the disturbance z is abduced and kept; another action a' is the
+    action of a random training step whose state lies in the same cluster as s; and its reward is
+    r' = f̂_r(s, a', z), within the range of the logged rewards. The model must reproduce the logged
+    reward, |f̂_r(s, a, z) − r| ≤ ε_r, and r' must differ from r by more than δ, the model's error on
+    held-out steps.
+    """
+
+    view: EpisodeStore
+    crm: CausalRewardModel
+    clusters: StateClusters
+    support: ActionSupport
+    epsilon_r: float
+    delta: float
+    item_rewards: ItemRewardModel | None = None
+    """See `read_transitions`."""
+
+    def propose(
+        self, episodes: IntArray, steps: IntArray, count: int, seed: int
+    ) -> tuple[AugmentedEpisodes, ActionReport]:
+        """Propose `count` other actions at each of the given steps, and copy what passes.
+
+        Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
+
+        Args:
+            episodes: (M,) positions in the view; `steps` are steps of them.
+        """
+        # In float64, so that a later check confirms what passes.
+        exact = copy.deepcopy(self.crm).double()
+        rng = np.random.default_rng([seed, _ACTION_STREAM])
+        chunks = []
+        for start in range(0, max(1, len(steps)), _ACTION_CHUNK):
+            part = slice(start, start + _ACTION_CHUNK)
+            chunks.append(self._predict(exact, episodes[part], steps[part], count, rng))
+        proposed = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+        logged_rewards = self.view.column(schema.REWARD)
+        low, high = logged_rewards.min(), logged_rewards.max()
+        reward = proposed["reward"].clip(low, high).astype(np.float32)
+        change = reward - proposed["logged"]
+        accepted = proposed["reproduced"] & (np.abs(change) > self.delta)
+        report = ActionReport(
+            proposals=len(accepted),
+            reproduced=float(proposed["reproduced"].mean()) if len(accepted) else 0.0,
+            copies=int(accepted.sum()),
+            mean_change=float(change[accepted].mean()) if accepted.any() else 0.0,
+            earns_more=float((change[accepted] > 0).mean()) if accepted.any() else 0.0,
+        )
+        none = np.zeros(0, dtype=np.int64)
+        copies = AugmentedEpisodes(
+            *(none, none, none, np.zeros((0, self.view.state_size), dtype=np.float32)),
+            action_source=self.view.episode_ids[proposed["episode"][accepted]],
+            action_step=proposed["step"][accepted],
+            action=proposed["action"][accepted],
+            action_reward=reward[accepted],
+        )
+        return copies, report
+
+    @torch.no_grad()
+    def _predict(
+        self,
+        exact: CausalRewardModel,
+        episodes: IntArray,
+        steps: IntArray,
+        count: int,
+        rng: np.random.Generator,
+    ) -> dict[str, Any]:
+        """Draw other actions at each of the given steps, and predict their rewards.
+
+        Of each of N actions: `episode`, `step`, `action`, its `reward`, the `logged` reward, and
+        whether the reward model has `reproduced` that.
+        """
+        factual = read_transitions(self.view, episodes, steps, self.item_rewards)
+        factual = factual.to(self.crm.device)
+        s, a, r = (values.double() for values in (factual.states, factual.actions, factual.rewards))
+        z = exact.abduct(s, a, r)
+        reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
+        rows = np.repeat(np.arange(len(steps)), count)
+        states = self.crm.normalised_states(factual.states).cpu()
+        labels = self.clusters.nearest(states).numpy()
+        actions, drawable = self.support.draw(labels[rows], rng)
+        logged = logged_actions(self.view, episodes[rows], steps[rows])
+        differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
+        rows, actions = rows[differs], actions[differs]
+        other = read_transitions(self.view, episodes[rows], steps[rows], self.item_rewards, actions)
+        at = torch.from_numpy(rows).to(s.device)
+        return {
+            "episode": episodes[rows],
+            "step": steps[rows],
+            "action": actions,
+            "reward": exact.predict(s[at], other.actions.to(s), z[at]).cpu().numpy(),
+            "logged": r.cpu().numpy()[rows],
+            "reproduced": reproduced[rows],
+        }
+
+
+def logged_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
+    """The logged actions of M steps, (M,) int64 items or (M, A) float32 vectors."""
+    if view.has_items:
+        return view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
+    return view.step_values(schema.ACTION, episodes, steps)

@@ -1,6 +1,7 @@
-"""Counterfactual state generators: they propose other states with the same predicted reward."""
+"""Clusters of states, and generators: they propose other states with the same predicted reward."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
@@ -9,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.counterfactual.clusters import StateClusters
+from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.counterfactual.reward_model import CausalRewardModel, mlp
 from ucfrec.episodes.windows import Transitions
 from ucfrec.fitting.loop import LoopConfig, fit
@@ -70,26 +71,80 @@ class CSGConfig:
         )
 
 
+@dataclass(frozen=True)
+class StateClusters:
+    """C clusters of normalised states, found by k-means."""
+
+    centres: Tensor
+    """(C, S)."""
+    covariances: Tensor
+    """(C, S, S) covariance of the states of each cluster."""
+
+    @classmethod
+    def of(cls, states: Tensor, most: int, seed: int) -> "StateClusters":
+        """At most `most` clusters of normalised states (M, S), on the CPU; of few, fewer."""
+        # Imported here because it takes a second and 100 MB, and loading a policy does not need it.
+        from sklearn.cluster import MiniBatchKMeans
+
+        size = states.shape[1]
+        clusters = max(1, min(most, len(states) // (8 * size)))
+        fitted = MiniBatchKMeans(clusters, random_state=seed, n_init=1, batch_size=4096)
+        labels = torch.from_numpy(fitted.fit_predict(states.numpy()).astype(np.int64))
+        centres = torch.from_numpy(fitted.cluster_centers_).float()
+        whole = torch.cov(states.T, correction=0).reshape(size, size)
+        covariances = torch.empty(clusters, size, size)
+        for cluster in range(clusters):
+            deviations = states[labels == cluster] - centres[cluster]
+            squares, rows = deviations.T @ deviations, len(deviations)
+            # Shrunk towards the covariance of all states, because a cluster may have few.
+            covariances[cluster] = (squares + size * whole) / (rows + size)
+        return cls(centres, covariances)
+
+    def to(self, device: torch.device) -> "StateClusters":
+        """The clusters on `device`."""
+        return StateClusters(self.centres.to(device), self.covariances.to(device))
+
+    def nearest(self, states: Tensor) -> Tensor:
+        """(B,) cluster whose centre is nearest to each of the normalised states (B, S)."""
+        return torch.cdist(states, self.centres).argmin(dim=1)
+
+
+class ActionSupport:
+    """The actions that the log took in each cluster of states: what else could have been done."""
+
+    def __init__(self, labels: IntArray, actions: Array) -> None:
+        """Of M logged steps: clusters (M,) of their states, and items (M,) or vectors (M, A)."""
+        order = np.argsort(labels, kind="stable")
+        self._actions = actions[order]
+        self._counts = np.bincount(labels)
+        self._starts = np.cumsum(self._counts) - self._counts
+
+    def draw(self, labels: IntArray, generator: np.random.Generator) -> tuple[Array, BoolArray]:
+        """The action of a random logged step of each of B clusters, (B,) or (B, A); and (B,)
+        whether the cluster has a logged step at all, without which the action means nothing."""
+        drawable = labels < len(self._counts)
+        clusters = np.where(drawable, labels, 0)
+        counts = np.where(drawable, self._counts[clusters], 0)
+        numbers = (generator.random(len(labels)) * counts).astype(np.int64)
+        places = np.minimum(self._starts[clusters] + numbers, len(self._actions) - 1)
+        return self._actions[places], counts > 0
+
+
 class Generator(Protocol):
     """Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
 
     @property
     def band(self) -> tuple[float, float]:
-        """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
+        """(ρ_low, ρ_high), see `CSGConfig`."""
 
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Propose a state s_c for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
+        """A state s_c (M, S) for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
 
         Args:
-            states: (M, S) states s, as logged.
-            actions: (M, A) actions a.
-            z: (M, latent_dim) abduced disturbances.
+            states: (M, S) states s, with actions (M, A) and abduced disturbances (M, latent_dim).
             generator: source of all random numbers, on the CPU.
-
-        Returns:
-            (M, S) counterfactual states s_c, in the units of `states`.
         """
 
 
@@ -104,16 +159,10 @@ class TangentGenerator:
     """
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
-        """
-        Args:
-            clusters: of the states that edits are proposed for.
-        """
-        self._crm = crm
+        self._crm, self._config, self.band = crm, config, config.band
         self._clusters = clusters.to(crm.device)
         values, vectors = torch.linalg.eigh(clusters.covariances)
         self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
-        self._config = config
-        self.band = config.band
 
     @torch.no_grad()
     def propose(
@@ -190,14 +239,10 @@ class CounterfactualStateGenerator(nn.Module):
 
 
 class NoiseGenerator:
-    """A control: moves in random directions, with the lengths of `TangentGenerator`.
-
-    Comparing both shows the effect of preserving the predicted reward.
-    """
+    """A control: moves in random directions, with the lengths of `TangentGenerator`."""
 
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
-        self._std = crm.state_std
-        self.band = config.band
+        self._std, self.band = crm.state_std, config.band
 
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
@@ -240,10 +285,7 @@ def make_generator(
     if config.kind == "tangent":
         clusters = clusters or state_clusters(train, crm, config, seed)
         return TangentGenerator(crm, clusters, config)
-    chosen = _high_rewards(train, config, seed)
-    fields = (train.states, train.actions, train.rewards)
-    s, a, r = (values[chosen].to(crm.device) for values in fields)
-    return _faithful(s, a, r, crm, config, folder, seed)
+    return _fit_faithful(train, crm, config, folder, seed)
 
 
 def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
@@ -254,15 +296,13 @@ def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
     return torch.from_numpy(shuffled[: config.max_transitions])
 
 
-def _faithful(
-    states: Tensor,
-    actions: Tensor,
-    rewards: Tensor,
-    crm: CausalRewardModel,
-    config: CSGConfig,
-    folder: Path,
-    seed: int,
+def _fit_faithful(
+    train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> CounterfactualStateGenerator:
+    rows = _high_rewards(train, config, seed)
+    states, actions, rewards = (
+        values[rows].to(crm.device) for values in (train.states, train.actions, train.rewards)
+    )
     torch.manual_seed(seed)
     csg = CounterfactualStateGenerator(crm, config).to(crm.device)
     low, high = config.band

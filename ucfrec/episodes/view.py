@@ -1,8 +1,9 @@
-"""Views of a store: the episodes of a view, and access to their columns."""
+"""Columns of a store, memory-mapped or in memory, and views of its episodes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -10,44 +11,354 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.columns import Columns
-from ucfrec.episodes.record import StoreRecord
+from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.record import Source, StoreRecord
+from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Overlay, Transitions, Windows
-from ucfrec.errors import InputError
+from ucfrec.episodes.windows import Transitions, Windows
+from ucfrec.errors import InputError, one_line
 
-_OF_ACTIONS = (schema.ITEM, schema.ACTION, schema.REWARD, schema.RETURN_TO_GO)
-"""Step columns in which an action copy differs from its source."""
+_DTYPES: Final = {
+    schema.OFFSETS: "<i8",
+    schema.RETURN_TO_GO: "<f4",
+    **schema.STEP_DTYPES,
+    **schema.EPISODE_DTYPES,
+}
+_IN_MEMORY = Path("<memory>")
 _BATCH_STEPS = 2**20
 _LONG_ENOUGH = 1000
 """Mean number of steps from which consecutive steps are read as slices."""
 
 
-class EpisodeView:
-    """Some episodes of a store: E logged episodes, then C augmented episodes, then N action copies.
+class StepColumn:
+    """A step column, indexed across its shards."""
 
-    Wherever a method takes `episodes`, these are positions in the view, 0 to E + C + N − 1. An
-    action copy ends with the step that has another action; only this step of it counts and is
-    drawn, because the steps before it are those of its source.
+    def __init__(self, parts: list[Array], dimensions: IntArray | None = None) -> None:
+        """
+        Args:
+            parts: one a shard, (M,) or (M, size).
+            dimensions: that values have, of the size; None for all.
+        """
+        self.parts, self._dimensions = parts, dimensions
+        self._bounds = np.cumsum([0] + [len(part) for part in parts])
+
+    def __len__(self) -> int:
+        return int(self._bounds[-1])
+
+    def select_dimensions(self, dimensions: IntArray) -> "StepColumn":
+        """The same column with some dimensions of those that it has, (K,) indices."""
+        chosen = dimensions if self._dimensions is None else self._dimensions[dimensions]
+        return StepColumn(self.parts, chosen)
+
+    def take(self, index: IntArray) -> Array:
+        """A copy of the values at the indices `index`, of any shape."""
+        if len(self.parts) == 1:
+            values = np.asarray(self.parts[0][index])
+        else:
+            shard = np.searchsorted(self._bounds[1:-1], index, side="right")
+            first = self.parts[0]
+            values = np.empty((*index.shape, *first.shape[1:]), dtype=first.dtype)
+            for i, part in enumerate(self.parts):
+                in_shard = shard == i
+                values[in_shard] = part[index[in_shard] - self._bounds[i]]
+        return values if self._dimensions is None else values[..., self._dimensions]
+
+    def between(self, begin: int, end: int) -> Array:
+        """The values from index `begin` to before `end`; of one shard, without a copy."""
+        first = int(np.searchsorted(self._bounds, begin, side="right")) - 1
+        last = int(np.searchsorted(self._bounds, end, side="left"))
+        parts = [
+            np.asarray(part[max(begin - low, 0) : end - low])
+            for part, low in zip(self.parts[first:last], self._bounds[first:last], strict=True)
+        ]
+        values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return values if self._dimensions is None else values[..., self._dimensions]
+
+
+class Columns:
+    """The columns of all E episodes of a store, with N steps in total.
+
+    Episodes are numbered 0 to E − 1 in the order of the store, independently of any view.
     """
 
     def __init__(
-        self, columns: Columns, episode_ids: IntArray | None = None, overlay: Overlay | None = None
+        self,
+        path: Path,
+        record: StoreRecord,
+        arrays: Mapping[str, Array] | None = None,
+        item_states: ItemStates | None = None,
+        return_to_go: ReturnToGo | None = None,
     ) -> None:
+        """
+        Args:
+            arrays: columns in memory, by name, used instead of the files of the folder.
+            item_states: used instead of the file of the folder.
+            return_to_go: what the returns-to-go count; None for the rest of the session.
+        """
+        self.return_to_go = return_to_go or ReturnToGo()
+        self.path, self.record, self._sealed = path, record, record.checksums(path)
+        self._arrays, self._given_states = dict(arrays or {}), item_states
+        self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
+        self._steps: dict[str, StepColumn] = {}
+        self.skipped: IntArray | None = None
+        """(E,) number of steps at the beginning of each episode that are known but do not count;
+        None for none."""
+
+    @classmethod
+    def open(cls, path: Path) -> "Columns":
+        """Open a store folder; only `meta.json` is read, columns are mapped on first use.
+
+        Raises:
+            InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
+        """
+        columns = cls(path, StoreRecord.read(path))
+        columns._sealed.require_sizes()
+        return columns
+
+    @classmethod
+    def from_arrays(
+        cls,
+        steps: Mapping[str, Array],
+        lengths: IntArray,
+        episodes: Mapping[str, Array],
+        item_states: ItemStates | None,
+    ) -> "Columns":
+        """See `EpisodeStore.from_arrays`; `episodes` must include `split`.
+
+        Raises:
+            InputError: columns differ in length.
+        """
+        offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+        dtypes = schema.STEP_DTYPES | schema.EPISODE_DTYPES
+        arrays = {
+            name: np.asarray(values, dtypes[name]) for name, values in {**steps, **episodes}.items()
+        }
+        for name, values in arrays.items():
+            what, expected = (
+                ("step", int(offsets[-1])) if name in steps else ("episode", len(lengths))
+            )
+            if len(values) != expected:
+                raise InputError(
+                    f"column {name!r} has {len(values)} values instead of {expected}; give one per "
+                    f"{what}"
+                )
+        record = StoreRecord(
+            files={},
+            version=schema.STORE_VERSION,
+            n_steps=int(offsets[-1]),
+            n_episodes=len(lengths),
+            n_shards=0,
+            columns={name: list(arrays[name].shape[1:]) for name in steps},
+            fingerprint="",
+            reward=schema.REWARD,
+            source=Source(),
+        )
+        arrays[schema.OFFSETS] = offsets
+        arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
+        return cls(_IN_MEMORY, record, arrays, item_states)
+
+    def replace(
+        self, name: str, column: StepColumn, size: tuple[int, ...], return_to_go: ReturnToGo | None
+    ) -> "Columns":
+        """A copy with another step column of the given size; files stay as they are.
+
+        Args:
+            return_to_go: what the returns-to-go count; None for what they counted before.
+        """
+        sizes = dict(self.record.columns)
+        if name in sizes:
+            sizes[name] = list(size)
+        record, definition = self.record.copy_with(columns=sizes), return_to_go or self.return_to_go
+        copy = Columns(self.path, record, self._arrays, self._given_states, definition)
+        copy._steps = {**self._steps, name: column}
+        return copy
+
+    @cached_property
+    def starts(self) -> IntArray:
+        """(E,) index of each episode's first step among the N steps of the store."""
+        return np.cumsum(self.lengths) - self.lengths
+
+    @cached_property
+    def lengths(self) -> IntArray:
+        """(E,) number of steps of each episode."""
+        lengths = []
+        for offsets in self._parts(schema.OFFSETS):
+            if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
+                raise self._damaged(schema.OFFSETS, "do not ascend from 0")
+            lengths.append(np.diff(offsets))
+        joined = np.concatenate(lengths)
+        counted, expected = joined.sum(), (self.record.n_episodes, self.record.n_steps)
+        if (len(joined), counted) != expected:
+            raise self._damaged(
+                schema.OFFSETS,
+                f"have {len(joined)} episodes of {counted} steps, not {expected[0]} of "
+                f"{expected[1]}",
+            )
+        return joined
+
+    @cached_property
+    def has_items(self) -> bool:
+        """Whether actions are items of a catalogue; otherwise they are vectors."""
+        return schema.ITEM in self.record.columns
+
+    @cached_property
+    def observation_size(self) -> int:
+        """O, size of the logged observation; 0 if none was logged."""
+        return int((self.record.columns.get(schema.OBSERVATION) or [0])[0])
+
+    @cached_property
+    def item_states(self) -> ItemStates:
+        """Builds states from items; for stores of items only.
+
+        Raises:
+            InputError: the file of item states is missing or damaged.
+        """
+        if self._given_states is not None:
+            return self._given_states
+        self._sealed.require(ITEM_STATES)
+        return ItemStates.load(self.path / ITEM_STATES)
+
+    @property
+    def has_item_states(self) -> bool:
+        """Whether the store has `item_states`, in memory or as a file."""
+        return self._given_states is not None or (self.path / ITEM_STATES).is_file()
+
+    @cached_property
+    def user_rows(self) -> IntArray:
+        """(E,) row of each episode's user in the user features; −1 for an unknown user."""
+        if self.item_states.user_features.shape[1] == 0:
+            return np.full(self.record.n_episodes, -1)
+        return self.episode_column(schema.USER)
+
+    def has_episode_column(self, name: str) -> bool:
+        """Whether the store has the episode column `name`."""
+        files = [shard / f"{name}.npy" for shard in self._shards]
+        return name in self._arrays or (bool(files) and all(file.is_file() for file in files))
+
+    def episode_column(self, name: str) -> Array:
+        """The whole episode column `name`, (E,).
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        parts = self._parts(name)
+        if not parts:
+            raise InputError(f"{self.path} has no column {name!r}; write the store with it")
+        values = np.concatenate(parts)
+        if len(values) != self.record.n_episodes:
+            raise self._damaged(name, f"has {len(values)} of {self.record.n_episodes} episodes")
+        if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
+            raise self._damaged(name, "has numbers that are not a split")
+        return values
+
+    def step_column(self, name: str) -> StepColumn:
+        """The step column `name`.
+
+        Raises:
+            InputError: the store has no such column, or its files are damaged.
+        """
+        if name not in self._steps:
+            if name not in (*self.record.columns, schema.RETURN_TO_GO):
+                raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
+            column = StepColumn(self._parts(name, mmap=True))
+            if len(column) != self.record.n_steps:
+                raise self._damaged(name, f"has {len(column)} of {self.record.n_steps} steps")
+            if name == schema.ITEM and name not in self._arrays and self.has_item_states:
+                low = min(part.min() for part in column.parts)
+                high = max(part.max() for part in column.parts)
+                items = len(self.item_states.embeddings)
+                if not -1 <= low <= high < items:
+                    fault = f"has items from {low} to {high}, there are {items}"
+                    raise self._damaged(name, fault)
+            self._steps[name] = column
+        return self._steps[name]
+
+    def _parts(self, name: str, mmap: bool = False) -> list[Array]:
+        """A column as one array per shard; a column in memory is a single array.
+
+        Raises:
+            InputError: a file is missing or damaged, or holds something else.
+        """
+        if name in self._arrays:
+            return [self._arrays[name]]
+        shape, parts = tuple(self.record.columns.get(name, ())), []
+        for shard in self._shards:
+            path = shard / f"{name}.npy"
+            self._sealed.require(f"{shard.name}/{name}.npy")
+            try:
+                # Mapping compares the header with the size of the file before it takes memory.
+                values: Array = np.load(path, mmap_mode="r")
+            except Exception as error:  # numpy parses headers as Python and raises what that raises
+                message = one_line(str(error)) or type(error).__name__
+                raise InputError(
+                    f"{path} is missing or damaged ({message}); {StoreRecord.REMEDY}"
+                ) from None
+            if values.dtype != _DTYPES[name] or values.shape[1:] != shape or values.ndim == 0:
+                raise InputError(
+                    f"{path} is damaged: it holds {values.dtype} in the shape {values.shape}; "
+                    f"{StoreRecord.REMEDY}"
+                )
+            parts.append(values if mmap else np.array(values))
+        return parts
+
+    def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
+        """The logged states before the given steps.
+
+        Args:
+            episodes: (B,) numbers in the store.
+            steps: (B, K) steps of those episodes, consecutive in each row; may be below 0.
+
+        Returns:
+            (B, K, S) float32; undefined at steps below 0.
+        """
+        index = self.starts[episodes][:, None] + np.maximum(steps, 0)
+        observations = torch.zeros(*steps.shape, 0)
+        if self.observation_size:
+            observations = torch.from_numpy(self.step_column(schema.OBSERVATION).take(index))
+        if not self.has_items:
+            return observations
+        window = self.item_states.window
+        # The histories of the K steps overlap: gather their K + window − 1 steps once.
+        width = steps.shape[1] + window - 1
+        history = steps[:, -1:] - np.arange(width, 0, -1)  # (B, width), the last is step end − 1
+        history_index = np.maximum(index[:, -1:] - steps[:, -1:] + history, 0)
+        valid = history >= 0
+        items, rewards = (
+            self.step_column(name).take(history_index) for name in (schema.ITEM, schema.REWARD)
+        )
+        return self.item_states.build(
+            torch.from_numpy(np.where(valid, items, -1).astype(np.int64)),
+            torch.from_numpy(np.where(valid, rewards, 0).astype(np.float32)),
+            torch.from_numpy(np.maximum(steps, 0)),
+            torch.from_numpy(self.user_rows[episodes]),
+            observations,
+        )
+
+    def _damaged(self, name: str, fault: str) -> InputError:
+        return InputError(f"{self.path} is damaged: column {name!r} {fault}; {StoreRecord.REMEDY}")
+
+
+class EpisodeView:
+    """E episodes of a store. Wherever a method takes `episodes`, these are positions in the view,
+    0 to E − 1."""
+
+    def __init__(self, columns: Columns, episode_ids: IntArray | None = None) -> None:
         """
         Args:
             episode_ids: (E,) numbers in the store of the view's episodes; None for all.
         """
         self._columns, self._selected = columns, episode_ids
-        self.overlay = overlay
-        """Edited copies of episodes and action copies, or None."""
+        self.path, self.record = columns.path, columns.record
+        """The store folder, and the content of its `meta.json`."""
+        self.return_to_go = columns.return_to_go
+        """What the returns-to-go count."""
+        self.has_items = columns.has_items
+        """Whether actions are items of a catalogue; otherwise they are vectors."""
+        self.observation_size = columns.observation_size
+        """O, size of the logged observation; 0 if none was logged."""
 
     def __repr__(self) -> str:
-        facts = [f"{self.n_steps:,} steps", f"{len(self.episode_ids):,} episodes"]
-        if self.overlay is not None:
-            facts[1] += f" and {len(self.overlay.copy_source):,} augmented episodes"
-            if len(self.overlay.action_source):
-                facts[1] += f" and {len(self.overlay.action_source):,} action copies"
+        facts = [f"{self.n_steps:,} steps", f"{len(self):,} episodes"]
         if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
         facts.append(f"reward={self.record.reward}")
@@ -61,71 +372,43 @@ class EpisodeView:
     def __len__(self) -> int:
         return self.n_episodes
 
-    @property
-    def path(self) -> Path:
-        """The store folder."""
-        return self._columns.path
-
-    @property
-    def record(self) -> StoreRecord:
-        """The content of `meta.json`."""
-        return self._columns.record
-
     @cached_property
     def episode_ids(self) -> IntArray:
-        """(E,) numbers in the store of the logged episodes of the view; excludes copies."""
+        """(E,) numbers in the store of the episodes of the view."""
         return np.arange(self.record.n_episodes) if self._selected is None else self._selected
 
     @cached_property
-    def _sources(self) -> IntArray:
-        """(E + C + N,) number in the store of every episode; a copy has its source's."""
-        if self.overlay is None:
-            return self.episode_ids
-        copies = (self.overlay.copy_source, self.overlay.action_source)
-        return np.concatenate([self.episode_ids, *copies])
-
-    @cached_property
-    def _first_action_copy(self) -> int:
-        return self.n_episodes - (0 if self.overlay is None else len(self.overlay.action_source))
-
-    @cached_property
     def lengths(self) -> IntArray:
-        """(E + C + N,) number of steps of each episode."""
-        lengths = self._columns.lengths[self._sources]
-        if self.overlay is not None:
-            lengths[self._first_action_copy :] = self.overlay.action_step + 1
-        return lengths
+        """(E,) number of steps of each episode."""
+        return self._columns.lengths[self.episode_ids]
 
-    @property
+    @cached_property
     def n_episodes(self) -> int:
-        """E + C + N, the number of episodes of the view, including copies."""
-        return len(self._sources)
+        """E, the number of episodes of the view."""
+        return len(self.episode_ids)
 
     @cached_property
     def n_steps(self) -> int:
-        """Number of steps of the view, including those of copies; 1 of each action copy."""
+        """Number of steps of the view."""
         return int(self._counts.sum())
 
     @cached_property
     def _counts(self) -> IntArray:
-        """(E + C + N,) number of steps of each episode that count, which are its last."""
-        counts = self.lengths.copy()
-        if self._columns.skipped is not None:
-            counts -= self._columns.skipped[self._sources]
-        counts[self._first_action_copy :] = 1
-        return counts
+        """(E,) number of steps of each episode that count, which are its last."""
+        if self._columns.skipped is None:
+            return self.lengths
+        return self.lengths - self._columns.skipped[self.episode_ids]
 
     @cached_property
-    def has_items(self) -> bool:
-        """Whether actions are items of a catalogue; otherwise they are vectors."""
-        return self._columns.has_items
+    def _ends(self) -> IntArray:
+        return np.cumsum(self._counts)
 
     @property
     def has_users(self) -> bool:
         """Whether the store names the user of every episode."""
         return self.has_episode_values(schema.USER)
 
-    @property
+    @cached_property
     def item_states(self) -> ItemStates:
         """Builds states from items; for stores of items only.
 
@@ -133,11 +416,6 @@ class EpisodeView:
             InputError: the file of item states is missing or damaged.
         """
         return self._columns.item_states
-
-    @cached_property
-    def observation_size(self) -> int:
-        """O, size of the logged observation; 0 if none was logged."""
-        return self._columns.observation_size
 
     @property
     def state_size(self) -> int:
@@ -149,33 +427,28 @@ class EpisodeView:
         return self._columns.has_episode_column(name)
 
     def episode_values(self, name: str) -> Array:
-        """An episode column, (E + C + N,); a copy has the value of its source.
+        """An episode column, (E,).
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._columns.episode_column(name)[self._sources]
+        return self._columns.episode_column(name)[self.episode_ids]
 
     @property
     def terminated(self) -> BoolArray:
-        """(E + C + N,) whether each session is known to have ended with its last step."""
-        ended = np.ones(self.n_episodes, dtype=bool)
-        if self._columns.has_episode_column(schema.TERMINATED):
-            ended = self.episode_values(schema.TERMINATED).astype(bool)
-        ended[self._first_action_copy :] = False
-        return ended
+        """(E,) whether each session is known to have ended with its last step."""
+        if not self.has_episode_values(schema.TERMINATED):
+            return np.ones(self.n_episodes, dtype=bool)
+        return self.episode_values(schema.TERMINATED).astype(bool)
 
     @cached_property
     def returns(self) -> Float32Array:
-        """(E + C + N,) undiscounted return of each episode, in reward units."""
+        """(E,) undiscounted return of each episode, in reward units."""
         episodes = np.arange(self.n_episodes)
         return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
 
     def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
-        """Values of a step column at the given steps; edits of states do not apply.
-
-        In the last step of an action copy, action and reward are its own, and its returns-to-go
-        count this reward. All else is the source's.
+        """Values of a step column at the given steps.
 
         Args:
             episodes: positions in the view, of any shape.
@@ -187,47 +460,8 @@ class EpisodeView:
         Raises:
             InputError: the store has no such column, or its files are damaged.
         """
-        return self._step_values(episodes, steps, name)[0]
-
-    def _step_values(self, episodes: IntArray, steps: IntArray, *names: str) -> list[Array]:
-        """`step_values` of several columns."""
-        index = self._columns.starts[self._sources[episodes]] + steps
-        columns = self._columns.step_values(index, *names)
-        if self._first_action_copy < self.n_episodes:
-            copies = np.broadcast_arrays(episodes - self._first_action_copy, steps)
-            for name, values in zip(names, columns, strict=True):
-                if name in _OF_ACTIONS:
-                    self._change_actions(name, values, *copies)
-        return columns
-
-    def _change_actions(self, name: str, values: Array, copies: IntArray, steps: IntArray) -> None:
-        """Let `values` of a column in `_OF_ACTIONS` be those of action copies, where `copies` are.
-
-        Args:
-            values: at the steps of the sources, changed in place.
-            copies: numbers of action copies; below 0 for other episodes.
-            steps: steps of them, of the same shape.
-        """
-        assert self.overlay is not None
-        in_copies = np.asarray(copies >= 0)
-        ahead = self.overlay.action_step[copies[in_copies]] - steps[in_copies]
-        if name == schema.RETURN_TO_GO:
-            counted = self._columns.return_to_go.weights(ahead)
-            values[in_copies] += counted * self._reward_changes[copies[in_copies]]
-            return
-        values_of_copies = (
-            self.overlay.action_reward if name == schema.REWARD else self.overlay.action
-        )
-        in_copies[in_copies] = ahead == 0
-        values[in_copies] = values_of_copies[copies[in_copies]]
-
-    @cached_property
-    def _reward_changes(self) -> Float64Array:
-        """(N,) reward of each action copy less that of its source, in reward units."""
-        assert self.overlay is not None
-        index = self._columns.starts[self.overlay.action_source] + self.overlay.action_step
-        (logged,) = self._columns.step_values(index, schema.REWARD)
-        return self.overlay.action_reward.astype(np.float64) - logged
+        index = self._columns.starts[self.episode_ids[episodes]] + steps
+        return self._columns.step_column(name).take(index)
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of the session before each step, in reward units.
@@ -236,7 +470,7 @@ class EpisodeView:
             episodes: (B,) positions in the view.
             steps: (B,) steps of those episodes, from 0.
         """
-        owner, earlier_steps = self._earlier(steps)
+        owner, earlier_steps = _list_earlier(steps)
         rewards = self.step_values(schema.REWARD, episodes[owner], earlier_steps)
         return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
 
@@ -247,18 +481,11 @@ class EpisodeView:
             episodes: (B,) positions in the view.
             steps: (B,) steps of those episodes, from 0; `rows` are indices into the B.
         """
-        owner, earlier_steps = self._earlier(steps)
+        owner, earlier_steps = _list_earlier(steps)
         return owner, self.step_values(schema.ITEM, episodes[owner], earlier_steps).astype(np.int64)
 
-    @staticmethod
-    def _earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
-        """Row and number of every step before the given ones (B,), row by row."""
-        owner = np.repeat(np.arange(len(steps)), steps)
-        return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)
-
     def all_steps(self) -> tuple[IntArray, IntArray]:
-        """(episodes, steps), each (n_steps,): every step of the view, episode by episode; of an
-        action copy, the last."""
+        """(episodes, steps), each (n_steps,): every step of the view, episode by episode."""
         episodes = np.repeat(np.arange(self.n_episodes), self._counts)
         return episodes, np.arange(self.n_steps) - (self._ends - self.lengths)[episodes]
 
@@ -289,18 +516,19 @@ class EpisodeView:
         """
         if not self.n_steps:
             return
-        ends = (self._columns.starts + self._columns.lengths)[self._sources]
+        ends = (self._columns.starts + self._columns.lengths)[self.episode_ids]
         begins = ends - self._counts
         apart = begins[1:] != ends[:-1]
         begins, ends = begins[np.append(True, apart)], ends[np.append(apart, True)]
-        if self.overlay is not None or len(begins) > self.n_steps // _LONG_ENOUGH:
-            for steps in self.step_batches():
-                yield tuple(self.step_values(name, *steps) for name in names)
+        if len(begins) > self.n_steps // _LONG_ENOUGH:
+            for episodes, steps in self.step_batches():
+                yield tuple(self.step_values(name, episodes, steps) for name in names)
             return
+        columns = [self._columns.step_column(name) for name in names]
         for begin, end in zip(begins, ends, strict=True):
             for first in range(begin, end, _BATCH_STEPS):
                 last = min(first + _BATCH_STEPS, end)
-                yield tuple(self._columns.step_range(name, first, last) for name in names)
+                yield tuple(column.between(first, last) for column in columns)
 
     def item_counts(self) -> IntArray:
         """(n_items,) number of steps of the view that show each item; for stores of items only."""
@@ -308,10 +536,6 @@ class EpisodeView:
         for (items,) in self.column_batches(schema.ITEM):
             counts += np.bincount(items, minlength=len(counts))
         return counts
-
-    @cached_property
-    def _ends(self) -> IntArray:
-        return np.cumsum(self._counts)
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
@@ -346,19 +570,19 @@ class EpisodeView:
         self._require_steps(episodes, ends, length)
         steps = ends[:, None] + np.arange(1 - length, 1)  # (B, K)
         action = schema.ITEM if self.has_items else schema.ACTION
-        names = action, schema.REWARD, schema.RETURN_TO_GO
-        columns = self._step_values(episodes[:, None], np.maximum(steps, 0), *names)
-        actions, rewards, returns_to_go = map(torch.from_numpy, columns)
-        return Windows.of(
-            torch.from_numpy(steps),
-            self._edited_states(episodes, steps),
-            actions.long() if self.has_items else actions,
-            rewards,
-            returns_to_go,
+        numbers, columns = self.episode_ids[episodes], self._columns
+        index = columns.starts[numbers][:, None] + np.maximum(steps, 0)
+        actions, rewards, returns = (
+            torch.from_numpy(columns.step_column(name).take(index))
+            for name in (action, schema.REWARD, schema.RETURN_TO_GO)
         )
+        if self.has_items:
+            actions = actions.long()
+        states = columns.states(numbers, steps)
+        return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states; next states are as logged, also where augmented.
+        """Single steps with their next states.
 
         Args:
             episodes: (M,) positions in the view.
@@ -370,7 +594,7 @@ class EpisodeView:
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1
         next_steps = np.where(last, steps, steps + 1)
-        next_states = self._columns.states(self._sources[episodes], next_steps[:, None])[:, 0]
+        next_states = self._columns.states(self.episode_ids[episodes], next_steps[:, None])[:, 0]
         is_last = torch.from_numpy(last)
         return Transitions(
             states=window.states[:, 0],
@@ -379,15 +603,6 @@ class EpisodeView:
             next_states=next_states.masked_fill(is_last.unsqueeze(-1), 0.0),
             last=is_last,
         )
-
-    def _edited_states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """States (B, K, S) at `steps` (B, K) with edits applied; undefined at steps below 0."""
-        states = self._columns.states(self._sources[episodes], steps)
-        if self.overlay is not None:
-            copies = episodes[:, None] - len(self.episode_ids)
-            rows, columns, edits = self.overlay.edits_at(copies, steps)
-            states[rows, columns] = torch.from_numpy(self.overlay.edit_state[edits])
-        return states
 
     def _require_steps(self, episodes: IntArray, ends: IntArray, length: int) -> None:
         if episodes.ndim != 1 or episodes.shape != ends.shape or length < 1:
@@ -409,3 +624,9 @@ class EpisodeView:
                 f"episode {episodes[first]} has {self.lengths[episodes[first]]} steps, none "
                 f"numbered {ends[first]}; steps are numbered from 0"
             )
+
+
+def _list_earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
+    """Row and number of every step before the given ones (B,), row by row."""
+    owner = np.repeat(np.arange(len(steps)), steps)
+    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)

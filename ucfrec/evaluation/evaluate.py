@@ -9,18 +9,18 @@ from gymnasium import spaces
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Actor, rollout
+from ucfrec.acting.rollout import Actor, Episodes, rollout
 from ucfrec.arrays import IntArray
-from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns
-from ucfrec.evaluation.environment import Environment
-from ucfrec.evaluation.session_metrics import bootstrap_interval, session_metrics
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.processes import random_state_kept
 from ucfrec.provenance import config_hash, provenance
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
+from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "evaluate"
@@ -153,3 +153,21 @@ def _misfit(environment: Environment, takes: str) -> InputError:
         f"{environment.name} takes {takes}, which the policy was not trained on; train it on "
         f"logs of {environment.name}"
     )
+
+
+def session_metrics(played: Episodes) -> dict[str, float]:
+    """Metrics of simulated episodes; rewards and returns in reward units.
+
+    Returns:
+        `R_cum`: mean episode return (called R_tra in some papers). `R_avg_pooled`: sum of all
+        rewards divided by the number of all steps (called R_each in some papers). `R_avg_episode`:
+        mean over episodes of the episode's mean reward per step. `length`: mean number of steps of
+        an episode.
+    """
+    returns, lengths = played.returns, played.lengths
+    return {
+        "R_cum": float(returns.mean()),
+        "R_avg_pooled": float(returns.sum() / lengths.sum()),
+        "R_avg_episode": float((returns / lengths).mean()),
+        "length": float(lengths.mean()),
+    }

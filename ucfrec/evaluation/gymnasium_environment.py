@@ -13,10 +13,8 @@ import pyarrow.parquet as pq
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ucfrec.acting.uniform import Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Simulator
 from ucfrec.files.parquet import require_regular
 from ucfrec.schema import ITEM_ID, USER_IDS
 
@@ -31,26 +29,6 @@ FEATURES: Final = "features"
 """Column of the item table with an array's numbers."""
 TAGS: Final = "tags"
 """Column of the item table with the numbers of an array's true columns."""
-
-
-def gymnasium_simulator(
-    env_id: str, observe: Sequence[str], item_features: str | None
-) -> Simulator:
-    """The simulator that wraps a Gymnasium environment.
-
-    Args:
-        env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
-        observe: entries of a dict observation that are observed, see `GymnasiumEnvironment`.
-        item_features: file or attribute with item features, see `gymnasium_items.item_table`.
-    """
-
-    def make(num_envs: int, folder: Path | None) -> GymnasiumEnvironment:
-        if item_features is None:
-            return GymnasiumEnvironment(env_id, num_envs, observe)
-        return GymnasiumCatalog(env_id, num_envs, partial(item_table, item_features), observe)
-
-    summary = f"the Gymnasium environment {env_id}"
-    return Simulator(summary, make, behaviors={"random": Uniform}, feedback=REWARD)
 
 
 class GymnasiumEnvironment(SyncVectorEnv):
@@ -157,7 +135,7 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
             ) from None
         self.action_space, self._to_action = _actions(self.env.action_space, env_id)
         vectors = isinstance(self.action_space, spaces.Box)
-        self._observed = _observed(self.env.observation_space, observe, vectors, env_id)
+        self._observed = _select_observed(self.env.observation_space, observe, vectors, env_id)
         size = sum(spaces.flatdim(space) for _, space in self._observed)
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
 
@@ -207,7 +185,7 @@ def _actions(
     )
 
 
-def _observed(
+def _select_observed(
     space: spaces.Space[Any], keys: tuple[str, ...], vectors: bool, env_id: str
 ) -> _Observed:
     entries = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
@@ -255,7 +233,7 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
         require_regular(Path(source))
     try:
         if source.endswith(".parquet"):
-            return _ordered(pq.read_table(source), source, n_items)
+            return _order_rows(pq.read_table(source), source, n_items)
         if source.endswith(".npy"):
             return _table(np.load(source, allow_pickle=False), source, n_items)
     except (OSError, ValueError) as error:
@@ -288,7 +266,7 @@ def _table(values: Array, source: str, n_items: int) -> pa.Table:
     return pa.table({ITEM_ID: ids, FEATURES: pa.array(column)})
 
 
-def _ordered(table: pa.Table, source: str, n_items: int) -> pa.Table:
+def _order_rows(table: pa.Table, source: str, n_items: int) -> pa.Table:
     """The rows of a Parquet file, in the order of the actions."""
     if ITEM_ID not in table.column_names or not pa.types.is_integer(table[ITEM_ID].type):
         raise InputError(

@@ -13,18 +13,18 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.evaluation.liked import Liked
-from ucfrec.evaluation.ranking import Ranker, Steps
-from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
-from ucfrec.policies.item_knn import ItemKNNConfig, ItemKNNPolicy
-from ucfrec.policies.popular import (
+from ucfrec.evaluation.ranking import Liked, Ranker, Steps
+from ucfrec.policies.baselines import (
+    ItemKNNConfig,
+    ItemKNNPolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
-    decayed_counts,
-    liked_rates,
+    count_decayed,
+    shrink_rates,
 )
+from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
 from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -43,8 +43,9 @@ class PolicyRanker:
 
     def scores(self, steps: Steps) -> Tensor:
         """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
-        at = steps.store, steps.episodes, steps.steps
-        scores = logged_scores(self._scorer, *at, steps.left_out)
+        scores = logged_scores(
+            self._scorer, steps.store, steps.episodes, steps.steps, steps.left_out
+        )
         return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
 
@@ -102,8 +103,8 @@ class ItemNeighbours:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        recent = steps.rows.recent(steps.numbers, _KNN_HISTORY)
-        return self._knn.similarity(*map(torch.from_numpy, recent)) + self._tie_break
+        items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
+        return self._knn.similarity(items, rewards) + self._tie_break
 
 
 class BoostedClicks:
@@ -181,7 +182,7 @@ def recent_rankers(
     rankers: list[Ranker] = []
     for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
         hours = kind.best_half_life(first, validation, liked_of)
-        scores = kind.scores_of(decayed_counts(train, hours, liked_of))
+        scores = kind.scores_of(count_decayed(train, hours, liked_of))
         rankers.append(SameForAll(f"recent {name}", scores.double()))
     return rankers
 
@@ -206,7 +207,7 @@ def baselines(
         Random(len(shown), seed),
         SameForAll("most shown", shown),
         SameForAll("most clicked", liked),
-        SameForAll("item click rate", liked_rates(counts)),
+        SameForAll("item click rate", shrink_rates(counts)),
     ]
     if train is not None:
         rankers.append(ItemNeighbours(train, shown.float()))

@@ -1,11 +1,13 @@
-"""What a plugin of the entry-point group `ucfrec.simulators` is."""
+"""Simulators: plugins of the entry-point group `ucfrec.simulators`, and environments by name."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from ucfrec.errors import InputError
+from ucfrec.plugins import load_plugin
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -48,3 +50,58 @@ class Simulator:
                 "`make` must give a gymnasium.vector.VectorEnv"
             )
         return env
+
+
+GYMNASIUM: Final = "gymnasium:"
+"""Start of the names of environments that are Gymnasium environments."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """A simulator and what it is made from."""
+
+    name: str
+    """Name of a simulator plugin, or `gymnasium:` and the identifier of an environment."""
+    folder: Path | None = None
+    """Folder of the simulator's weights; None if it needs none."""
+
+    observe: tuple[str, ...] = field(default=(), kw_only=True)
+    """Entries of a Gymnasium environment's dict observation that are observed."""
+    item_features: str | None = field(default=None, kw_only=True)
+    """File or attribute of a Gymnasium environment with features of its items; None for none."""
+
+    @property
+    def title(self) -> str:
+        """The name, and the options that belong to it as the command line has them."""
+        observe = f" --observe {','.join(self.observe)}" if self.observe else ""
+        features = f" --item-features {self.item_features}" if self.item_features else ""
+        return self.name + observe + features
+
+    def simulator(self) -> Simulator:
+        """Load the simulator plugin, or make the one of a Gymnasium environment.
+
+        Raises:
+            InputError: no simulator of this name is installed, or it takes no `observe` and
+                `item_features`.
+        """
+        if self.name.startswith(GYMNASIUM):
+            from ucfrec.acting.rollout import Uniform
+            from ucfrec.evaluation import gymnasium_environment as wrapped
+
+            env_id = self.name.removeprefix(GYMNASIUM)
+
+            def make(num_envs: int, _: Path | None) -> wrapped.GymnasiumEnvironment:
+                if self.item_features is None:
+                    return wrapped.GymnasiumEnvironment(env_id, num_envs, self.observe)
+                items = partial(wrapped.item_table, self.item_features)
+                return wrapped.GymnasiumCatalog(env_id, num_envs, items, self.observe)
+
+            summary = f"the Gymnasium environment {env_id}"
+            return Simulator(summary, make, behaviors={"random": Uniform}, feedback=wrapped.REWARD)
+        if self.observe or self.item_features is not None:
+            raise InputError(
+                f"--observe and --item-features are for {GYMNASIUM}ID; leave them out for "
+                f"{self.name}"
+            )
+        simulator: Simulator = load_plugin("simulators", self.name)
+        return simulator

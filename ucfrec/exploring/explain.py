@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import RANK, recommend, sessions_of
@@ -94,7 +94,7 @@ def explain(
     return Explained(rows, cards, tuple(excluded))
 
 
-def pasted_history(text: str) -> pd.DataFrame:
+def read_pasted(text: str) -> pd.DataFrame:
     """The history that someone pasted: a row per line, `item_id` or `item_id, reward`, the latest
     last, as a frame of one user whose rows are a minute apart.
 

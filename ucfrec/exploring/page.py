@@ -1,28 +1,31 @@
-"""The page of the explorer as HTML, from what a visitor asked for."""
+"""The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+from fastapi import FastAPI, Request, Response
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, Explained, explain, pasted_history
+from ucfrec.exploring.explain import PARTS, explain, read_pasted
 from ucfrec.files.record import CARD
-from ucfrec.python_api.given_data import histories_given
+from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
-from ucfrec.reporting.page_results import find_quoted, read_evidence
-from ucfrec.results.row import ResultRow
+from ucfrec.reporting.results import find_quoted, read_evidence
+from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PACKAGE: Final = "ucfrec.exploring"
@@ -31,6 +34,14 @@ _IMAGES: Final = ("image", "image_url", "picture")
 _NUMBER: Final = re.compile(r"-?\d{1,12}(\.\d{1,12})?")
 _USERS_LISTED: Final = 1000
 _MOST_ITEMS: Final = 100
+_HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'unsafe-inline'; "
+        "img-src http: https:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
 
 
 @dataclass(frozen=True)
@@ -78,10 +89,15 @@ class Explorer:
         Args:
             fields: of the form, by name; unknown ones are ignored.
         """
+        cards = [run.folder / CARD for run in self.runs]
+        texts = [
+            card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
+            for card in cards
+        ]
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
             given=fields,
-            runs=[(run.folder.name, run, self._card(run)) for run in self.runs],
+            runs=[(r.folder.name, r, text) for r, text in zip(self.runs, texts, strict=True)],
             sliders=self._sliders(fields),
             values=self.values,
             chart=self.values_chart,
@@ -110,8 +126,8 @@ class Explorer:
             curves.setdefault(row.policy, {})[target] = row.value
         if max(map(len, curves.values()), default=0) < 2:
             return None
-        styled = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
-        return line_chart("Off-policy value against the target return", "target return", styled)
+        lines = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
+        return line_chart("Off-policy value against the target return", "target return", lines)
 
     @cached_property
     def reports(self) -> list[str]:
@@ -126,39 +142,28 @@ class Explorer:
 
     def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
-        lists: list[tuple[str, str, Explained]] = []
-        error = ""
+        lists, error = [], ""
         try:
             if fields.get("user", "").strip() or fields.get("history", "").strip():
-                lists = [self._recommend(trained, fields) for trained in self.runs]
+                k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
+                for trained in self.runs:
+                    history, rule = _read_history(trained, fields), _read_rule(trained, fields)
+                    filter_seen = fields.get("keep_seen") is None
+                    explained = explain(trained, rule, history, k, filter_seen)
+                    lists.append((trained.folder.name, str(rule), explained))
         except InputError as fault:
             lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in explained.cards} for _, _, explained in lists]
-        common = set.intersection(*ids) if len(ids) == 2 else None
-        widths = [
-            abs(v)
-            for _, _, explained in lists
-            for card in explained.cards
-            for v in card.parts.values()
-        ]
+        cards = [explained.cards for _, _, explained in lists]
+        ids = [{str(card.item_id) for card in row} for row in cards]
+        widths = [abs(part) for row in cards for card in row for part in card.parts.values()]
         return {
             "lists": lists,
             "error": error,
-            "common": common,
+            "common": ids[0] & ids[1] if len(ids) == 2 else None,
             "parts": PARTS,
             "widest": max(widths, default=0.0) or 1.0,
             "item": self._item,
         }
-
-    def _recommend(
-        self, trained: TrainedPolicy, fields: Mapping[str, str]
-    ) -> tuple[str, str, Explained]:
-        text, user = fields.get("history", "").strip(), fields.get("user", "").strip()
-        history = _read_pasted(trained, text) if text else _read_stored(trained, user)
-        rule = _read_rule(trained, fields)
-        k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
-        filter_seen = fields.get("keep_seen") is None
-        return trained.folder.name, str(rule), explain(trained, rule, history, k, filter_seen)
 
     def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
         trained = self.runs[0]
@@ -177,15 +182,12 @@ class Explorer:
         states = trained.item_states
         if states is None or not bool((states.tags >= 0).any()):
             sliders.pop()
-        if fields.get("custom") is None:
-            return sliders
-        # Where a number is wrong, the list says so.
-        return [
-            replace(slider, value=float(fields[slider.name]))
-            if _NUMBER.fullmatch(fields.get(slider.name, ""))
-            else slider
-            for slider in sliders
-        ]
+        for n, slider in enumerate(sliders):
+            text = fields.get(slider.name, "")
+            # Where a number is wrong, the list says so.
+            if fields.get("custom") is not None and _NUMBER.fullmatch(text):
+                sliders[n] = replace(slider, value=float(text))
+        return sliders
 
     def _item(self, item_id: Any) -> dict[str, Any]:
         """Title, picture and other features of an item."""
@@ -200,26 +202,25 @@ class Explorer:
             "features": features[:200],
         }
 
-    @staticmethod
-    def _card(trained: TrainedPolicy) -> str:
-        card = trained.folder / CARD
-        return card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
 
+def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
+    """The history that is pasted, else that of the user in the store.
 
-def _read_pasted(trained: TrainedPolicy, text: str) -> Histories:
-    (history,) = histories_given(trained, pasted_history(text), None, ["pasted"])
-    unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
-    if len(unknown):
-        raise InputError(
-            f"the run {trained.folder.name} does not know the items "
-            f"{name_some(list(dict.fromkeys(unknown.tolist()))):.200}; take their "
-            "lines out of the history"
-        )
-    return history
-
-
-def _read_stored(trained: TrainedPolicy, user: str) -> Histories:
-    run = trained.folder.name
+    Raises:
+        InputError: the text cannot be used, or there is no such user or no store.
+    """
+    run, text = trained.folder.name, fields.get("history", "").strip()
+    if text:
+        (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
+        unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
+        if len(unknown):
+            raise InputError(
+                f"the run {run} does not know the items "
+                f"{name_some(list(dict.fromkeys(unknown.tolist()))):.200}; take their lines out of "
+                "the history"
+            )
+        return history
+    user = fields.get("user", "").strip()
     if trained.users.numbers(np.asarray([user]))[0] < 0:
         raise InputError(
             f"the run {run} has no user {user[:60]!r}; choose one of the list, or paste a history"
@@ -229,20 +230,19 @@ def _read_stored(trained: TrainedPolicy, user: str) -> Histories:
             f"the store of the run {run}, {trained.record.store}, is gone or has changed; paste a "
             "history instead"
         )
-    (history,) = histories_given(trained, None, None, [user])
+    (history,) = read_histories(trained, None, None, [user])
     return history
 
 
 def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:
     """The run's own rule, or that of the sliders."""
-    rule = trained.rule
     if fields.get("custom") is None:
-        return rule
+        return trained.rule
     names = [name for name in ("target", "reward_weight", "temperature") if name in fields]
     changes: dict[str, Any] = {name: _read_number(fields, name, 0.0, -1e12, 1e12) for name in names}
     if "tag_window" in fields:
         changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 0, 10))
-    return replace(rule, **changes)
+    return replace(trained.rule, **changes)
 
 
 def _read_number(
@@ -258,3 +258,43 @@ def _read_number(
     if not low <= value <= high:
         raise InputError(f"{name} is {text[:40]!r}; give a number from {low:g} to {high:g}")
     return value
+
+
+def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
+    """The application, which keeps no state of its visitors.
+
+    Args:
+        allowed_hosts: values of the header `Host` that are answered.
+    """
+    app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
+    script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
+
+    def html(text: str) -> Response:
+        # Texts of files may have bytes that are not valid Unicode.
+        content = text.encode("utf-8", errors="backslashreplace")
+        return Response(content, media_type="text/html; charset=utf-8", headers=_HEADERS)
+
+    @app.get("/")
+    def page(request: Request) -> Response:
+        """The page, filled in as the address says."""
+        return html(explorer.page(request.query_params))
+
+    @app.get("/results")
+    def results(request: Request) -> Response:
+        """The list alone."""
+        return html(explorer.results(request.query_params))
+
+    @app.get("/explore.js")
+    def javascript() -> Response:
+        """The script of the page."""
+        return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
+
+    @app.get("/report/{number}")
+    def report(number: int) -> Response:
+        """The report of a run."""
+        if not 0 <= number < len(explorer.runs):
+            return Response("there is no such run", 404)
+        return html(explorer.reports[number])
+
+    return app

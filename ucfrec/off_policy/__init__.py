@@ -9,12 +9,10 @@ The array functions need no ucfrec run, and do not load torch:
         print(name, one.value, one.low, one.high)
 """
 
-from ucfrec.off_policy.diagnostics import diagnose
 from ucfrec.off_policy.estimators import Estimate, estimate
-from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled
-from ucfrec.off_policy.pages import as_pages
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, Modelled, as_pages
 from ucfrec.off_policy.selection import select
-from ucfrec.off_policy.verdict import Verdict, conclude
+from ucfrec.off_policy.verdict import Verdict, conclude, diagnose
 
 __all__ = [
     "Estimate",

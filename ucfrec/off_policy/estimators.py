@@ -16,7 +16,7 @@ whole session, E_n the mean over sessions.
 | DR | E_n[Σ_t γ^t (w_it (r_it − q_it) + w_i,t−1 v_it)] | Dudík 2011; Jiang & Li, ICML 2016 |
 | SNDR | DR with w_it / E_n[w_it] for w_it | weighted DR: Thomas & Brunskill, ICML 2016, eq. 8 |
 | MIPS | PDIS with weights of clusters | Saito & Joachims, ICML 2022 |
-| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.pages` |
+| IIPS | E_n[Σ_t γ^t ρ_it r_it], of pages | Li et al., KDD 2018; `ucfrec.off_policy.logged_steps` |
 | SNIIPS | the same with ρ_it over its mean at position t | |
 
 Estimators that shrink large weights take a little bias for much less variance. Each is
@@ -43,15 +43,14 @@ step, as if it went on without reward (Thomas & Brunskill 2016).
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
-from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.diagnostics import WeightTest, check_mean_weight
-from ucfrec.off_policy.intervals import cluster_intervals
-from ucfrec.off_policy.logged_steps import LoggedSteps
-from ucfrec.off_policy.pages import independent_terms
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.off_policy.logged_steps import LoggedSteps, independent_terms
 from ucfrec.results.statistics import effective_number
 
 SUITE: Final = "off-policy"
@@ -130,20 +129,13 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
 
 
 def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
-    """Estimates with intervals, of terms of S units by name of the estimator.
-
-    Args:
-        user: (S,) whose they are; None where each is of another user.
-        seed: draws the bootstrap's resamples.
-    """
+    """Estimates with intervals, of terms of S units, each of a user (S,), by estimator."""
     above = np.stack([term.above for term in terms.values()], axis=1)
     below = np.stack([term.below for term in terms.values()], axis=1)
     estimates = {}
     intervals = cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
-        if term.biased:
-            interval = None
-        weights = term.weights
+        interval, weights = None if term.biased else interval, term.weights
         estimates[name] = Estimate(
             value=float(term.above.sum() / term.below.sum()),
             low=None if interval is None else interval.low,
@@ -185,21 +177,15 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         terms["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
-    return terms | _shrunk_terms(steps)
-
-
-def _shrunk_terms(steps: LoggedSteps) -> dict[str, Terms]:
-    weights, zeros = steps.session_weights, np.zeros(len(steps.first))
-    kinds = {name: (*kind, steps.returns, zeros) for name, kind in IPS_KINDS.items()}
+    kinds = {name: (*kind, steps.returns, 0 * ones) for name, kind in IPS_KINDS.items()}
     if steps.model is not None and len(steps.session) == len(steps.first):
         left, value = steps.reward - steps.model.q, steps.model.v
         kinds |= {name: (*kind, left, value) for name, kind in DR_KINDS.items()}
-    terms = {}
     for name, (shrink, parameters, left, value) in kinds.items():
-        parameter = tune(shrink, parameters, weights, left, value)
-        shrunk = shrink(weights, parameter)
-        biased = bool((shrunk != weights).any())
-        terms[name] = Terms(value + shrunk * left, np.ones(len(weights)), shrunk, parameter, biased)
+        parameter = tune(shrink, parameters, last, left, value)
+        shrunk = shrink(last, parameter)
+        biased = bool((shrunk != last).any())
+        terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, biased)
     return terms
 
 
@@ -237,13 +223,8 @@ def tune(
     left: Float64Array,
     value: Float64Array,
 ) -> float:
-    """The parameter of least estimated mean squared error, the first of equals (Su et al. 2020).
-
-    Args:
-        weights: (S,) unshrunk.
-        left: (S,) r − q.
-        value: (S,) v.
-    """
+    """The parameter of least estimated mean squared error, the first of equals (Su et al. 2020), of
+    unshrunk weights, r − q and v (S,)."""
     errors = [
         mean_squared_error(weights, shrink(weights, parameter), left, value)
         for parameter in parameters
@@ -297,8 +278,7 @@ def normalise_by_step(
     bootstrap, which then needs one number per session rather than one per step.
 
     Args:
-        left: (N,) reward, or what the model leaves of it.
-        v: (N,) modelled values, or None.
+        left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
         sums: of all sessions; where there are more than those of `steps`, without modelled values.
     """
     weights, step, sessions, totals = steps.weights, steps.step, sums.sessions, sums.totals
@@ -322,70 +302,160 @@ def normalise_by_step(
     return np.asarray(value + sessions * (steps.per_session(mine) - taken - start))
 
 
-BEST: Final = "DR"
-"""The estimate that the lift is of."""
+RESAMPLES = 2000
+MOST_CLUSTERS = 10_000
+"""Of more, random groups are drawn, all of about one size: the error stays, and time and memory do
+not grow with the logs."""
+FEWEST_USERS = 10
+"""Users below which their spread says too little for a conclusion."""
+_COUNTS_AT_ONCE = 2**22
+_USABLE = 0.9
+"""Share of resamples that must have a spread of their own."""
 
 
 @dataclass(frozen=True)
-class StepValue:
-    """What N' logged steps with a propensity say of the evaluated policy, per step.
+class Interval:
+    """What resampling says of a number."""
 
-    The contextual bandit of Dudík, Langford & Li (ICML 2011) on those steps, picked at random: the
-    mean reward of a step, had the evaluated policy chosen its item after a history as the logging
-    policy makes them. It says nothing of the return of sessions that the policy itself would make.
+    low: float
+    high: float
+    error: float
+    """Standard error, over clusters."""
+    above_zero: float
+    """Share of resamples in which the number is above 0."""
+
+
+def cluster_intervals(
+    above: Float64Array,
+    below: Float64Array,
+    cluster: IntArray | None,
+    seed: int,
+) -> list[Interval | None]:
+    """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below.
+
+    Clusters are drawn with replacement, each with all its sessions (Cameron, Gelbach & Miller,
+    Review of Economics and Statistics 2008), and every resample's deviation is divided by its own
+    standard error (Efron & Tibshirani 1993, section 12.5): where a few heavy weights carry the sum,
+    value and error rise and fall together, which percentiles of the value alone miss.
+
+    Args:
+        above: (S, K), one row per session, one column per estimate; as `below`.
+        cluster: (S,) of each session, any integers; None where each session is its own.
+
+    Returns:
+        One per column; None where nothing spreads: one cluster, all clusters equal, or so few that
+        differ that more than a tenth of the resamples have no spread.
     """
+    resamples = resample(above, below, cluster, seed)
+    intervals: list[Interval | None] = []
+    for k, (value, error) in enumerate(zip(resamples.value, resamples.error, strict=True)):
+        rows = resamples.usable[:, k]
+        if not resamples.spreads[k] or rows.mean() < _USABLE:
+            intervals.append(None)
+            continue
+        shift, errors = resamples.shift[rows, k], resamples.errors[rows, k]
+        low_t, high_t = np.quantile(shift / errors, [0.025, 0.975])
+        low, high = float(value - high_t * error), float(value - low_t * error)
+        intervals.append(Interval(low, high, float(error), float((value + shift > 0).mean())))
+    return intervals
 
-    estimates: dict[str, Estimate]
-    """Mean reward of a step as logged, and by IPS, SNIPS and DR under the evaluated policy."""
-    lift: Estimate
-    """Of DR over the steps as logged."""
-    steps: int
-    """N'."""
-    of: int
-    """All logged steps."""
-    weight: WeightTest
-    """Mean of target / propensity."""
 
-    @property
-    def doubt(self) -> str | None:
-        """Why not to believe the estimates; None if nothing is found."""
-        if self.weight.passed:
-            return None
-        return (
-            f"{self.weight} where 1 is expected: propensities are wrong, or those steps lack "
-            "choices that the policy makes"
+@dataclass(frozen=True)
+class Resamples:
+    """K ratios, and B resamples of them; the same clusters are drawn for all K."""
+
+    value: Float64Array
+    """(K,)."""
+    error: Float64Array
+    """(K,) standard errors over clusters."""
+    shift: Float64Array
+    """(B, K) of each resample: its ratio less `value`."""
+    errors: Float64Array
+    """(B, K) its own standard error."""
+    spreads: BoolArray
+    """(K,) whether clusters differ at all."""
+
+    usable: BoolArray
+    """(B, K) whether the resample has a spread of its own."""
+
+
+def resample(
+    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
+) -> Resamples:
+    """Draw clusters with replacement, each with all its sessions: `cluster_intervals`."""
+    names, clusters = _number_clusters(cluster, len(above))
+    if clusters > MOST_CLUSTERS:
+        shuffled = np.random.default_rng(seed).permutation(clusters)
+        names, clusters = shuffled[names] % MOST_CLUSTERS, MOST_CLUSTERS
+    above, below = (
+        np.stack([np.bincount(names, column, clusters) for column in values.T], axis=1).astype(
+            np.float64, copy=False
         )
+        for values in (above, below)
+    )
+    value = above.sum(axis=0) / below.sum(axis=0)
+    # Deviations from the estimate, in units that keep squares of large weights finite.
+    scale = np.maximum(np.abs(above - value * below).max(axis=0), np.finfo(float).tiny)
+    size = np.abs(below).max(axis=0)
+    e, b = (above - value * below) / scale, below / size
+    unit = scale / size
+    correction = np.sqrt(clusters / max(clusters - 1, 1))
+    error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
+    moments = np.stack([e, b, e * e, e * b, b * b])
+    flat, at_once = (
+        np.moveaxis(moments, 1, 0).reshape(clusters, -1),
+        max(1, _COUNTS_AT_ONCE // clusters),
+    )
+    counts, shifts, spreads = _draw_counts(clusters, seed), [], []
+    for begin in range(0, RESAMPLES, at_once):
+        # How often each cluster is drawn stands for the resampled rows.
+        times = counts[begin : begin + at_once].astype(np.float64)
+        e, b, ee, eb, bb = (times @ flat).reshape(-1, 5, len(value)).swapaxes(0, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shift = np.where(b > 0, e / b, np.nan)
+            spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
+            spreads.append(correction * np.sqrt(spread) / b * unit)
+        shifts.append(shift * unit)
+    shift, errors, error_in_units = np.concatenate(shifts), np.concatenate(spreads), error * unit
+    usable = np.isfinite(shift) & (errors > 1e-9 * error_in_units)
+    differ = (error > 1e-12) & (clusters > 1)
+    return Resamples(value, error_in_units, shift, errors, differ, usable)
 
-    def __str__(self) -> str:
-        interval = ""
-        if self.lift.interval is not None:
-            low, high = self.lift.interval
-            interval = f" [{low:+.4g}, {high:+.4g}]"
-        return (
-            f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
-            f"logging policy's distribution of histories: {self.lift.value:+.4g}{interval} "
-            f"per step by {BEST}; not an estimate of the session return"
-        )
+
+def cluster_mean(
+    values: Float64Array, cluster: IntArray | None, weights: Float64Array | None = None
+) -> tuple[float, float]:
+    """Mean of values (S,), of weights (S,) if given, and its standard error over clusters (S,)."""
+    names, clusters = _number_clusters(cluster, len(values))
+    above = np.bincount(names, values if weights is None else values * weights, clusters)
+    below = np.bincount(names, weights, clusters)
+    mean = above.sum() / below.sum()
+    spread = np.square(above - mean * below).sum()
+    return float(mean), float(np.sqrt(clusters / max(clusters - 1, 1) * spread) / below.sum())
 
 
-def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
-    """The value per step; None where all steps have propensities, too few, or no weight."""
-    weighable = ~np.isnan(steps.propensity)
-    if steps.model is None or weighable.all() or weighable.sum() < 2:
-        return None
-    reward, weight = steps.reward[weighable], (steps.target / steps.propensity)[weighable]
-    if not weight.any():
-        return None
-    ones, user = np.ones(len(reward)), steps.users[steps.session[weighable]]
-    left = reward - steps.model.logged_reward[weighable]
-    doubly_robust = steps.model.reward[weighable] + weight * left
-    terms = {
-        LOGGED: Terms(reward, ones, ones),
-        "IPS": Terms(weight * reward, ones, weight),
-        "SNIPS": Terms(weight * reward, weight, weight),
-        BEST: Terms(doubly_robust, ones, weight),
-        "lift": Terms(doubly_robust - reward, ones, weight),
-    }
-    estimates = summarise(terms, user, seed)
-    lift, test = estimates.pop("lift"), check_mean_weight("per step", weight, user)
-    return StepValue(estimates, lift, len(reward), len(weighable), test)
+def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray, int]:
+    """(S,) clusters numbered from 0, and how many there are."""
+    if cluster is None:
+        return np.arange(sessions), sessions
+    names = np.unique(cluster, return_inverse=True)[1]
+    return names, int(names.max()) + 1
+
+
+@lru_cache(maxsize=1)
+def _draw_counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
+    """(B, C) how often each resample has each cluster, at most 40 MB.
+
+    Kept for the next call: an estimate, its verdict and a selection draw the same clusters.
+    """
+    generator = np.random.default_rng(seed)
+    counts = np.empty((RESAMPLES, clusters), dtype=np.uint16)
+    at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))
+    for begin in range(0, RESAMPLES, at_once):
+        draws = min(at_once, RESAMPLES - begin)
+        picked = generator.integers(clusters, size=(draws, clusters))
+        picked += np.arange(draws)[:, None] * clusters
+        times = np.bincount(picked.ravel(), minlength=draws * clusters)
+        counts[begin : begin + draws] = times.reshape(draws, clusters)
+    counts.setflags(write=False)
+    return counts

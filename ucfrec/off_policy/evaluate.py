@@ -12,32 +12,38 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.behavior_model import fit_behavior, group_items
-from ucfrec.off_policy.diagnostics import (
-    FAR_OFF,
-    MOST_LEFT_OUT,
-    Diagnosis,
-    check_catalogue_size,
-    diagnose,
-)
 from ucfrec.off_policy.estimators import (
     LOGGED,
     SUITE,
     Estimate,
-    StepValue,
+    Terms,
     estimate,
     session_terms,
-    step_value,
+    summarise,
 )
-from ucfrec.off_policy.features import InputsFile, array_on_disk, make_inputs
-from ucfrec.off_policy.fqe import ModelReport, fit_models
-from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps
-from ucfrec.off_policy.pages import as_pages, number_pages
+from ucfrec.off_policy.logged_steps import ItemGroups, LoggedSteps, as_pages, number_pages
+from ucfrec.off_policy.models import (
+    InputsFile,
+    ModelReport,
+    array_on_disk,
+    fit_behavior,
+    fit_models,
+    group_items,
+    make_inputs,
+)
 from ucfrec.off_policy.score import LoggedSessions, score_steps, seen_too_often, share_seen
-from ucfrec.off_policy.verdict import Verdict, conclude, list_cautions
+from ucfrec.off_policy.verdict import (
+    FAR_OFF,
+    MOST_LEFT_OUT,
+    Verdict,
+    check_catalogue_size,
+    check_mean_weight,
+    conclude,
+    diagnose,
+    list_cautions,
+)
 from ucfrec.provenance import config_hash, provenance, shorten_paths
-from ucfrec.results.row import ResultRow, Scalar
-from ucfrec.results.table import ResultTable
+from ucfrec.results.rows import ResultRow, ResultTable, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
 
@@ -50,7 +56,7 @@ class EstimateOptions:
     """Discount factor γ of the estimated returns."""
     pages: bool = False
     """Estimate the return of a page: sessions of one step, of one user within 10 ms, are the
-    positions of a page (`ucfrec.off_policy.pages`)."""
+    positions of a page (`ucfrec.off_policy.logged_steps`)."""
     users_known: bool = True
     """Whether the logs' users are persons, whose sessions are resampled together; if not, each
     session is taken to be of another user."""
@@ -75,6 +81,65 @@ class EstimateOptions:
 
 
 DEFAULTS = EstimateOptions()
+
+
+@dataclass(frozen=True)
+class StepValue:
+    """What N' logged steps with a propensity say of the evaluated policy, per step.
+
+    The contextual bandit of Dudík, Langford & Li (ICML 2011) on those steps, picked at random: the
+    mean reward of a step, had the evaluated policy chosen its item after a history as the logging
+    policy makes them. It says nothing of the return of sessions that the policy itself would make.
+    """
+
+    estimates: dict[str, Estimate]
+    """Mean reward of a step as logged, and by IPS, SNIPS and DR under the evaluated policy."""
+    lift: Estimate
+    """Of DR over the steps as logged."""
+    steps: int
+    """N'."""
+    of: int
+    """All logged steps."""
+    doubt: str | None
+    """Why not to believe the estimates; None if nothing is found."""
+
+    def __str__(self) -> str:
+        ends = ""
+        if self.lift.interval is not None:
+            low, high = self.lift.interval
+            ends = f" [{low:+.4g}, {high:+.4g}]"
+        return (
+            f"per step, on the {self.steps:,} of {self.of:,} steps with a propensity, under the "
+            f"logging policy's distribution of histories: {self.lift.value:+.4g}{ends} per step by "
+            "DR; not an estimate of the session return"
+        )
+
+
+def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
+    """The value per step; None where all steps have propensities, too few, or no weight."""
+    weighable = ~np.isnan(steps.propensity)
+    if steps.model is None or weighable.all() or weighable.sum() < 2:
+        return None
+    reward, weight = steps.reward[weighable], (steps.target / steps.propensity)[weighable]
+    if not weight.any():
+        return None
+    ones, user = np.ones(len(reward)), steps.users[steps.session[weighable]]
+    left = reward - steps.model.logged_reward[weighable]
+    doubly_robust = steps.model.reward[weighable] + weight * left
+    terms = {
+        LOGGED: Terms(reward, ones, ones),
+        "IPS": Terms(weight * reward, ones, weight),
+        "SNIPS": Terms(weight * reward, weight, weight),
+        "DR": Terms(doubly_robust, ones, weight),
+        "lift": Terms(doubly_robust - reward, ones, weight),
+    }
+    estimates = summarise(terms, user, seed)
+    lift, test = estimates.pop("lift"), check_mean_weight("per step", weight, user)
+    doubt = (
+        f"{test} where 1 is expected: propensities are wrong, or those steps lack choices that the "
+        "policy makes"
+    )
+    return StepValue(estimates, lift, len(reward), len(weighable), None if test.passed else doubt)
 
 
 @dataclass(frozen=True, repr=False)
@@ -107,9 +172,22 @@ class OffPolicyReport(ResultTable):
 
 
 @dataclass
-class Doubts:
-    """What the logs say against an estimate, beside their weights."""
+class Evidence:
+    """Logged steps, and what the logs say of an estimate beside their weights."""
 
+    steps: LoggedSteps
+    rows: int
+    """Number of rows of the logs."""
+    columns: dict[str, Any]
+    """Further columns of the result rows."""
+    segment: IntArray | None = None
+    """(S,) as `diagnose` takes it."""
+    declared: str = ""
+    """What the estimates rest on beside the logs."""
+    fingerprint: str | None = None
+    """Of the logs."""
+    models: ModelReport | None = None
+    per_step: StepValue | None = None
     forbidden: list[str] = field(default_factory=list)
     """What forbids a conclusion."""
     remarks: list[str] = field(default_factory=list)
@@ -142,13 +220,20 @@ def evaluate_off_policy(
     """
     rule, store = rule or trained.rule, logged.store
     steps, models, declared = collect_steps(trained, logged, rule, seed, options)
-    seen, segment, per_step = share_seen(trained, store), None, None
-    doubts = _doubt_logs(logged, seen, options.pages)
     assert steps.groups is not None
+    columns = {
+        "seen_in_training": share_seen(trained, store),
+        "dropped": logged.report["dropped"],
+        "unknown_item_rows": logged.unknown_items,
+        **{f"model_{name}": value for name, value in asdict(models).items()},
+    }
+    evidence = Evidence(steps, len(steps.reward), columns, declared=declared, models=models)
+    evidence.fingerprint = store.record.fingerprint
+    _doubt_logs(evidence, logged, options.pages)
     items, in_catalogue = len(trained.items), steps.groups.number >= 0
     implied = None if declared else check_catalogue_size(steps, in_catalogue, items)
     if implied is not None and not implied.passed:
-        doubts.forbidden.append(
+        evidence.forbidden.append(
             f"the propensities imply {implied.mean * items:,.0f} ± {implied.error * items:,.0f} "
             f"items to choose from, the run knows {items:,}: propensities are too small"
         )
@@ -157,78 +242,52 @@ def evaluate_off_policy(
     else:
         # The quarter of the logs, 1 to 4 by time, in which each session begins.
         times = store.column(schema.TIMESTAMP)[steps.first]
-        segment = 1 + np.searchsorted(np.quantile(times, [0.25, 0.5, 0.75]), times, side="right")
-        per_step = step_value(steps, seed)
+        quartiles = np.quantile(times, [0.25, 0.5, 0.75])
+        evidence.segment = 1 + np.searchsorted(quartiles, times, side="right")
+        evidence.per_step = step_value(steps, seed)
     clusters = steps.cluster_weights
     if clusters is not None and abs((mean := float(clusters[steps.last].mean())) - 1) > FAR_OFF:
         # The estimated probabilities of groups are not good enough for sessions of this length.
         steps = replace(steps, cluster_propensity=None, cluster_target=None)
-        doubts.remarks.append(
+        evidence.remarks.append(
             f"MIPS is excluded: its session weights have mean {mean:.3g} where 1 is expected"
         )
     if not models.converged:
-        doubts.remarks.append(
+        evidence.remarks.append(
             "fitted Q evaluation diverged (its values exceed the largest possible return) and was "
             "stopped: ignore FQE"
         )
-    if per_step is not None and per_step.doubt:
-        doubts.remarks.append(per_step.doubt)
-    columns = {
-        "seen_in_training": seen,
-        "dropped": logged.report["dropped"],
-        "unknown_item_rows": logged.unknown_items,
-        **models.columns(),
-    }
-    return make_report(
-        trained,
-        rule,
-        steps,
-        seed,
-        options,
-        rows=len(steps.reward),
-        doubts=doubts,
-        columns=columns,
-        segment=segment,
-        declared=declared,
-        fingerprint=store.record.fingerprint,
-        models=models,
-        per_step=per_step,
-    )
+    if evidence.per_step is not None and evidence.per_step.doubt:
+        evidence.remarks.append(evidence.per_step.doubt)
+    evidence.steps = steps
+    return make_report(trained, rule, evidence, seed, options)
 
 
 def make_report(
     trained: TrainedPolicy,
     rule: DecisionRule,
-    steps: LoggedSteps,
+    evidence: Evidence,
     seed: int,
     options: EstimateOptions,
-    *,
-    rows: int,
-    doubts: Doubts,
-    columns: dict[str, Any],
-    segment: IntArray | None = None,
-    declared: str = "",
-    fingerprint: str | None = None,
-    models: ModelReport | None = None,
-    per_step: StepValue | None = None,
 ) -> OffPolicyReport:
     """Estimate from logged steps, judge the estimates, and make their result rows.
 
-    `R_cum` is the mean return, as in `ucfrec.evaluation.session_metrics`, and `R_step` the mean
+    `R_cum` is the mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean
     reward of a step; a row may have no interval.
-
-    Args:
-        rows: number of rows of the logs.
-        columns: further columns of the result rows.
-        segment: (S,) as `diagnose` takes it.
-        declared: what the estimates rest on beside the logs.
-        fingerprint: of the logs.
     """
+    steps, per_step = evidence.steps, evidence.per_step
     estimates = estimate(steps, seed)
-    diagnosis = diagnose(steps, options.reward_range, segment)
-    lift, filter_seen = options.wanted_lift, options.filter_seen
-    verdict = conclude(steps, seed, diagnosis, lift, doubts.forbidden, declared, filter_seen)
-    warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *doubts.remarks]
+    diagnosis = diagnose(steps, options.reward_range, evidence.segment)
+    verdict = conclude(
+        steps,
+        seed,
+        diagnosis,
+        options.wanted_lift,
+        evidence.forbidden,
+        evidence.declared,
+        options.filter_seen,
+    )
+    warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
     record, choice = trained.record, "softmax" if rule.draws else "greedy"
     conditions: dict[str, Scalar] = {
         "run": shorten_paths(str(trained.folder)),
@@ -237,9 +296,20 @@ def make_report(
         "anonymous": not options.users_known,
         "filter_seen": options.filter_seen,
         "sessions": len(steps.first),
-        "steps": rows,
+        "steps": evidence.rows,
     }
-    judged = {**columns, "warnings": warnings, **_columns_of_evidence(verdict, diagnosis)}
+    judged = {
+        **evidence.columns,
+        "warnings": warnings,
+        **{
+            name: value
+            for name, value in asdict(verdict).items()
+            if name not in ("estimator", "reasons")
+        },
+        "verdict": str(verdict),
+        "verdict_of": verdict.estimator,
+        **diagnosis.as_columns(),
+    }
 
     def make_row(name: str, result: Estimate, metric: str, units: str, table: str) -> ResultRow:
         row = ResultRow(
@@ -252,7 +322,7 @@ def make_report(
             evaluation_seed=seed,
             conditions={**conditions, "choice": "as logged" if name == LOGGED else choice},
             config_hash=config_hash(record.settings),
-            data_fingerprint=fingerprint,
+            data_fingerprint=evidence.fingerprint,
             metric=metric,
             metrics={metric: result.value},
             interval=result.interval,
@@ -273,7 +343,6 @@ def make_report(
     terms = None
     if weighable is not None and verdict.estimator is not None:
         terms = session_terms(weighable)[verdict.estimator].influences
-    of_steps = {} if per_step is None else per_step.estimates
     return OffPolicyReport(
         rows=[
             make_row(name, result, "R_cum", "sessions", "estimates")
@@ -281,47 +350,30 @@ def make_report(
         ],
         warnings=warnings,
         verdict=verdict,
-        models=models,
+        models=evidence.models,
         returns=np.empty(0) if weighable is None else weighable.returns,
         user=None if weighable is None else weighable.user,
         terms=terms,
         per_step=per_step,
         step_rows=[
             make_row(name, result, "R_step", "steps", "per step")
-            for name, result in of_steps.items()
+            for name, result in ({} if per_step is None else per_step.estimates).items()
         ],
     )
 
 
-def _columns_of_evidence(verdict: Verdict, diagnosis: Diagnosis) -> dict[str, Any]:
-    """The verdict, and what speaks against the estimates, by name."""
-    columns = asdict(verdict) | {"verdict": str(verdict), "verdict_of": verdict.estimator}
-    del columns["estimator"], columns["reasons"]
-    return columns | {
-        "overlap": diagnosis.overlap,
-        "users": diagnosis.users,
-        "sessions_without_propensity": diagnosis.left_out,
-        "effective_users": diagnosis.effective_users,
-        "effective_by_step": list(diagnosis.effective_by_step),
-        "unsupported_from_step": diagnosis.unsupported_from_step,
-        "weight_tests": [asdict(test) for test in diagnosis.tests],
-        "mean_weight": diagnosis.mean_weight,
-        "pareto_tail": diagnosis.tail,
-        "bounds": None if diagnosis.bounds is None else list(diagnosis.bounds),
-    }
-
-
-def _doubt_logs(logged: LoggedSessions, seen: float | None, pages: bool) -> Doubts:
-    """What rows seen in training, of unknown items, and dropped rows say."""
-    doubts, dropped = Doubts(seen_too_often(seen)), logged.report["dropped"]
+def _doubt_logs(evidence: Evidence, logged: LoggedSessions, pages: bool) -> None:
+    """Add what rows seen in training, of unknown items, and dropped rows say."""
+    seen, dropped = evidence.columns["seen_in_training"], logged.report["dropped"]
+    evidence.forbidden += seen_too_often(seen)
     if seen is None:
-        doubts.remarks.append(
+        evidence.remarks.append(
             "the store that the run was trained on is gone or has changed: whether these logs were "
             "seen in training is not known, and users begin without a history; move the run "
             "together with its store"
         )
     if logged.unknown_items:
-        doubts.remarks.append(
+        evidence.remarks.append(
             f"{logged.unknown_items:,} rows show items that the run does not know, and so never "
             "would: they weigh 0"
         )
@@ -329,15 +381,14 @@ def _doubt_logs(logged: LoggedSessions, seen: float | None, pages: bool) -> Doub
         rows = logged.store.n_steps + without_reward
         text = f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
         if without_reward > MOST_LEFT_OUT * rows:
-            doubts.forbidden.append(f"{text}, and may differ from the rest")
+            evidence.forbidden.append(f"{text}, and may differ from the rest")
         else:
-            doubts.remarks.append(text)
+            evidence.remarks.append(text)
     if pages and (repeated := dropped.get("duplicate", 0)):
-        doubts.remarks.append(
+        evidence.remarks.append(
             f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "
             "page can show an item twice, log its positions a millisecond apart"
         )
-    return doubts
 
 
 def _find_pages(logged: LoggedSessions) -> tuple[IntArray, IntArray | None]:
@@ -364,15 +415,8 @@ def collect_steps(
     In memory are some ten numbers a step; what the models see of it, and the probabilities of item
     groups, lie on disk.
 
-    Args:
-        logged: logs read with `keep_unknown`.
-        seed: seed of the folds, item groups and samples.
-
     Returns:
         The steps, how good the models are, and which propensities are estimated; "" if none is.
-
-    Raises:
-        InputError: propensities are not probabilities, or there is only one user.
     """
     store = logged.store
     propensity = np.full(store.n_steps, np.nan)
@@ -411,7 +455,7 @@ def collect_steps(
         inputs.append(batch_inputs)
         end = rows.stop
     columns: dict[str, Any] = {}
-    declared, unknown = "", plain.unknown_propensities
+    declared, unknown = "", int(np.isnan(propensity).sum())
     if options.estimate_propensities or (one_hot.shape[1] > 1 and unknown < len(items)):
         group = np.maximum(groups.number, 0)
         behavior = fit_behavior(inputs.states, items, group, plain.session, seed, plain.user)

@@ -1,25 +1,42 @@
-"""Logged steps as flat arrays, and the importance weights that follow from them.
+"""Logged steps as flat arrays, the importance weights that follow from them, and pages.
 
 Notation of the whole package: session i of S, step t (from 0) of its T_i steps; ρ_it =
 target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,−1 = 1; γ the discount.
+
+The steps of a page are its positions, chosen at once. The return of a page under another policy
+depends on how its positions influence each other, and the weights follow from what is assumed
+(McInerney, Brost, Chandar, Mehrotra & Carterette, *Counterfactual Evaluation of Slate
+Recommendations with Sequential Reward Interactions*, KDD 2020):
+
+| model of the reward at a position | depends on the items at | weight | estimates |
+|---|---|---|---|
+| independent | this position | ρ_it | IIPS, SNIIPS (Li et al., KDD 2018) |
+| cascade | this position and those before it | w_it = Π_{k ≤ t} ρ_ik | PDIS (their RIPS), SNPDIS |
+| slate | all positions | w_i = Π_k ρ_ik | IPS, SNIPS |
+
+Each model contains the one above it: a weaker assumption, and heavier weights.
 """
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
-_LARGEST = 1e100
+_LARGEST: Final = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
-_ROUNDING = 1e-6
+_ROUNDING: Final = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
-_PROPENSITIES = ("propensity", "cluster_propensity")
+_LEAST_RATIO: Final = 1e-12
+"""Mean ratio of a position below which nothing is divided by it."""
+PAGE_MS: Final = 10
+"""Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""
 _TARGETS = ("target", "cluster_target")
-_COLUMNS = ("reward", *_PROPENSITIES, *_TARGETS, "per_decision", "by_step")
+_PROBABILITIES = ("propensity", "cluster_propensity", *_TARGETS)
+_COLUMNS = ("reward", *_PROBABILITIES, "per_decision", "by_step")
 """What there is one number of a step."""
 
 
@@ -38,9 +55,7 @@ class Modelled:
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
-            column = _convert_to_floats(f"modelled {name}", values)
-            _require_finite(f"modelled {name}", column)
-            object.__setattr__(self, name, column)
+            object.__setattr__(self, name, _require_finite(f"modelled {name}", values))
 
 
 @dataclass(frozen=True)
@@ -93,8 +108,7 @@ class LoggedSteps:
     by_step: Float64Array | None = None
     """(N,) those of SNPDIS."""
     pages: bool = False
-    """Whether a session is one page and its steps the page's positions, chosen at once; see
-    `ucfrec.off_policy.pages`."""
+    """Whether a session is one page and its steps the page's positions (`as_pages`)."""
 
     def __post_init__(self) -> None:
         replace_field = partial(object.__setattr__, self)
@@ -107,13 +121,11 @@ class LoggedSteps:
         replace_field("session", session.astype(np.int64, copy=False))
         n = len(session)
         for name in _COLUMNS:
-            if getattr(self, name) is not None:
-                column = _convert_to_floats(name, getattr(self, name))
-                if name in (*_PROPENSITIES, *_TARGETS):
-                    column = _check_probabilities(name, column, self.densities)
+            if (values := getattr(self, name)) is not None:
+                if name in _PROBABILITIES:
+                    replace_field(name, _check_probabilities(name, values, self.densities))
                 else:
-                    _require_finite(name, column)
-                replace_field(name, column)
+                    replace_field(name, _require_finite(name, values))
         if self.user is not None:
             replace_field("user", _number_users(self.user))
         if (self.cluster_propensity is None) is not (self.cluster_target is None):
@@ -188,11 +200,6 @@ class LoggedSteps:
             return None
         return self._multiply(self.cluster_target / self.cluster_propensity)
 
-    @property
-    def unknown_propensities(self) -> int:
-        """How many steps have none."""
-        return int(np.isnan(self.propensity).sum())
-
     def per_session(self, values: Float64Array) -> Float64Array:
         """(S,) sums of values (N,)."""
         return np.asarray(np.add.reduceat(values, self.first))
@@ -211,40 +218,26 @@ class LoggedSteps:
 
     @cached_property
     def weighable(self) -> "LoggedSteps":
-        """The sessions of whose every step the propensity is known, renumbered.
-
-        Raises:
-            InputError: there is none.
-        """
-        return self.select(~self.lacking) if self.unknown_propensities else self
+        """The sessions of whose every step the propensity is known, renumbered; there is one."""
+        return self.select(~self.lacking) if self.lacking.any() else self
 
     def select(self, sessions: BoolArray) -> "LoggedSteps":
-        """The sessions that a mask (S,) marks, renumbered.
-
-        Raises:
-            InputError: it marks none.
-        """
+        """The sessions that a mask (S,) marks, renumbered."""
         rows = np.flatnonzero(sessions[self.session])
         numbers = (np.cumsum(sessions) - 1)[self.session[rows]]
         return self.regroup(rows, numbers, None if self.user is None else self.user[sessions])
 
     def regroup(self, rows: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
-        """Some steps, in other sessions.
-
-        Args:
-            rows: (M,) numbers of the steps, in their new order.
-            session: (M,) session of each, in the new order.
-            user: (S,) of the new sessions; None where each is of another user.
-        """
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        parts: dict[str, Any] = {
-            name: values[rows] for name, values in columns.items() if values is not None
+        """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
+        values = {name: getattr(self, name) for name in (*_COLUMNS, "model", "groups")}
+        taken: dict[str, Any] = {
+            name: replace(value, **{key: column[rows] for key, column in vars(value).items()})
+            if name in ("model", "groups")
+            else value[rows]
+            for name, value in values.items()
+            if value is not None
         }
-        for name in ("model", "groups"):
-            if (part := getattr(self, name)) is not None:
-                values = {field: column[rows] for field, column in vars(part).items()}
-                parts[name] = replace(part, **values)
-        return replace(self, session=session, user=user, **parts)
+        return replace(self, session=session, user=user, **taken)
 
     def _multiply(self, ratios: Float64Array) -> Float64Array:
         """(N,) products of ratios (N,) from the session's first step to each, in place."""
@@ -258,11 +251,7 @@ class LoggedSteps:
 
 
 def _convert_to_floats(name: str, values: Any) -> Float64Array:
-    """(N,) values as float64, not copied where they are that; NaN where one is missing or masked.
-
-    Raises:
-        InputError: they are no numbers, or have another shape.
-    """
+    """(N,) values as float64, not copied where they are that; NaN where one is missing."""
     try:
         column = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     except (TypeError, ValueError) as error:
@@ -287,13 +276,16 @@ def _number_users(values: Any) -> Array:
     return np.asarray(numbers)
 
 
-def _require_finite(name: str, values: Float64Array) -> None:
-    if count := int((~np.isfinite(values)).sum()):
-        raise InputError(f"{name} is not finite at {count:,} of {len(values):,} steps; correct it")
+def _require_finite(name: str, values: Any) -> Float64Array:
+    column = _convert_to_floats(name, values)
+    if count := int((~np.isfinite(column)).sum()):
+        raise InputError(f"{name} is not finite at {count:,} of {len(column):,} steps; correct it")
+    return column
 
 
-def _check_probabilities(name: str, values: Float64Array, densities: bool) -> Float64Array:
+def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Array:
     """The probabilities without rounding errors above 1; the same array where there are none."""
+    values = np.asarray(_convert_to_floats(name, values))
     above = (values > 1) & (values <= 1 + _ROUNDING)
     if above.any() and not densities:
         values = np.where(above, 1.0, values)
@@ -313,4 +305,65 @@ def _check_probabilities(name: str, values: Float64Array, densities: bool) -> Fl
             f"{rule}; {outside.sum():,} of {len(values):,} are outside, the first is "
             f"{values[outside][0]:.10g}{remedy}"
         )
-    return values
+    return np.asarray(values)
+
+
+def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = None) -> LoggedSteps:
+    """Put sessions of one step each together to pages: a session a page, in order of the numbers of
+    `page`, each of the user of its first step.
+
+    The evaluated policy chooses each position without knowing what the others got; its probability
+    of a page is the product of those of the positions. A model of the steps' reward stays: in DR it
+    is a control variate, whose errors the weights correct.
+
+    Args:
+        page: (N,) whose equal numbers mark one page.
+        position: (N,) by which the steps of a page are ordered, the cascade's first in front; None
+            for the order of the steps.
+
+    Raises:
+        InputError: a session has several steps, or `page` has another shape.
+    """
+    if len(steps.first) < len(steps.session):
+        raise InputError(
+            f"only {len(steps.first):,} sessions for {len(steps.session):,} steps: pages are made "
+            "of sessions of one step; prepare the logs with one session a row"
+        )
+    if page.shape != steps.session.shape:
+        raise InputError(f"page has shape {page.shape} for {len(steps.session):,} steps")
+    places = np.zeros(len(page)) if position is None else position
+    order = np.lexsort((places, page))
+    number = np.unique(page[order], return_inverse=True)[1]
+    first = np.flatnonzero(np.diff(number, prepend=-1))
+    user = None if steps.user is None else steps.user[order][first]
+    return replace(steps.regroup(order, number, user), pages=True)
+
+
+def number_pages(user: IntArray, time: IntArray) -> IntArray:
+    """(N,) number of each step's page: rows of one user (N,), each within 10 ms of the one before,
+    by their time (N,) in ms."""
+    order = np.lexsort((time, user))
+    begins = (np.diff(user[order], prepend=-1) != 0) | (np.diff(time[order], prepend=0) > PAGE_MS)
+    page = np.empty(len(order), dtype=np.int64)
+    page[order] = np.cumsum(begins) - 1
+    return page
+
+
+def independent_terms(steps: LoggedSteps) -> dict[str, tuple[Float64Array, Float64Array]]:
+    """Of each estimator under the independent model: the terms (S,) whose mean is the estimate, and
+    what each page counts (S,), its mean ratio. Propensities of all steps are known."""
+    ratios = steps.target / steps.propensity
+    rewards = steps.discounts * ratios * steps.reward
+    counts = steps.per_session(ratios) / steps.lengths
+    terms = {"IIPS": (steps.per_session(rewards), counts)}
+    # Means over pages, by position, of ρ, of ρ r γ^t over it, and of there being such a position.
+    pages = len(steps.first)
+    below = np.bincount(steps.step, ratios) / pages
+    if (below > _LEAST_RATIO).all():
+        mean = np.bincount(steps.step, rewards) / pages / below
+        positions = np.bincount(steps.step) / pages
+        # The estimate Σ_t positions_t mean_t, plus each page's influence on it.
+        beyond = (steps.discounts * steps.reward - mean[steps.step]) * ratios
+        influence = (positions / below)[steps.step] * beyond + mean[steps.step]
+        terms["SNIIPS"] = (steps.per_session(influence), counts)
+    return terms

@@ -1,25 +1,31 @@
-"""The return of a policy, estimated from the rows that `ucfrec score` wrote, of any number.
+"""Scored rows of any number: written by workers of Spark, and the return that follows from them.
 
-The rows are read twice, in batches, and summed to sessions: in memory is a row a session. What
-needs models of the reward (DM, FQE, DR) or the probabilities of other items (MIPS) needs the logs.
+For an estimate the rows are read twice, in batches, and summed to sessions: in memory is a row a
+session. What needs models of the reward (DM, FQE, DR) or the probabilities of other items (MIPS)
+needs the logs.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, one_line
-from ucfrec.files.parquet import require_regular
-from ucfrec.off_policy.diagnostics import MOST_LEFT_OUT
+from ucfrec.files.atomic import atomic_file, atomic_folder
+from ucfrec.files.parquet import part_name, require_regular, write_frames
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.off_policy.estimators import StepSums, normalise_by_step
-from ucfrec.off_policy.evaluate import Doubts, EstimateOptions, OffPolicyReport, make_report
+from ucfrec.off_policy.evaluate import EstimateOptions, Evidence, OffPolicyReport, make_report
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.score import (
     PROBABILITY,
@@ -27,10 +33,16 @@ from ucfrec.off_policy.score import (
     UNKNOWN_ITEMS,
     about_scores,
     hash_rows,
+    prepare_sessions,
+    require_items,
+    score,
     seen_too_often,
     share_of_rows_seen,
+    training_options,
 )
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.off_policy.verdict import MOST_LEFT_OUT
+from ucfrec.runs.on_workers import RunOnWorkers
+from ucfrec.runs.trained_policy import ITEMS, TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18
 _TESTED_ROWS: Final = 2**20
@@ -70,33 +82,37 @@ def evaluate_scored(
     ]
     if not files:
         raise InputError(f"{paths[0]} has no .parquet file; name what ucfrec score wrote")
-    described = [_check_file(file, about_scores(trained, rule)) for file in files]
+    described = [_read_metadata(file, trained, rule) for file in files]
     rows = sum(metadata.num_rows for metadata in described)
     sessions = _sum_sessions(files, options)
-    seen = _share_seen(trained, files, rows)
-    doubts = Doubts(remarks=["from scored rows: without models of the reward there is no DR"])
+    every, keys = max(1, rows // _TESTED_ROWS), []
+    for file in files:
+        for batch in _read_batches(file, _KEYS):
+            users, items, times = (batch[name][::every] for name in _KEYS)
+            known = trained.users.numbers(users), trained.items.numbers(items)
+            keys.append(hash_rows(*known, times))
+    seen = share_of_rows_seen(trained, np.concatenate(keys))
+    evidence = Evidence(sessions, rows, {"seen_in_training": seen})
+    evidence.remarks = ["from scored rows: without models of the reward there is no DR"]
     counts = [(metadata.metadata or {}).get(UNKNOWN_ITEMS.encode(), b"") for metadata in described]
     if not all(count.isdigit() for count in counts):
-        doubts.remarks.append(
+        evidence.remarks.append(
             "rows of items that the run does not know are not part of scored rows; where the logs "
             "have many, estimate from the logs"
         )
     elif unknown := sum(map(int, counts)):
         # In the logs they weigh 0; here sessions lack them.
         much = unknown > MOST_LEFT_OUT * (rows + unknown)
-        (doubts.forbidden if much else doubts.remarks).append(
+        (evidence.forbidden if much else evidence.remarks).append(
             f"{unknown:,} of {rows + unknown:,} rows show items that the run does not know, and "
             "are not part of scored rows: estimate from the logs, where they weigh 0"
         )
-    doubts.forbidden += seen_too_often(seen)
-    columns = {"seen_in_training": seen}
-    return make_report(
-        trained, rule, sessions, seed, options, rows=rows, doubts=doubts, columns=columns
-    )
+    evidence.forbidden += seen_too_often(seen)
+    return make_report(trained, rule, evidence, seed, options)
 
 
-def _check_file(file: Path, scored_by: Mapping[str, str]) -> pq.FileMetaData:
-    """The metadata of a file that the run and rule scored."""
+def _read_metadata(file: Path, trained: TrainedPolicy, rule: DecisionRule) -> pq.FileMetaData:
+    """Metadata of a file that the run and rule scored."""
     require_regular(file)
     try:
         described = pq.read_metadata(file)
@@ -108,7 +124,7 @@ def _check_file(file: Path, scored_by: Mapping[str, str]) -> pq.FileMetaData:
             f"{file} has no column {', '.join(dict.fromkeys(missing))}; name what ucfrec score "
             "made of logs with propensities"
         )
-    for name, value in scored_by.items():
+    for name, value in about_scores(trained, rule).items():
         scored = (described.metadata or {}).get(name.encode(), b"").decode(errors="replace")
         if scored != value:
             raise InputError(
@@ -130,7 +146,7 @@ def _read_batches(file: Path, names: Sequence[str]) -> Iterator[dict[str, Array]
 
 
 def _read_whole_sessions(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Array]]]:
-    """The rows that are weighed, in batches that end where a session does; with their last file."""
+    """The rows that are weighed, in batches that end where a session does; with their file."""
     held: dict[str, Array] = {}
     for file in files:
         for rows in _read_batches(file, _WEIGHED):
@@ -147,12 +163,7 @@ def _read_whole_sessions(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str
 
 def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[LoggedSteps, IntArray]]:
     """The sessions of all files, in order, some at once; with the number (S,) of each session's
-    user, over all of them.
-
-    Raises:
-        InputError: they are not in the order in which `score` writes them, or a reward or a
-            probability is none.
-    """
+    user, over all of them."""
     session, user, users = -1, None, 0
     for file, rows in _read_whole_sessions(files):
         rises = np.diff(rows[SESSION], prepend=session)
@@ -213,12 +224,76 @@ def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedStep
     )
 
 
-def _share_seen(trained: TrainedPolicy, files: Sequence[Path], rows: int) -> float | None:
-    """About the share of rows that are in the run's training or validation data."""
-    every, keys = max(1, rows // _TESTED_ROWS), []
-    for file in files:
-        for batch in _read_batches(file, _KEYS):
-            users, items, times = (batch[name][::every] for name in _KEYS)
-            users, items = trained.users.numbers(users), trained.items.numbers(items)
-            keys.append(hash_rows(users, items, times))
-    return share_of_rows_seen(trained, np.concatenate(keys))
+def score_with_spark(
+    trained: TrainedPolicy,
+    files: Sequence[Path],
+    mapping: LogMapping,
+    out: Path,
+    master: str,
+    *,
+    checkpoint: str = "best",
+    rule: DecisionRule | None = None,
+    filter_seen: bool = False,
+    memory_limit: str = "2GB",
+) -> int:
+    """Write the probability of every choice of logs, as `score` finds it.
+
+    Args:
+        files: logs, which every worker sees, as the run folder and `out`.
+        mapping: of the logs' columns; what it leaves open is as in the training logs.
+        out: folder for the scores, Parquet parts with sessions numbered throughout.
+        master: Spark's master, e.g. "local[*]" or "spark://host:7077".
+        checkpoint: with which `trained` was loaded.
+        memory_limit: of a worker while it reads its rows.
+
+    Returns:
+        The number of sessions.
+
+    Raises:
+        InputError: the policy's actions are vectors, the logs cannot be used, or Spark is missing
+            or fails.
+    """
+    require_items(trained)
+    columns, options = training_options(trained, mapping)
+    assert options.reward is not None
+    log = UserLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
+    with atomic_folder(out) as folder:
+        run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
+        score_part = partial(_score_part, run, folder.absolute(), memory_limit, rule, filter_seen)
+        sessions = map_users(log, folder.parent, master, score_part)
+        number_sessions(folder, sessions)
+    return sum(sessions)
+
+
+def _score_part(
+    run: RunOnWorkers,
+    folder: Path,
+    memory_limit: str,
+    rule: DecisionRule,
+    filter_seen: bool,
+    part: int,
+    rows: Path,
+    mapping: LogMapping,
+) -> int:
+    """Write the file of a part, with sessions numbered from 0; returns their number. A worker calls
+    it (`ucfrec.logs.spark.Work`)."""
+    trained = run.load()
+    _, options = training_options(trained, mapping, memory_limit)
+    options = replace(options, reward=schema.REWARD)
+    with prepare_sessions(trained, [rows], mapping, options) as logged:
+        frames = score(trained, logged, rule, filter_seen)
+        write_frames(folder / part_name(part), frames, about_scores(trained, rule))
+        return logged.store.n_episodes
+
+
+def number_sessions(folder: Path, sessions: Sequence[int]) -> None:
+    """Number the sessions of all parts in a row, given how many each of the parts has."""
+    first = 0
+    for file, count in zip(sorted(folder.iterdir()), sessions, strict=True):
+        with atomic_file(file) as scratch, pq.ParquetFile(file) as source:
+            place = source.schema_arrow.get_field_index(SESSION)
+            with pq.ParquetWriter(scratch, source.schema_arrow) as writer:
+                for batch in source.iter_batches():
+                    numbers = pc.add(batch.column(place), pa.scalar(first, pa.int64()))
+                    writer.write_batch(batch.set_column(place, SESSION, numbers))
+        first += count

@@ -1,4 +1,4 @@
-"""Base of all sequence policies: configuration, normalisation, action loss, token embedding."""
+"""Base of all sequence policies: configuration, normalisation, action loss."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -11,13 +11,11 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
-from ucfrec.policies.layers import embedding, some_padding
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
@@ -185,7 +183,7 @@ class SequencePolicy(nn.Module, ABC):
         Returns-to-go are first raised to the lowest value in the training data: after a session has
         reached its target return, they would otherwise leave the range of the training data.
         """
-        states = ((windows.states - self.state_mean) / self.state_std).clamp(-_CLIP, _CLIP)
+        states = standardise(windows.states, self.state_mean, self.state_std)
         returns_to_go = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
         return replace(windows, states=states, returns_to_go=returns_to_go / self.return_scale)
 
@@ -204,13 +202,12 @@ class SequencePolicy(nn.Module, ABC):
             features: (B, K, d) of the windows.
             windows: normalised.
         """
-        exposed, padded = self.exposed(windows), some_padding(windows.mask)
+        padded = some_padding(windows.mask)
+        exposed = self.exposed(windows, padded)
 
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
             return values.flatten(0, 1) if padded is None else values[padded]
 
-        if exposed is not None and padded is not None:
-            exposed = exposed.select(padded.flatten())
         inputs = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
             value = self.head.loss(*inputs)  # type: ignore[arg-type]
@@ -255,16 +252,23 @@ class SequencePolicy(nn.Module, ABC):
         best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 
-    def exposed(self, windows: Windows) -> Exposed | None:
-        """What was shown before each of the (B·K) steps; None without `policy.exposure`."""
+    def exposed(self, windows: Windows, steps: Tensor | None = None) -> Exposed | None:
+        """What was shown before each of the (B·K) steps, or of the `steps` of a mask (B, K); None
+        without `policy.exposure`."""
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
-        return Exposed.before(windows, self.head.exposure.lags)
+        exposed = Exposed.before(windows, self.head.exposure.lags)
+        return exposed if steps is None else exposed.select(steps.flatten())
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
         return Exposed.before_last(windows, self.head.exposure.lags)
+
+
+def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """States (..., S) in standard deviations from their mean, clipped."""
+    return ((states - mean) / std).clamp(-_CLIP, _CLIP)
 
 
 def require_items(name: str, sizes: Mapping[str, int]) -> None:
@@ -277,42 +281,6 @@ def require_items(name: str, sizes: Mapping[str, int]) -> None:
         raise InputError(
             f"{name} recommends items; this store's actions are vectors; use another policy"
         )
-
-
-class TokenEmbedding(nn.Module):
-    """Tokens of returns-to-go, states and actions (Appendix G.3).
-
-    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
-    """
-
-    def __init__(self, config: PolicyConfig, state_size: int) -> None:
-        super().__init__()
-        self.embed_return: nn.Module = nn.Linear(1, config.dim)
-        self.embed_state = nn.Linear(state_size, config.dim)
-        self.embed_timestep = embedding(config.max_timestep, config.dim)
-        self.norm = nn.LayerNorm(config.dim)
-
-    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tokens of returns-to-go, states and actions, (B, K, d) each.
-
-        Args:
-            windows: normalised.
-            actions: (B, K, d) embedded actions.
-        """
-        time, returns, states = self._parts(windows)
-        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
-
-    def stacked(self, windows: Windows, actions: Tensor) -> Tensor:
-        """The same as one tensor (3, B, K, d), with fewer operations."""
-        time, returns, states = self._parts(windows)
-        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
-
-    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
-        """Embedded time, returns-to-go and states, (B, K, d) each."""
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        return time, returns, self.embed_state(windows.states)
 
 
 def require_heads(config: PolicyConfig, heads: int) -> None:
@@ -329,7 +297,51 @@ def require_heads(config: PolicyConfig, heads: int) -> None:
     )
 
 
-def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
-    batch, length, dim = returns.shape
-    return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)
+def some_padding(mask: Tensor) -> Tensor | None:
+    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all.
+
+    A graph that is exported holds for every padding.
+    """
+    on_cpu = mask.device.type == "cpu" and not torch.compiler.is_compiling()
+    return None if on_cpu and bool(mask.all()) else mask
+
+
+def draw_normal(weight: Tensor, std: float = 1.0) -> Tensor:
+    """Fill `weight` from N(0, std²), unless it has no memory, as where sizes are compared with
+    those of a file: torch would import its compiler, which takes longer than torch itself."""
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
+    return weight
+
+
+def embedding(rows: int, size: int) -> nn.Embedding:
+    """`nn.Embedding(rows, size)`, with `draw_normal`."""
+    return nn.Embedding(rows, size, _weight=draw_normal(torch.empty(rows, size)))
+
+
+def init_linear(module: nn.Module) -> None:
+    """Initialise all linear layers as GPT-2 does: weights from N(0, 0.02²), biases 0."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            draw_normal(layer.weight, std=0.02)
+            nn.init.zeros_(layer.bias)
+
+
+def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
+    """Outputs (B, K, d) of a network for left-padded inputs, whatever the padding before a session.
+
+    The network runs with the padding moved behind the steps.
+
+    Args:
+        network: with `batch_first=True`.
+        inputs: (B, K, c).
+        mask: (B, K) bool, false at padding.
+    """
+    length = mask.shape[1]
+    padding = (~mask).sum(1, keepdim=True)
+    places = torch.arange(length, device=mask.device)
+
+    def rolled(x: Tensor, by: Tensor) -> Tensor:
+        return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
+
+    return rolled(network(rolled(inputs, padding))[0], -padding)

@@ -12,9 +12,8 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.counterfactual.reward_model import mlp
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Shown, Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import VectorHead
 from ucfrec.user_model.reward import MEMORY, ItemRewardModel
@@ -109,7 +108,7 @@ class CRMGreedyPolicy(SequencePolicy):
         if not isinstance(model, ItemRewardModel):
             return self._errors(windows)[:, -1].mean()
         states, items = windows.states[:, -1], windows.actions[:, -1]
-        predicted = model.expected(model.score(states, Shown.before_last(windows), None, items))
+        predicted = model.expect(model.score(states, Shown.before_last(windows), None, items))
         return ((windows.rewards[:, -1] - predicted) / model.reward_std).square().mean()
 
     def act(self, windows: Windows) -> Tensor:

@@ -1,22 +1,38 @@
-"""Decision Transformer (Chen et al., 2021): a baseline and the backbone of `w/o Arch`."""
+"""Decision Transformer (Chen et al., 2021), a baseline and the backbone of `w/o Arch`; variants.
+
+CDT4Rec (Wang et al., SIGIR 2023) also estimates the reward. DT4Rec (Zhao et al., WWW 2023) has
+returns as soft buckets, recurrent encoders and a contrastive loss.
+"""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Annotated
 
+import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec import schema, settings
+from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import (
     Heads,
     Layers,
     PolicyConfig,
     SequencePolicy,
-    TokenEmbedding,
-    interleave,
+    init_linear,
+    recurrent,
     require_heads,
 )
-from ucfrec.policies.layers import Dropout, attend, init_linear, visible_tokens
-from ucfrec.settings import settings_table
+from ucfrec.policies.ucf import (
+    Dropout,
+    TokenEmbedding,
+    draw_mask,
+    interleave,
+    visible_tokens,
+)
+from ucfrec.settings import Weight, settings_table
 
 
 @settings_table("policy")
@@ -56,13 +72,13 @@ class DTPolicy(SequencePolicy):
 
     def transform(self, windows: Windows) -> Tensor:
         """Outputs at all tokens R_0, s_0, a_0, R_1, …, (B, 3K, d), from normalised windows."""
-        return self.attended(self.tokens(windows), windows.mask)
+        return self.attend(self.tokens(windows), windows.mask)
 
     def tokens(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens R_t, s_t and a_t, (B, K, d) each, from normalised windows."""
         return self.embed(windows, self.head.embed(windows.actions))  # type: ignore[no-any-return]
 
-    def attended(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> Tensor:
+    def attend(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> Tensor:
         """Outputs (B, 3K, d) at tokens of `tokens`; `mask` (B, K) is false at padding."""
         hidden, visible = self._first(tokens, mask)
         for block in self.blocks:
@@ -73,7 +89,7 @@ class DTPolicy(SequencePolicy):
         """Row K − 1 of `features`, (B, d), without what the last block has for other tokens."""
         first = self._first(self.tokens(windows), windows.mask)
         state = slice(-2, -1)
-        return self.final_norm(rows_through(self.blocks, *first, state))[:, 0]  # type: ignore[no-any-return]
+        return self.final_norm(pass_rows(self.blocks, *first, state))[:, 0]  # type: ignore[no-any-return]
 
     def _first(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the first block (B, 3K, d), and which of them see which, (B, 1, 3K, 3K)."""
@@ -98,16 +114,16 @@ class Block(nn.Module):
     def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
         """Map (B, L, d) to (B, L, d); `visible` (B, 1, L, L) comes from `visible_tokens`."""
         query, key, value = self.query_key_value(self.attention_norm(hidden)).chunk(3, dim=-1)
-        return self._updated(hidden, query, key, value, visible)
+        return self._update(hidden, query, key, value, visible)
 
     def rows(self, hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
         """The `rows` of what `forward` gives, (B, M, d)."""
         layer, dim, normed = self.query_key_value, hidden.shape[-1], self.attention_norm(hidden)
         query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
         key, value = F.linear(normed, layer.weight[dim:], layer.bias[dim:]).chunk(2, dim=-1)
-        return self._updated(hidden[:, rows], query, key, value, visible[:, :, rows])
+        return self._update(hidden[:, rows], query, key, value, visible[:, :, rows])
 
-    def _updated(
+    def _update(
         self, hidden: Tensor, query: Tensor, key: Tensor, value: Tensor, visible: Tensor
     ) -> Tensor:
         """Tokens (B, M, d) whose queries (B, M, d) have attended to keys and values (B, L, d)."""
@@ -122,12 +138,228 @@ class Block(nn.Module):
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
 
-def rows_through(
-    blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice
-) -> Tensor:
+def pass_rows(blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
     """The `rows` (B, M, d) of what `Block`s make of (B, L, d), by `visible` (B, 1, L, L)."""
     *first_blocks, last = blocks
     assert isinstance(last, Block)
     for block in first_blocks:
         hidden = block(hidden, visible)
     return last.rows(hidden, visible, rows)
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor, visible: Tensor, dropout: float) -> Tensor:
+    """Scaled dot-product attention (B, H, L, c) of query, key and value of this shape.
+
+    Args:
+        visible: (B, 1, L, L) bool, true where a row may attend to a column; somewhere in each row.
+        dropout: share of the attention weights that is dropped, as by `Dropout`.
+    """
+    if dropout == 0 or query.device.type != "cpu":
+        return F.scaled_dot_product_attention(query, key, value, visible, dropout)
+    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
+    weights = scores.masked_fill(~visible, -torch.inf).softmax(-1)
+    return torch.matmul(weights * draw_mask(weights.shape, dropout), value)
+
+
+@settings_table("policy")
+class CDT4RecConfig(DTConfig):
+    """Settings of CDT4Rec; the backbone is DT, as in its public code."""
+
+    reward_weight: Weight = 0.5
+    """Weight of the squared error of the standardised reward; 0 gives DT. The public code adds both
+    losses unweighted and does not standardise rewards."""
+
+
+class CDT4RecPolicy(DTPolicy):
+    """DT with a causal reward estimator on its hidden states.
+
+    The hidden state of s_t attends to those of a_0, …, a_t (keys and values). The result and the
+    state together predict r_t, and the error also trains the shared blocks. The public code
+    concatenates the hidden states of a_t and s_t instead, and never trains its reward head.
+    """
+
+    Config = CDT4RecConfig
+    config: CDT4RecConfig
+    reward_mean: Tensor
+    reward_std: Tensor
+
+    def __init__(self, config: CDT4RecConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        dim = config.dim
+        self.register_buffer("reward_mean", torch.zeros(()))
+        self.register_buffer("reward_std", torch.ones(()))
+        self.attention = nn.MultiheadAttention(dim, config.heads, batch_first=True)
+        self.estimate = nn.Sequential(nn.Linear(2 * dim, dim), nn.ReLU(), nn.Linear(dim, 1))
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Set the mean and standard deviation of the training rewards."""
+        rewards = torch.from_numpy(train.column(schema.REWARD))
+        self.reward_mean.copy_(rewards.mean())
+        self.reward_std.copy_(rewards.std(correction=0).clamp(min=1e-6))
+
+    def estimate_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
+        """Estimates (B, K) of the logged actions' standardised rewards, from outputs (B, 3K, d) of
+        `transform`; the mask (B, K) is false at padding."""
+        states, actions = hidden[:, 1::3], hidden[:, 2::3]
+        length = mask.shape[1]
+        later = torch.ones(length, length, dtype=torch.bool, device=mask.device).triu(1)
+        diagonal = torch.eye(length, dtype=torch.bool, device=mask.device)
+        hidden_keys = (later | ~mask.unsqueeze(1)) & ~diagonal  # (B, K, K)
+        attended, _ = self.attention(
+            states,
+            actions,
+            actions,
+            attn_mask=hidden_keys.repeat_interleave(self.config.heads, dim=0),
+            need_weights=False,
+        )
+        return self.estimate(torch.cat([attended, states], dim=-1)).squeeze(-1)  # type: ignore[no-any-return]
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Action loss plus weighted reward loss over all steps, and scalars to log."""
+        mask = windows.mask
+        normalized = self.normalize(windows)
+        hidden = self.transform(normalized)
+        imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
+        rewards = (windows.rewards - self.reward_mean) / self.reward_std
+        reward_loss = (self.estimate_rewards(hidden, mask) - rewards).square()[mask].mean()
+        return imitation + self.config.reward_weight * reward_loss, {
+            **scalars,
+            "reward_loss": reward_loss.detach(),
+        }
+
+
+@settings_table("policy")
+class DT4RecConfig(DTConfig):
+    """Settings of DT4Rec; defaults are those of its public code, which has no contrastive loss."""
+
+    layers: Layers = 2
+    """Transformer blocks, each attention and a perceptron."""
+    heads: Heads = 8
+    """Attention heads per block; must divide `dim`."""
+    buckets: Annotated[int, Field(ge=1, le=100_000)] = 100
+    """Buckets of the reward prompt, spread evenly over the range of training returns-to-go."""
+    recurrent_dropout: settings.Dropout = 0.2
+    """Dropout between the two layers of the recurrent encoders."""
+    negatives: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Wrong returns-to-go per window in the contrastive loss, each of which costs a forward pass of
+    the Transformer; the paper has 8."""
+    contrastive_weight: Weight = 0.1
+    """Weight of the contrastive loss; 0 gives the loss of the public code."""
+    temperature: Annotated[float, Field(gt=0, le=1000)] = 0.07
+    """Temperature of the contrastive loss, which divides the similarities."""
+
+
+class DT4RecPolicy(DTPolicy):
+    """DT whose tokens come from a reward prompt and from recurrent encoders.
+
+    The contrastive loss draws the features of a step closer to the embedding of its action with the
+    logged return-to-go than with others. The public code shifts the next return by 0 to 7; here,
+    the others are returns of other windows of the batch, which are on the scale of the data.
+    Actions are one item or one vector, so the shared heads decode them. The recurrent decoder of
+    the public code is not used; it starts from the encoding of the true action.
+    """
+
+    Config = DT4RecConfig
+    config: DT4RecConfig
+    embed: "PromptedEmbedding"
+
+    def __init__(self, config: DT4RecConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        self.embed = PromptedEmbedding(config, sizes["state"])
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Spread the buckets evenly over the range of training returns-to-go."""
+        returns = torch.from_numpy(train.step_values(schema.RETURN_TO_GO, *train.all_steps()))
+        low, high = returns.min() / self.return_scale, returns.max() / self.return_scale
+        centres = self.embed.embed_return.centres
+        centres.copy_(low + (high - low) * torch.linspace(0, 1, len(centres)))
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
+        config, normalized = self.config, self.normalize(windows)
+        tokens = self.tokens(normalized)
+        features = self.attend(tokens, normalized.mask)[:, 1::3]
+        imitation, scalars = self.imitation(features, normalized)
+        if config.contrastive_weight == 0:
+            return imitation, scalars
+        contrast = self.contrastive_loss(normalized, tokens[1:], features)
+        scalars["contrastive_loss"] = contrast.detach()
+        return imitation + config.contrastive_weight * contrast, scalars
+
+    def contrastive_loss(
+        self, windows: Windows, encoded: tuple[Tensor, Tensor], features: Tensor
+    ) -> Tensor:
+        """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.
+
+        Args:
+            windows: B normalised windows, with their `features` (B, K, d).
+            encoded: their tokens s_t and a_t, (B, K, d) each, which returns do not change.
+        """
+        config, mask = self.config, windows.mask
+        actions = self.head.embed(windows.actions)[mask]
+        scores = [F.cosine_similarity(features[mask], actions, dim=-1)]
+        for _ in range(config.negatives):
+            order = torch.randperm(len(mask), device=mask.device)
+            both_valid = mask & mask[order]
+            returns = torch.where(both_valid, windows.returns_to_go[order], windows.returns_to_go)
+            prompts = self.embed.returns(replace(windows, returns_to_go=returns))
+            negative = self.attend((prompts, *encoded), mask)[:, 1::3]
+            score = F.cosine_similarity(negative[mask], actions, dim=-1)
+            # An equal return-to-go is not a negative.
+            same = (returns == windows.returns_to_go)[mask]
+            scores.append(score.masked_fill(same, -torch.inf))
+        logits = torch.stack(scores, dim=-1) / config.temperature  # (M, 1 + negatives)
+        return F.cross_entropy(logits, logits.new_zeros(len(logits), dtype=torch.int64))
+
+
+class PromptedEmbedding(TokenEmbedding):
+    """Tokens: returns from the reward prompt, states and actions from two-layer GRUs."""
+
+    embed_return: "RewardPrompt"
+
+    def __init__(self, config: DT4RecConfig, state_size: int) -> None:
+        super().__init__(config, state_size)
+        self.embed_return = RewardPrompt(config)
+        self.states, self.actions = (
+            nn.GRU(config.dim, config.dim, 2, batch_first=True, dropout=config.recurrent_dropout)
+            for _ in range(2)
+        )
+
+    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tokens of returns-to-go, states and actions, (B, K, d) each; see `TokenEmbedding`."""
+        states = recurrent(self.states, self.embed_state(windows.states), windows.mask)
+        actions = recurrent(self.actions, actions, windows.mask)
+        time = self._time(windows)
+        return self.returns(windows), self.norm(states + time), self.norm(actions + time)
+
+    def returns(self, windows: Windows) -> Tensor:
+        """Tokens of returns-to-go alone, (B, K, d)."""
+        prompts = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        return self.norm(prompts + self._time(windows))  # type: ignore[no-any-return]
+
+    def _time(self, windows: Windows) -> Tensor:
+        last = self.embed_timestep.num_embeddings - 1
+        return self.embed_timestep(windows.timesteps.clamp(max=last))  # type: ignore[no-any-return]
+
+
+class RewardPrompt(nn.Module):
+    """Embeds a return as a soft mixture of buckets: similar returns have similar embeddings.
+
+    h = LeakyReLU(w R), z = softmax(W h + h); the embedding is Σ_b z_b M_b, where M_b is a linear
+    map of the centre of bucket b.
+    """
+
+    centres: Tensor
+
+    def __init__(self, config: DT4RecConfig) -> None:
+        super().__init__()
+        self.register_buffer("centres", torch.linspace(0, 1, config.buckets, device="cpu"))
+        self.weight = nn.Linear(1, config.buckets, bias=False)
+        self.mix = nn.Linear(config.buckets, config.buckets, bias=False)
+        self.embed_centre = nn.Linear(1, config.dim)
+
+    def forward(self, returns: Tensor) -> Tensor:
+        """Embed scaled returns-to-go (B, K, 1) as (B, K, d)."""
+        hidden = F.leaky_relu(self.weight(returns))
+        shares = (self.mix(hidden) + hidden).softmax(-1)  # (B, K, buckets)
+        return shares @ self.embed_centre(self.centres.unsqueeze(-1))  # type: ignore[no-any-return]

@@ -1,4 +1,7 @@
-"""UCF's hybrid causal architecture (paper section 3.2)."""
+"""UCF's hybrid causal architecture (paper section 3.2), and the layers that it shares with others.
+
+Dropout, attention and convolution cost less here than PyTorch's on a CPU.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Final
@@ -15,18 +18,19 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
-    TokenEmbedding,
-    interleave,
+    embedding,
     require_heads,
+    some_padding,
 )
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.layers import ConvStream, Dropout, convolved, some_padding
 from ucfrec.settings import Share, Weight, settings_table
 
 _FEW: Final = 32
 """Windows up to which calling an operation costs more than its arithmetic."""
 EPSILON: Final = 1e-8
 """Added inside the logarithm of Eq. 5 (Table 7)."""
+_LEVELS = 2**16
+"""Values of the random 16-bit numbers that decide what a CPU drops."""
 
 
 @settings_table("policy")
@@ -85,10 +89,9 @@ class UCFPolicy(SequencePolicy):
         super().__init__(config, sizes)
         dim = config.dim
         self.embed = TokenEmbedding(config, sizes["state"])
-        blocks = dim, config.conv_blocks, config.dropout
-        self.return_stream = ConvStream(*blocks)
-        self.state_stream = ConvStream(*blocks)
-        self.action_stream = ConvStream(*blocks)
+        self.return_stream = ConvStream(config)
+        self.state_stream = ConvStream(config)
+        self.action_stream = ConvStream(config)
         self.fuse = nn.Linear(3 * dim, dim)
         self.fuse_norm = nn.LayerNorm(dim)
         self.attention = SupervisedAttention(config)
@@ -103,23 +106,26 @@ class UCFPolicy(SequencePolicy):
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
-        return self._outputs(*self._fused(windows), _visible(windows.mask))
+        states, tokens = self._fuse_streams(windows)
+        return self._outputs(states, tokens, _visible(windows.mask))
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d): attention has a single query."""
-        states, tokens = self._fused(windows)
+        states, tokens = self._fuse_streams(windows)
         return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
 
     def acting_features(self) -> Callable[[Windows], Tensor]:
         """`last_features`, with stacked weights for a few windows."""
-        own = type(self).last_features is UCFPolicy.last_features
-        return StackedStreams(self) if own else self.last_features
+        is_inherited = type(self).last_features is UCFPolicy.last_features
+        return StackedStreams(self) if is_inherited else self.last_features
 
-    def _fused(self, windows: Windows) -> tuple[Tensor, Tensor]:
+    def _fuse_streams(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
+        padded = some_padding(windows.mask)
         tokens = self.embed(windows, self.head.embed(windows.actions))
-        streams = (self.return_stream, self.state_stream, self.action_stream)
-        returns, states, actions = convolved(streams, tokens, windows.mask)
+        returns = self.return_stream(tokens[0], padded)
+        states = self.state_stream(tokens[1], padded)
+        actions = self.action_stream(tokens[2], padded)
         # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
         # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
         of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
@@ -129,7 +135,6 @@ class UCFPolicy(SequencePolicy):
         fused_states = self.fuse_norm(states + revealed)
         revealed = revealed + F.linear(actions, of_action)
         fused_actions = self.fuse_norm(actions + revealed)
-
         return fused_states, interleave(fused_returns, fused_states, fused_actions)
 
     def _outputs(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,16 +204,14 @@ class SupervisedAttention(nn.Module):
         self.dropout = Dropout(config.dropout)
 
     def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d).
+        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d), R_0, s_0, a_0, R_1, …
 
         Args:
-            tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
             visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
 
         Returns:
             Output (B, Q, d), without dropout of its own, and probabilities (B, H, Q, 3K) before
-            dropout. Each row sums to one; padded tokens get zero probability, except from their own
-            row.
+            dropout, which sum to one in each row.
         """
         width = states.shape[-1] // self.heads
         # Heads are slices, which matrix products read where they lie; heads as a dimension of the
@@ -224,6 +227,164 @@ class SupervisedAttention(nn.Module):
         return self.out(mixed), attention
 
 
+class Dropout(nn.Dropout):
+    """Sets a share p of the values to 0 and divides the others by 1 − p.
+
+    On a CPU, p is rounded to a multiple of 2⁻¹⁶: four values share one 64-bit draw, which takes a
+    fifth of the time of one draw each.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Values of any shape, unchanged in evaluation mode."""
+        if not self.training or self.p == 0:
+            return input
+        if input.device.type != "cpu":
+            return F.dropout(input, self.p)
+        return input * draw_mask(input.shape, self.p)
+
+    def add(self, residual: Tensor, input: Tensor) -> Tensor:
+        """`residual` + this dropout of `input`, both of the same shape, in one pass."""
+        if not self.training or self.p == 0 or input.device.type != "cpu":
+            dropped: Tensor = self(input)
+            return residual + dropped
+        return torch.addcmul(residual, input, draw_mask(input.shape, self.p))
+
+
+def draw_mask(shape: torch.Size, p: float) -> Tensor:
+    """Independent draws, float32 on the CPU: 0 with probability p, rounded to a multiple of 2⁻¹⁶,
+    otherwise 1 / (1 − p)."""
+    dropped = round(p * _LEVELS)
+    if dropped == _LEVELS:
+        return torch.zeros(shape)
+    mask = torch.empty(shape)
+    draws = torch.empty(-(-mask.numel() // 4), dtype=torch.int64).random_(-(2**63), None)
+    levels = draws.view(torch.int16)[: mask.numel()].view(shape)
+    torch.ge(levels, dropped - _LEVELS // 2, out=mask)
+    return mask.mul_(_LEVELS / (_LEVELS - dropped))
+
+
+class TokenEmbedding(nn.Module):
+    """Tokens of returns-to-go, states and actions (Appendix G.3).
+
+    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
+    """
+
+    def __init__(self, config: PolicyConfig, state_size: int) -> None:
+        super().__init__()
+        self.embed_return: nn.Module = nn.Linear(1, config.dim)
+        self.embed_state = nn.Linear(state_size, config.dim)
+        self.embed_timestep = embedding(config.max_timestep, config.dim)
+        self.norm = nn.LayerNorm(config.dim)
+
+    def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tokens of returns-to-go, states and actions, (B, K, d) each, from normalised windows and
+        embedded actions (B, K, d)."""
+        time, returns, states = self._parts(windows)
+        return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
+
+    def stack(self, windows: Windows, actions: Tensor) -> Tensor:
+        """The same as one tensor (3, B, K, d), with fewer operations."""
+        time, returns, states = self._parts(windows)
+        return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
+
+    def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
+        """Embedded time, returns-to-go and states, (B, K, d) each."""
+        last = self.embed_timestep.num_embeddings - 1
+        time = self.embed_timestep(windows.timesteps.clamp(max=last))
+        returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        return time, returns, self.embed_state(windows.states)
+
+
+def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
+    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
+    batch, length, dim = returns.shape
+    return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)
+
+
+class CausalDepthwise(nn.Conv1d):
+    """A depthwise convolution over the last 3 steps: the output at t depends on t − 2 to t.
+
+    It has the weights of `nn.Conv1d(dim, dim, 3, groups=dim)`. Adding three shifted products needs
+    no transposed copies, which cost more than the convolution itself.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__(dim, dim, kernel_size=3, groups=dim)
+
+    def forward(self, input: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Map (B, K, d) to (B, K, d).
+
+        Args:
+            mask: (B, K) bool, false at steps that count as zeros; None if all count.
+        """
+        steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)
+        taps = self.weight[:, 0].T.contiguous()  # strided factors take three times as long
+        return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _ShiftedProducts(torch.autograd.Function):
+    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from x (B, K, d), w (3, d) and b (d,)."""
+
+    @staticmethod
+    def forward(ctx: Any, steps: Tensor, taps: Tensor, bias: Tensor) -> Any:
+        ctx.save_for_backward(steps, taps)
+        out = torch.addcmul(bias, steps, taps[2])
+        for back in (1, 2):
+            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        steps, taps = ctx.saved_tensors
+        of_steps, of_taps = gradient * taps[2], torch.empty_like(taps)
+        of_taps[2] = (gradient * steps).sum((0, 1))
+        for back in (1, 2):
+            later, earlier = gradient[:, back:], steps[:, :-back]
+            of_steps[:, :-back].addcmul_(later, taps[2 - back])
+            of_taps[2 - back] = (later * earlier).sum((0, 1))
+        return of_steps, of_taps, gradient.sum((0, 1))
+
+
+class ConvStream(nn.Module):
+    """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
+
+    def __init__(self, config: UCFConfig) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(
+            _ConvBlock(config.dim, config.dropout) for _ in range(config.conv_blocks)
+        )
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        """Map (B, K, d) to (B, K, d); steps outside the mask count as zeros in convolutions."""
+        for block in self.blocks:
+            tokens = block(tokens, mask)
+        return tokens
+
+
+class _ConvBlock(nn.Module):
+    def __init__(self, dim: int, dropout: float) -> None:
+        super().__init__()
+        self.depthwise = CausalDepthwise(dim)
+        self.pointwise = nn.Linear(dim, dim)
+        self.dropout = Dropout(dropout)
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+        local = self.depthwise(tokens, mask)
+        return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
+
+
+def visible_tokens(valid: Tensor) -> Tensor:
+    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
+
+    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
+    """
+    length = valid.shape[1]
+    earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
+    diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
+    return ((earlier & valid.unsqueeze(1)) | diagonal).unsqueeze(1)
+
+
 def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:
     """Target attention q of the row that predicts a_t, over tokens (R_0, s_0, a_0, R_1, …).
 
@@ -232,10 +393,7 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
     normalised to sum to one.
 
     Args:
-        mask: (B, K) bool, true at steps of the episode, false at padding.
-        window: number of earlier states that are parents.
-        decay: weight of the state k steps earlier is decay^k.
-        previous_action: weight of a_{t−1}.
+        mask: (B, K) bool, false at padding.
 
     Returns:
         (B, K, 3K); rows of padded steps are zero.
@@ -254,24 +412,15 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
 
 
 def mask_loss(attention: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
-    """Mean cross-entropy (nats) of attention against the causal parents (Eq. 5).
-
-    Args:
-        attention: (B, H, K, 3K) probabilities after the softmax, before dropout.
-        targets: (B, K, 3K) from `parent_targets`.
-        mask: (B, K) bool.
-    """
+    """Mean cross-entropy (nats) of attention (B, H, K, 3K), before dropout, against the causal
+    parents (B, K, 3K) of `parent_targets` at the steps of the mask (B, K) (Eq. 5)."""
     entropy = -(targets.unsqueeze(1) * torch.log(attention + EPSILON)).sum(-1)  # (B, H, K)
     return entropy.mean(1)[mask].mean()
 
 
 def _visible(mask: Tensor) -> Tensor:
     """(B, K, 3K): true where s_t may attend to a token: itself and valid tokens before it."""
-    length = mask.shape[1]
-    row = 3 * torch.arange(length, device=mask.device).unsqueeze(1) + 1
-    token = torch.arange(3 * length, device=mask.device)
-    valid = mask.repeat_interleave(3, dim=1).unsqueeze(1)
-    return (token <= row) & valid | (token == row)
+    return visible_tokens(mask.repeat_interleave(3, dim=1))[:, 0, 1::3]
 
 
 class StackedStreams:
@@ -281,15 +430,12 @@ class StackedStreams:
     """
 
     def __init__(self, policy: UCFPolicy) -> None:
-        """
-        Args:
-            policy: in evaluation mode; its weights must not change afterwards.
-        """
+        """The policy is in evaluation mode; its weights must not change afterwards."""
         self._policy = policy
         streams = (policy.return_stream, policy.state_stream, policy.action_stream)
         with torch.no_grad():
             layers = zip(*(stream.blocks for stream in streams), strict=True)
-            self._blocks = [_stacked(blocks) for blocks in layers]
+            self._blocks = [_stack_blocks(blocks) for blocks in layers]
             self._eps = float(policy.return_stream.blocks[0].norm.eps)  # type: ignore[arg-type,union-attr]
             self._fuse = torch.stack([part.T for part in policy.fuse.weight.chunk(3, dim=1)])
             # The sum over the modalities known so far begins with the bias.
@@ -305,16 +451,16 @@ class StackedStreams:
         head = policy.head
         # Vectors of a few items cost less than keeping those of all.
         embed = head.vectors if isinstance(head, ItemHead) else head.embed
-        tokens = policy.embed.stacked(windows, embed(windows.actions))
-        tokens = self._convolved(tokens, some_padding(windows.mask))
+        tokens = policy.embed.stack(windows, embed(windows.actions))
+        tokens = self._convolve(tokens, some_padding(windows.mask))
         rows = tokens.view(3, batch * length, -1)
         sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
         fused = policy.fuse_norm(sums.add_(rows)).view(tokens.shape)
-        attended = self._attended(fused, windows.mask)
+        attended = self._attend_last(fused, windows.mask)
         hidden = fused[1, :, -1] + attended
         return policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
-    def _convolved(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+    def _convolve(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         """The three streams of tokens (3, B, K, d); padded steps count as zeros."""
         shape, dim = tokens.shape, tokens.shape[-1]
         for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
@@ -327,7 +473,7 @@ class StackedStreams:
             tokens = torch.addcmul(shift, normed, scale)
         return tokens
 
-    def _attended(self, tokens: Tensor, mask: Tensor) -> Tensor:
+    def _attend_last(self, tokens: Tensor, mask: Tensor) -> Tensor:
         """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""
         layer, (_, batch, length, dim) = self._policy.attention, tokens.shape
         heads, size = layer.heads, dim // layer.heads
@@ -343,18 +489,18 @@ class StackedStreams:
         return layer.out(mixed)  # type: ignore[no-any-return]
 
 
-def _stacked(blocks: tuple[torch.nn.Module, ...]) -> tuple[Tensor, ...]:
+def _stack_blocks(blocks: tuple[torch.nn.Module, ...]) -> tuple[Tensor, ...]:
     """The weights of one block of each stream."""
 
-    def stacked(name: str) -> Tensor:
+    def stack(name: str) -> Tensor:
         return torch.stack([block.get_parameter(name) for block in blocks])
 
-    taps = stacked("depthwise.weight")[:, :, 0]  # (3, d, 3)
+    taps = stack("depthwise.weight")[:, :, 0]  # (3, d, 3)
     return (
         taps.permute(2, 0, 1)[:, :, None, None].contiguous(),
-        stacked("depthwise.bias")[:, None, None],
-        stacked("pointwise.weight").mT.contiguous(),
-        stacked("pointwise.bias").unsqueeze(1),
-        stacked("norm.weight")[:, None, None],
-        stacked("norm.bias")[:, None, None],
+        stack("depthwise.bias")[:, None, None],
+        stack("pointwise.weight").mT.contiguous(),
+        stack("pointwise.bias").unsqueeze(1),
+        stack("norm.weight")[:, None, None],
+        stack("norm.bias")[:, None, None],
     )

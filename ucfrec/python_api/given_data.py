@@ -4,7 +4,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from numbers import Real
 from pathlib import Path
 from tempfile import gettempdir
@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.arguments import require_ids, shown
-from ucfrec.arrays import Array
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -51,7 +50,7 @@ _OPTIONS: Final = (
     (r"--policy ([\w-]+)", r"policy='\1'"),
 )
 """Options of commands in messages, and what they are in Python."""
-_NOT_THE_USERS: Final = re.compile(r"(ucfrec|contextlib)(\.|$)")
+_OUR_MODULES: Final = re.compile(r"(ucfrec|contextlib)(\.|$)")
 """Modules whose lines a warning does not name."""
 
 
@@ -69,7 +68,7 @@ def require_logs(name: str, value: object) -> object:
     return value
 
 
-def split_given(name: str, value: object) -> tuple[float, ...]:
+def read_split(name: str, value: object) -> tuple[float, ...]:
     """A split as `PrepareOptions.split` has it, of shares or of times in any form.
 
     Raises:
@@ -83,20 +82,20 @@ def split_given(name: str, value: object) -> tuple[float, ...]:
     return parse_split(",".join(map(str, parts)))
 
 
-def _mapping(given: Columns | None) -> LogMapping:
-    if given is None or isinstance(given, LogMapping):
-        return given or LogMapping()
-    if isinstance(given, (str, Path)):
-        return read_mapping(Path(given))
-    if not isinstance(given, Mapping) or not all(isinstance(each, str) for each in given.values()):
-        raise InputError(
-            f"mapping is {shown(given)}; give a LogMapping, a TOML file, or a dictionary of log "
-            "columns to columns of the data"
-        )
-    return LogMapping(given)
+def _read_columns(columns: Columns | None) -> LogMapping:
+    if columns is None or isinstance(columns, LogMapping):
+        return columns or LogMapping()
+    if isinstance(columns, (str, Path)):
+        return read_mapping(Path(columns))
+    if isinstance(columns, Mapping) and all(isinstance(name, str) for name in columns.values()):
+        return LogMapping(columns)
+    raise InputError(
+        f"mapping is {shown(columns)}; give a LogMapping, a TOML file, or a dictionary of log "
+        "columns to columns of the data"
+    )
 
 
-def store_given(
+def prepare_store(
     data: EpisodeStore | Logs, mapping: Columns | None, scratch: Path, options: Mapping[str, Any]
 ) -> EpisodeStore:
     """The store that `data` is, or one prepared from the logs in it.
@@ -115,22 +114,24 @@ def store_given(
         if options or mapping is not None:
             raise InputError(f"{data} is prepared already; prepare its logs with other options")
         return data if isinstance(data, EpisodeStore) else EpisodeStore.open(str(data))
-    given, dataset = _mapping(mapping), options.get("dataset", "generic")
+    columns, dataset = _read_columns(mapping), options.get("dataset", "generic")
     if "dataset" in options and not _are_paths(data):
         raise InputError(f"dataset is {dataset!r}, but only files have one; leave it out")
+    frame = None
     if isinstance(data, LogFiles):
-        files, given, dataset = data.files, given.over(data.mapping), data.dataset
+        files, columns, dataset = data.files, columns.over(data.mapping), data.dataset
     elif _are_paths(data):
         adapter: Dataset = load_plugin("datasets", dataset)
-        files, given = adapter.resolve(_paths(data), given)
+        files, columns = adapter.resolve(_list_paths(data), columns)
     else:
-        files = (_written(data, scratch),)
-    with in_words_of_python(files[0] if files[0].parent == scratch else None):
-        named = PrepareOptions(**{**options, "dataset": dataset})
-        _require_gap(options, named.session_by or given.session_by)
-        report = prepare(files, given, scratch / "store", named)
+        frame = _write_frame(data, scratch)
+        files = (frame,)
+    with use_words_of_python(frame):
+        how = PrepareOptions(**{**options, "dataset": dataset})
+        _require_gap(options, how.session_by or columns.session_by)
+        report = prepare(files, columns, scratch / "store", how)
         _require_gap(options, report["session_by"])
-        note_dropped("", _not_noted(report), report["rows_read"], fine=())
+        _note_dropped(report, fine=())
     (scratch / _FRAME).unlink(missing_ok=True)
     return EpisodeStore.open(scratch / "store")
 
@@ -144,24 +145,21 @@ def _require_gap(options: Mapping[str, Any], session_by: str | None) -> None:
         )
 
 
-def _not_noted(report: Mapping[str, Any]) -> dict[str, int]:
-    """Rows that a report counts as dropped, by reason, without the reasons that `prepare` notes."""
+def _note_dropped(report: Mapping[str, Any], **how: Any) -> None:
+    """Warn of dropped rows, but for the reasons that `prepare` itself warns of."""
     dropped: Mapping[str, int] = report["dropped"]
-    wanted = report["rows_read"] - dropped["left_out"]
-    return {
-        reason: n for reason, n in dropped.items() if n <= MANY * wanted or reason == "left_out"
-    }
+    most = MANY * (report["rows_read"] - dropped["left_out"])
+    counts = {name: n for name, n in dropped.items() if n <= most or name == "left_out"}
+    note_dropped("", counts, report["rows_read"], **how)
 
 
 @contextmanager
-def logs_given(
+def read_logs(
     trained: TrainedPolicy, logs: Logs | None, mapping: Columns | None, keep_unknown: bool
 ) -> Iterator[LoggedSessions]:
     """Later logs of a policy, or None for the test split of its store.
 
     Args:
-        trained: the policy.
-        logs: the logs.
         mapping: of their columns; what it leaves open is as in the training log.
         keep_unknown: see `read_logged_sessions`.
 
@@ -173,18 +171,17 @@ def logs_given(
             raise InputError("mapping is of logs, and none are given; leave it out")
         yield held_out_sessions([trained])
         return
-    with ExitStack() as stack:
-        files, given, frame = stack.enter_context(files_given(trained, logs, mapping))
-        with in_words_of_python(frame):
-            read = read_logged_sessions(trained, files, given, keep_unknown)
-            logged = stack.enter_context(read)
-            note_dropped("", _not_noted(logged.report), logged.report["rows_read"])
-        with _errors_in_words_of_python(frame):
-            yield logged
+    with (
+        open_files(trained, logs, mapping) as (files, columns, frame),
+        use_words_of_python(frame),
+        read_logged_sessions(trained, files, columns, keep_unknown) as logged,
+    ):
+        _note_dropped(logged.report)
+        yield logged
 
 
 @contextmanager
-def files_given(
+def open_files(
     trained: TrainedPolicy, logs: Logs, mapping: Columns | None
 ) -> Iterator[tuple[tuple[Path, ...], LogMapping, Path | None]]:
     """Later logs of a policy as files: the files, the mapping, and the file of a frame, which lasts
@@ -193,18 +190,18 @@ def files_given(
     Raises:
         InputError: a path is missing, or the frame cannot be used.
     """
-    given = _mapping(mapping)
+    columns = _read_columns(mapping)
     if isinstance(logs, LogFiles):
-        yield logs.files, given.over(logs.mapping), None
+        yield logs.files, columns.over(logs.mapping), None
     elif _are_paths(logs):
-        yield *later_logs(trained, _paths(logs), given), None
+        yield *later_logs(trained, _list_paths(logs), columns), None
     else:
         with scratch_folder(Path(gettempdir()), "frame") as scratch:
-            file = _written(logs, scratch)
-            yield (file,), given, file
+            file = _write_frame(logs, scratch)
+            yield (file,), columns, file
 
 
-def histories_given(
+def read_histories(
     trained: TrainedPolicy,
     frame: pd.DataFrame | None,
     mapping: Columns | None,
@@ -217,28 +214,23 @@ def histories_given(
             of them has no rows.
     """
     stored = frame is None
-    wanted = None if users is None else require_ids("users", users, schema.USER_ID)
+    ids = None if users is None else require_ids("users", users, schema.USER_ID)
     if frame is None:
-        frame = _stored(trained, wanted)
+        store = trained.require_store("give the histories of the users as a frame")
+        if ids is not None:
+            numbers = trained.users.numbers(ids)
+            theirs = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
+            if not theirs.any():
+                raise InputError(f"none of the {len(ids):,} users is in the store of the run")
+            store = store.select(theirs.to_numpy().nonzero()[0])
+        columns = [schema.PROPENSITY, schema.IS_RANDOM, schema.SPLIT]
+        frame = store.to_frame().drop(columns=columns, errors="ignore")
         mapping = LogMapping({name: name for name in _KEYS if name in frame})
-    histories = histories_of_frame(trained, frame, _mapping(mapping), stored)
-    return histories if wanted is None else select_users(histories, wanted)
+    histories = histories_of_frame(trained, frame, _read_columns(mapping), stored)
+    return histories if ids is None else select_users(histories, ids)
 
 
-def _stored(trained: TrainedPolicy, users: Array | None) -> pd.DataFrame:
-    """The rows of the run's store, of some users or all."""
-    store = trained.require_store("give the histories of the users as a frame")
-    if users is not None:
-        numbers = trained.users.numbers(users)
-        kept = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
-        if not kept.any():
-            raise InputError(f"none of the {len(users):,} users is in the store of the run")
-        store = store.select(kept.to_numpy().nonzero()[0])
-    names = (schema.PROPENSITY, schema.IS_RANDOM, schema.SPLIT)
-    return store.to_frame().drop(columns=list(names), errors="ignore")
-
-
-def _written(frame: Any, scratch: Path) -> Path:
+def _write_frame(frame: Any, scratch: Path) -> Path:
     """A frame as a file that is read like any log."""
     file = scratch / _FRAME
     pq.write_table(log_table(frame, "data"), file)
@@ -246,48 +238,37 @@ def _written(frame: Any, scratch: Path) -> Path:
 
 
 def _are_paths(logs: object) -> bool:
-    several = isinstance(logs, Sequence) and all(isinstance(one, (str, Path)) for one in logs)
+    several = isinstance(logs, Sequence) and all(isinstance(path, (str, Path)) for path in logs)
     return isinstance(logs, (str, Path)) or several
 
 
-def _paths(logs: Any) -> list[str | Path]:
+def _list_paths(logs: Any) -> list[str | Path]:
     return [logs] if isinstance(logs, (str, Path)) else list(logs)
 
 
 @contextmanager
-def in_words_of_python(file: Path | None = None) -> Iterator[None]:
+def use_words_of_python(file: Path | None = None) -> Iterator[None]:
     """Let errors and warnings of the block name arguments, not a scratch file or options.
 
     Args:
         file: scratch file of the argument `data`.
     """
 
-    with warnings.catch_warnings(record=True) as noted:
+    def translate(message: object) -> str:
+        text = str(message) if file is None else str(message).replace(str(file), "data")
+        for option, python in _OPTIONS:
+            text = re.sub(option, python, text)
+        return text
+
+    with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always")
-        with _errors_in_words_of_python(file):
+        try:
             yield
-    for each in noted:
-        warnings.warn(each.category(_translated(each.message, file)), stacklevel=_level_of_caller())
-
-
-@contextmanager
-def _errors_in_words_of_python(file: Path | None) -> Iterator[None]:
-    try:
-        yield
-    except InputError as error:
-        raise InputError(_translated(error, file)) from None
-
-
-def _translated(message: object, file: Path | None) -> str:
-    text = str(message) if file is None else str(message).replace(str(file), "data")
-    for option, python in _OPTIONS:
-        text = re.sub(option, python, text)
-    return text
-
-
-def _level_of_caller() -> int:
-    """The `stacklevel` at which a warning of the calling function names the user's line."""
-    level, frame = 0, sys._getframe()
-    while frame.f_back is not None and _NOT_THE_USERS.match(frame.f_globals.get("__name__", "")):
-        level, frame = level + 1, frame.f_back
-    return level
+        except InputError as error:
+            raise InputError(translate(error)) from None
+    for note in notes:
+        # The first line of the user's, above ours.
+        level, frame = 1, sys._getframe()
+        while frame.f_back and _OUR_MODULES.match(frame.f_globals.get("__name__", "")):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(note.category(translate(note.message)), stacklevel=level)

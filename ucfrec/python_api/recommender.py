@@ -24,8 +24,8 @@ from ucfrec.arguments import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.ranking_table import require_one_catalogue
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.locks import scratch_folder
 from ucfrec.fitting.loop import Callbacks, Watcher
@@ -40,25 +40,22 @@ from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,
-    files_given,
-    histories_given,
-    in_words_of_python,
-    logs_given,
+    open_files,
+    prepare_store,
+    read_histories,
+    read_logs,
+    read_split,
     require_logs,
-    split_given,
-    store_given,
+    use_words_of_python,
 )
-from ucfrec.python_api.run_folders import Scratch, kept_beside
+from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
-from ucfrec.recommending.recommend import recommend
-from ucfrec.recommending.similar import similar_items
+from ucfrec.recommending.recommend import recommend, similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
-from ucfrec.results.table import Evaluation, Ranking, ResultTable
+from ucfrec.results.rows import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
-from ucfrec.runs.refit import refit_within
-from ucfrec.runs.screened import train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.update import UpdateOptions, update_run
 
@@ -74,7 +71,7 @@ _checked: Final = check_arguments(
         **dict.fromkeys(("out", "run", "folder", "file"), require_kind("a path", str, Path)),
         **dict.fromkeys(("on_step", "on_validation"), require_kind("a function", Callable)),
         **dict.fromkeys(("data", "logs"), require_logs),
-        "split": split_given,
+        "split": read_split,
         "histories": require_kind("a pandas DataFrame with one row per interaction", pd.DataFrame),
         "rule": require_kind("a DecisionRule", DecisionRule),
         "options": require_kind("EstimateOptions", EstimateOptions),
@@ -86,6 +83,10 @@ _checked: Final = check_arguments(
 
 class Recommender:
     """A policy that recommends items, trained from logs.
+
+    Its methods raise `InputError` if it is not trained yet, or if data or an argument cannot be
+    used. Several have the arguments `rule`, the decision rule, None for the run's own, and
+    `mapping`, of the columns of logs: what it leaves open is as in the training log.
 
     Example::
 
@@ -105,9 +106,6 @@ class Recommender:
             settings: as for `ucfrec train --set`: `{"train.steps": 200}`,
                 `{"train": {"steps": 200}}` or `["train.steps=200"]`.
             seed: of everything random.
-
-        Raises:
-            InputError: the policy or a setting is unknown or out of range.
         """
         self.policy, self.settings, self.seed = policy, settings, seed
         self.config = resolve_config(policy, None, settings, seed)
@@ -124,11 +122,8 @@ class Recommender:
         return "".join(f"<p>{escape(line)}</p>" for line in lines)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The arguments of the constructor, as scikit-learn's estimators have it.
-
-        Args:
-            deep: also every setting, as `table__field`.
-        """
+        """The arguments of the constructor, as scikit-learn's estimators have it; with `deep`, also
+        every setting, as `table__field`."""
         params = {name: getattr(self, name) for name in _OWN}
         if deep:
             for table in TABLES:
@@ -140,25 +135,24 @@ class Recommender:
         """Change arguments of the constructor, or settings as `train__steps=200`, before `fit`.
 
         Another policy keeps the settings that it has too.
-
-        Raises:
-            InputError: a policy or setting is unknown or out of range; nothing is changed then.
         """
-        own = {name: params.pop(name) for name in _OWN if name in params}
-        given = {name: own.get(name, getattr(self, name)) for name in _OWN}
-        if "settings" not in own and given["policy"] != self.policy:
-            known = {f"policy.{each.name}" for each in fields(policy_class(given["policy"]).Config)}
-            given["settings"] = {
-                name: value
-                for name, value in settings_given(self.settings).items()
-                if name in known or not name.startswith("policy.")
-            }
+        policy, seed = params.pop("policy", self.policy), params.pop("seed", self.seed)
+        settings = params.pop("settings", None)
+        if settings is None:
+            settings = self.settings
+            if policy != self.policy:
+                names = {f"policy.{field.name}" for field in fields(policy_class(policy).Config)}
+                settings = {
+                    name: value
+                    for name, value in settings_given(settings).items()
+                    if name in names or not name.startswith("policy.")
+                }
         if params:
-            new = {name.replace("__", ".", 1): value for name, value in params.items()}
+            changes = {name.replace("__", ".", 1): value for name, value in params.items()}
             # Texts `table.field=value` come first, so that the new values count.
-            given["settings"] = settings_given(given["settings"]) | new
-        self.config = resolve_config(given["policy"], None, given["settings"], given["seed"])
-        self.policy, self.settings, self.seed = (given[name] for name in _OWN)
+            settings = settings_given(settings) | changes
+        self.config = resolve_config(policy, None, settings, seed)
+        self.policy, self.settings, self.seed = policy, settings, seed
         return self
 
     @_checked
@@ -178,13 +172,12 @@ class Recommender:
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
     ) -> Self:
-        """Train on a store's training episodes; logs are prepared into a store first.
+        """Train on a store's training episodes; returns this recommender. Logs are prepared first.
 
         Args:
             data: a store or its folder; or logs: files, folders and globs, what
-                `ucfrec_datasets.load` returns, or a frame with one row per interaction:
-                `user_id`, `item_id`, `timestamp` (milliseconds, dates or timestamps) and
-                feedback.
+                `ucfrec_datasets.load` returns, or a frame with one row per interaction: `user_id`,
+                `item_id`, `timestamp` (milliseconds, dates or timestamps) and feedback.
             out: run folder, resumed if training was interrupted; a store prepared from logs is kept
                 beside it, as `OUT-store`. None for temporary ones, which last as long as this
                 recommender.
@@ -201,45 +194,36 @@ class Recommender:
                 `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
             on_validation: called after every validation with the step and all that is logged.
-
-        Returns:
-            This recommender, trained.
-
-        Raises:
-            InputError: the data or its options cannot be used, or `out` is another run.
         """
-        names = ("reward", "session_by", "gap_minutes", "split", "dataset")
-        values = (reward, session_by, gap_minutes, split, dataset)
-        options = {n: v for n, v in zip(names, values, strict=True) if v is not None}
-        with ExitStack() as scratch:
+        options = {
+            "reward": reward,
+            "session_by": session_by,
+            "gap_minutes": gap_minutes,
+            "split": split,
+            "dataset": dataset,
+        }
+        options = {name: value for name, value in options.items() if value is not None}
+        with ExitStack() as stack:
             # Whoever fits next removes what is left, should this process be killed.
-            own = None if out is None else Path(out).absolute()
-            parent = Path(tempfile.gettempdir()) if own is None else own.parent
-            folder = scratch.enter_context(scratch_folder(parent, "run"))
-            store = store_given(data, mapping, folder, options)
-            if own is not None and store.path.parent == folder:
-                store = kept_beside(own, store)
-            out = folder / "run" if own is None else own
+            parent = Path(tempfile.gettempdir()) if out is None else Path(out).absolute().parent
+            folder = stack.enter_context(scratch_folder(parent, "run"))
+            run = folder / "run" if out is None else Path(out).absolute()
+            store = prepare_store(data, mapping, folder, options)
+            if out is not None and store.path.parent == folder:
+                store = keep_beside(run, store)
             watchers = Callbacks(on_step, on_validation)
-            record = train_screened(store, out, self.config, screen, callbacks=watchers)
-            if warning := record.learned_nothing(read_metrics(out / "policy")):
-                with in_words_of_python():
+            record = train_policy(store, run, self.config, screen, refit, watchers)
+            if warning := record.learned_nothing(read_metrics(run / "policy")):
+                with use_words_of_python():
                     warnings.warn(InputNote(warning), stacklevel=2)
-            if refit:
-                refit_within(store, out)
-            write_card(out)
-            trained = TrainedPolicy.load(out)
-            kept = Scratch(scratch.pop_all()) if any(folder.iterdir()) else None
-        self._trained, self._scratch = trained, kept
+            trained = TrainedPolicy.load(run)
+            scratch = Scratch(stack.pop_all()) if any(folder.iterdir()) else None
+        self._trained, self._scratch = trained, scratch
         return self
 
     @property
     def run(self) -> Path:
-        """The run folder.
-
-        Raises:
-            InputError: the recommender is not trained, or its folder is gone.
-        """
+        """The run folder."""
         folder = self.trained.folder
         if not folder.is_dir():
             raise InputError(
@@ -250,16 +234,12 @@ class Recommender:
 
     @property
     def trained(self) -> TrainedPolicy:
-        """The policy with the lowest validation loss.
-
-        Raises:
-            InputError: the recommender is not trained; call `fit` first.
-        """
+        """The policy with the lowest validation loss."""
         if self._trained is None:
             raise InputError("this policy is not trained yet; call fit(...) or load(run) first")
         return self._trained
 
-    def _evaluated(self, logs: Logs | None) -> TrainedPolicy:
+    def _load_for(self, logs: Logs | None) -> TrainedPolicy:
         """The policy that logs can evaluate: the test split, the weights before a refit."""
         run, trained = self.run, self.trained
         if logs is not None or trained.record.refit_of is None:
@@ -288,11 +268,10 @@ class Recommender:
         made of at most the last 1,000 rows of a user; all rows count as seen.
 
         Args:
-            histories: one row per interaction, in any order: `user_id`, `item_id`, `timestamp`
-                (milliseconds, dates or timestamps); `reward`, or the columns of the training
-                reward's expression; `session_id`, if the run's sessions are split by it; and
-                `observation` (lists of floats), if the run has observations. None for the rows
-                of the store that the policy was trained on.
+            histories: one row per interaction, as for `fit`, in any order: with `reward`, or the
+                columns of the training reward's expression; `session_id`, if the run's sessions
+                are split by it; and `observation` (lists of floats), if the run has observations.
+                None for the rows of the store that the policy was trained on.
             k: number of items per user, at least 1.
             users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
@@ -300,7 +279,6 @@ class Recommender:
             skip_unknown: ignore rows of items that are not in the training data, and such
                 candidates where others are left.
             new_session: whether users begin a new session; otherwise their latest one goes on.
-            rule: the decision rule; None for the run's own, `Recommender.trained.rule`.
             seed: of the draws of a rule with a temperature, or that explores. They also depend on
                 the user and the time of the user's last row.
             mapping: names of the columns of `histories`; those that it leaves open are as in the
@@ -311,16 +289,11 @@ class Recommender:
             the items that are left, nats), `propensity` (probability of the item at its position,
             given those before it), `request_id`: k rows per user in the order shown, users in
             sorted order; fewer rows if fewer items remain, as with less than k candidates.
-
-        Raises:
-            InputError: the recommender is not trained, an argument is wrong, a column is missing or
-                of a wrong type, no row can be used, a user has no rows, or an item or candidate
-                is not in the training data.
         """
         trained = self.trained
         frames = recommend(
             trained,
-            histories_given(trained, histories, mapping, users),
+            read_histories(trained, histories, mapping, users),
             k,
             rule=rule,
             seed=seed,
@@ -329,7 +302,7 @@ class Recommender:
             skip_unknown=skip_unknown,
             new_session=new_session,
         )
-        with in_words_of_python():
+        with use_words_of_python():
             return pd.concat(frames, ignore_index=True)
 
     @_checked
@@ -342,9 +315,6 @@ class Recommender:
 
         Returns:
             `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
-
-        Raises:
-            InputError: the recommender is not trained, or an item is not in the training data.
         """
         return similar_items(self.trained, items, k)
 
@@ -367,29 +337,20 @@ class Recommender:
             logs: later logs, as for `fit`; None for the test split of the store.
             k: items recommended at each step.
             others: policies trained on the same store, ranked beside this one; or only one.
-            rule: the decision rule of this policy; None for the run's own.
             filter_seen: exclude items that the user has seen before a step.
             liked: truth value over the column reward, such as "reward >= 4"; None for at least 60%
                 of the way from the lowest training reward to the highest.
             seed: of the bootstrap over users and of the random baseline.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
-
-        Raises:
-            InputError: the recommender is not trained, the logs cannot be used, or another policy
-                has another catalogue.
         """
         beside = require_list("others", others, "a Recommender", Recommender)
-        trained, *rest = (policy._evaluated(logs) for policy in (self, *beside))
-        require_one_catalogue([trained, *rest])
-        candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
-        with (
-            logs_given(trained, logs, mapping, keep_unknown=False) as logged,
-            in_words_of_python(),
-        ):
+        policies = [policy._load_for(logs) for policy in (self, *beside)]
+        require_one_catalogue(policies)
+        rules = [rule or policies[0].rule, *(policy.rule for policy in policies[1:])]
+        with read_logs(policies[0], logs, mapping, keep_unknown=False) as logged:
             return rank_policies(
-                candidates,
+                list(zip(policies, rules, strict=True)),
                 logged,
-                _named(logs),
+                _name_logs(logs),
                 k=k,
                 filter_seen=filter_seen,
                 liked=liked,
@@ -414,20 +375,15 @@ class Recommender:
 
         Args:
             logs: logs with propensities, as for `fit`; None for the test split of the store.
-            rule: the decision rule; None for the run's own.
             options: what is estimated, and how.
             seed: of the folds and the bootstrap.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
-
-        Raises:
-            InputError: the recommender is not trained, or the logs cannot be used.
         """
-        trained = self._evaluated(logs)
-        with logs_given(trained, logs, mapping, keep_unknown=True) as logged:
+        trained = self._load_for(logs)
+        with read_logs(trained, logs, mapping, keep_unknown=True) as logged:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
-                [_named(logs)],
+                [_name_logs(logs)],
                 options=options,
                 seed=seed,
                 checkpoint="best",
@@ -448,12 +404,8 @@ class Recommender:
         Args:
             environment: name of a simulator, such as "synthetic-taobao", or an `Environment`.
             episodes: number of episodes of each policy.
-            rule: the decision rule; None for the run's own.
             behaviors: built-in policies of the simulator to evaluate beside it, such as "random".
             seed: of the episodes.
-
-        Raises:
-            InputError: the recommender is not trained, or the environment does not fit it.
         """
         trained = self.trained
         beside = require_list("behaviors", behaviors, "the name of a behavior", str)
@@ -480,19 +432,14 @@ class Recommender:
 
         Args:
             logs: as for `fit`.
-            rule: the decision rule; None for the run's own.
             filter_seen: exclude items that the user was shown before, as `recommend` does by
                 default: for logs of what it showed.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
             One row per logged step; see `ucfrec.off_policy.score.score`.
-
-        Raises:
-            InputError: the recommender is not trained, or the logs cannot be used.
         """
-        trained = self._evaluated(logs)
-        with logs_given(trained, logs, mapping, keep_unknown=False) as logged:
+        trained = self._load_for(logs)
+        with read_logs(trained, logs, mapping, keep_unknown=False) as logged:
             return pd.concat(score(trained, logged, rule, filter_seen), ignore_index=True)
 
     @_checked
@@ -516,20 +463,15 @@ class Recommender:
                 None to keep all.
             refit: go on learning from all rows once both policies are compared.
             filter_seen: compare them where items that the user was shown before are excluded.
-            mapping: of the logs' columns; what it leaves open is as in the training log.
 
         Returns:
             The new recommender; this one is not changed. `trained.record.update` has the drift and
             the verdict on both.
-
-        Raises:
-            InputError: the recommender is not trained, its store is gone, or the logs cannot be
-                used.
         """
         window = None if window_days is None else round(window_days * DAY_MS)
         options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
-        given = files_given(self.trained, logs, mapping)
-        with given as (files, columns, frame), in_words_of_python(frame):
+        opened = open_files(self.trained, logs, mapping)
+        with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)
         write_card(Path(out))
         return self.load(out)
@@ -543,13 +485,8 @@ class Recommender:
         Args:
             folder: folder to make.
             k: items that the graph chooses; None for 100, or all if there are fewer.
-            rule: the decision rule; None for the run's own.
-
-        Raises:
-            InputError: the extra `export` is not installed, the policy cannot be exported, or the
-                folder exists.
         """
-        with in_words_of_python():
+        with use_words_of_python():
             return export(self.trained, Path(folder), rule=rule, k=k)
 
     @_checked
@@ -559,42 +496,30 @@ class Recommender:
         results: ResultTable | Path | str | Iterable[ResultTable | Path | str] = (),
         items: Path | str | None = None,
     ) -> Path:
-        """Write one HTML page about the training and results: `ucfrec report`.
+        """Write one HTML page about the training and results, and return it: `ucfrec report`.
 
         Args:
             file: HTML file to write.
             results: what `evaluate` and `ope` returned, or files of it; one or several.
             items: file with item features to show beside sample recommendations.
-
-        Returns:
-            The file.
-
-        Raises:
-            InputError: the recommender is not trained, or a file or result cannot be used.
         """
         what = "what evaluate or ope returned, or files of it"
-        kinds = (Evaluation, OffPolicyReport, Path, str)
-        listed = [results] if isinstance(results, ResultTable) else results
-        given: list[ResultTable | Path | str] = require_list("results", listed, what, *kinds)
-        with tempfile.TemporaryDirectory() as scratch:
+        tables = [results] if isinstance(results, ResultTable) else results
+        tables = require_list("results", tables, what, Evaluation, OffPolicyReport, Path, str)
+        with tempfile.TemporaryDirectory() as scratch, use_words_of_python():
             files = []
-            for number, result in enumerate(given):
+            for number, result in enumerate(tables):
                 if isinstance(result, ResultTable):
                     files.append(Path(scratch) / f"{number}.json")
                     result.save(files[-1])
                 else:
                     files.append(Path(result))
-            with in_words_of_python():
-                write_report(Path(file), [self.run], files, None if items is None else Path(items))
+            write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
     @_checked
     def save(self, folder: Path | str) -> None:
-        """Copy the run to a new folder, which `load` and the command line can read.
-
-        Raises:
-            InputError: the folder exists, or the recommender is not trained.
-        """
+        """Copy the run to a new folder, which `load` and the command line can read."""
         run = self.run
         with atomic_folder(Path(folder)) as scratch:
             shutil.copytree(run, scratch, dirs_exist_ok=True)
@@ -602,16 +527,12 @@ class Recommender:
     @classmethod
     @_checked
     def load(cls, run: Path | str) -> Self:
-        """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`.
-
-        Raises:
-            InputError: the folder is not a run folder, or has no checkpoint yet.
-        """
+        """Load a recommender from a run folder, made by `save`, `fit` or `ucfrec train`."""
         policy = cls()
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
-        policy.settings = _changed(config)
+        policy.settings = _list_changes(config)
         return policy
 
 
@@ -619,7 +540,7 @@ UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
-def _changed(config: Config) -> dict[str, Any]:
+def _list_changes(config: Config) -> dict[str, Any]:
     """The settings `table.field` of a configuration that are not the defaults of its policy."""
     defaults = asdict(resolve_config(config.policy_name))
     return {
@@ -630,12 +551,12 @@ def _changed(config: Config) -> dict[str, Any]:
     }
 
 
-def _named(logs: Logs | None) -> str:
+def _name_logs(logs: Logs | None) -> str:
     """What a model card calls the logs that a measurement is on."""
     if logs is None:
         return TEST_SPLIT
     if isinstance(logs, pd.DataFrame):
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
-    listed = [files] if isinstance(files, (str, Path)) else files
-    return ", ".join(shorten_paths(str(file)) for file in listed)
+    paths = [files] if isinstance(files, (str, Path)) else files
+    return ", ".join(shorten_paths(str(path)) for path in paths)

@@ -1,8 +1,8 @@
-"""Charts of the report and the explorer: matplotlib figures as SVG that is part of a page.
+"""Charts by matplotlib: SVG that is part of a page of the report or explorer, and files.
 
 Colors are variables of the page's style sheet (`--ink`, `--soft`, `--rule`, `--paper`, `--c0` to
-`--c7`), so that a chart is legible in light and dark; text stays text. Matplotlib is imported when
-a chart is drawn.
+`--c7`), so that a chart is legible in light and dark; text stays text. Files have the style of a
+paper's figures. Matplotlib is imported when a chart is drawn.
 """
 
 import html
@@ -10,20 +10,26 @@ import io
 import re
 import textwrap
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 
 from ucfrec.errors import one_line
+from ucfrec.files.atomic import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+Drawn = TypeVar("Drawn")
 
 WIDTH, HEIGHT = 360, 220
 """Size of line charts and histograms in SVG units, which are points in matplotlib; charts of
@@ -249,3 +255,60 @@ def render(figure: "Figure", title: str, summary: str) -> Chart:
     body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
     label = html.escape(_printable(f"{title}. {summary}"))
     return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')
+
+
+# Figures that are files: colors and the column widths of a paper.
+COLUMN, PAGE = 3.4, 7.0
+"""Widths of one column and of the whole page, in inches."""
+PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
+"""Colors of other methods, of UCF, and of a third bar."""
+_NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
+
+_FILE_STYLE: Final[Any] = {
+    "figure.dpi": 200,
+    "figure.constrained_layout.use": True,
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": "#DDDDDD",
+    "lines.linewidth": 1.3,
+    "lines.markersize": 3.5,
+    "image.cmap": "cividis",
+    # Text stays text in SVG, and equal figures give identical files.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "ucfrec",
+}
+
+
+def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
+    """Decorator for functions that draw or save a figure: applies the style."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Drawn:
+        from matplotlib import rc_context
+
+        with rc_context(_FILE_STYLE):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
+@styled
+def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
+    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths.
+
+    Of the name, which may be a dataset's, characters that a path gives a meaning become "-".
+    """
+    files = []
+    for kind in ("png", "svg"):
+        path = folder / f"{_NOT_IN_NAMES.sub('-', name)}.{kind}"
+        with atomic_file(path) as scratch:
+            # A date in the metadata would make the SVG files of equal figures differ.
+            metadata = {"Date": None} if kind == "svg" else None
+            figure.savefig(scratch, format=kind, metadata=metadata)
+        files.append(path)
+    return files

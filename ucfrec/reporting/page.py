@@ -1,7 +1,7 @@
 """The HTML report on runs: conclusions from their results, and how they were trained."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,20 +11,20 @@ import pyarrow as pa
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from ucfrec import __version__
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import atomic_file, json_text
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.reporting.model_card import tabulate_user_model
-from ucfrec.reporting.page_results import (
+from ucfrec.reporting.results import (
+    conclude,
     draw_environments,
     draw_estimates,
     draw_forest,
     draw_frontier,
     read_evidence,
 )
-from ucfrec.reporting.samples import read_features, tabulate_samples
-from ucfrec.reporting.tables import Table, format_value
+from ucfrec.reporting.tables import Table
 from ucfrec.reporting.training import (
     POINTS,
     REFERENCES,
@@ -32,11 +32,12 @@ from ucfrec.reporting.training import (
     draw_curves,
     draw_distributions,
     draw_moves,
+    read_features,
     select_curves,
     tabulate_augmentation,
     tabulate_rows,
+    tabulate_samples,
 )
-from ucfrec.reporting.verdict import verdict
 from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_candidates, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
 
@@ -95,7 +96,7 @@ def write_report(
     evidence = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
-            "verdict": verdict(evidence),
+            "verdict": conclude(evidence),
             "environments": draw_environments(evidence),
             "estimates": draw_estimates(evidence),
             "forest": draw_forest(evidence),
@@ -185,7 +186,11 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "verdicts": [(name, report.verdict) for name, _, report in edited],
         "augmentation": tabulate_augmentation(edited) if edited else None,
         "moves": draw_moves(edited),
-        "user_models": _present(item_runs, tabulate_user_model),
+        "user_models": [
+            (run.name, table)
+            for run in item_runs
+            if (table := tabulate_user_model(run.record)) is not None
+        ],
         "frontiers": [
             (run.name, chart)
             for run in item_runs
@@ -195,12 +200,6 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
-
-
-def _present(runs: Sequence[_Run], make: Callable[[RunRecord], Any]) -> list[tuple[str, Any]]:
-    """Name of each run and what is made of its record, where that is not None."""
-    parts = [(run.name, make(run.record)) for run in runs]
-    return [(name, part) for name, part in parts if part is not None]
 
 
 def _tabulate_data(record: RunRecord) -> Table:
@@ -216,13 +215,12 @@ def _tabulate_data(record: RunRecord) -> Table:
     }
     for level, value in record.return_quantiles.items():
         rows[f"{float(level):.0%} of returns are at most"] = value
-    body = [(name, [format_value(value)]) for name, value in rows.items()]
-    return Table("Training data", "", ["value"], body)
+    return Table.from_values("Training data", ["value"], [(n, [v]) for n, v in rows.items()])
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
     fitted = [run.record.policy for run in runs]
-    rows: list[tuple[str, list[Any]]] = [
+    rows: list[tuple[str, Sequence[object]]] = [
         ("policy", [run.record.name for run in runs]),
         ("seed", [str(run.record.seed) for run in runs]),
         ("status", [run.status for run in runs]),
@@ -234,14 +232,7 @@ def _summarise(runs: Sequence[_Run]) -> Table:
     if any(run.references for run in runs):
         for key, name in REFERENCES.items():
             rows.append((f"loss with {name}", [run.references.get(key) for run in runs]))
-    return _tabulate_runs("Runs", runs, rows)
-
-
-def _tabulate_runs(
-    caption: str, runs: Sequence[_Run], rows: Sequence[tuple[str, list[Any]]]
-) -> Table:
-    body = [(name, [format_value(value) for value in values]) for name, values in rows]
-    return Table(caption, "", [run.name for run in runs], body)
+    return Table.from_values("Runs", [run.name for run in runs], rows)
 
 
 def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
@@ -252,7 +243,8 @@ def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     names = dict.fromkeys(name for run_settings in settings for name in run_settings)
     rows = [(name, [run_settings.get(name) for run_settings in settings]) for name in names]
     rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]
-    return _tabulate_runs("Settings that differ", runs, rows) if rows else None
+    columns = [run.name for run in runs]
+    return Table.from_values("Settings that differ", columns, rows) if rows else None
 
 
 def _flatten(tables: Mapping[str, Any]) -> dict[str, Any]:

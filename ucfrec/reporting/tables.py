@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ucfrec.errors import one_line
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, summary
 
 NONE = "–"
@@ -27,6 +27,14 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[tuple[str, Sequence[str]]]
     """(name, one cell per column) of each row."""
+
+    @classmethod
+    def from_values(
+        cls, caption: str, columns: Sequence[str], rows: Iterable[tuple[str, Sequence[object]]]
+    ) -> "Table":
+        """A table of (name, one value per column), as `format_value` writes them."""
+        cells = [(name, [format_value(value) for value in values]) for name, values in rows]
+        return cls(caption, "", columns, cells)
 
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:

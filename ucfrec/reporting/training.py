@@ -1,15 +1,27 @@
-"""What the report shows of a training: quality of the data, curves and augmentation."""
+"""What the report shows of a training: quality of the data, curves, augmentation and samples."""
 
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Final
 
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as csv
+import pyarrow.parquet as pq
+
+from ucfrec import schema
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
+from ucfrec.errors import InputError, damage_explained
+from ucfrec.files.atomic import read_json
+from ucfrec.files.parquet import require_regular
 from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
+from ucfrec.runs.samples import SAMPLES
+from ucfrec.runs.trained_policy import ITEMS
 
 Curves = Mapping[str, Mapping[int, float]]
 """{name: {step: value}}, as from `ucfrec.fitting.metrics_log.read_metrics`."""
@@ -37,6 +49,8 @@ _DISTRIBUTIONS: Final = {
     "item_popularity": ("Items by popularity", "steps that show the item"),
 }
 """Name of a distribution in the `summary` of `prepare` to its title and x-axis label."""
+_MOST_CHARACTERS: Final = 120
+"""Most characters of the shown features of an item."""
 _LEVELS: Final = ("0", "0.25", "0.5", "0.75", "0.99", "1")
 _COUNTS: Final = {
     "rows_read": "rows read",
@@ -61,18 +75,18 @@ def tabulate_rows(source: Source) -> list[Table]:
     total = source.rows_read
     if total is None:
         return []
-    counts = [(name, getattr(source, key)) for key, name in _COUNTS.items()]
+    counts = [(name, [getattr(source, key)]) for key, name in _COUNTS.items()]
     dropped = [
         (
             f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}",
-            [format_value(rows), f"{rows / total:.2%}" if total else "–"],
+            [rows, f"{rows / total:.2%}" if total else None],
         )
         for reason, rows in source.dropped.items()
     ]
-    rows = [(name, [format_value(count)]) for name, count in counts if count is not None]
+    rows = [(name, count) for name, count in counts if count != [None]]
     return [
-        Table("Rows of the logs", "", ["count"], rows),
-        Table("Rows dropped, by reason", "", ["rows", "share of rows read"], dropped),
+        Table.from_values("Rows of the logs", ["count"], rows),
+        Table.from_values("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
     ]
 
 
@@ -83,15 +97,14 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
         values = source.summary.get(name) if source.rows_read is not None else None
         if values is None:
             continue
-        levels = [format_value(values.quantiles.get(level)) for level in _LEVELS]
-        quantiles.append((title, levels))
+        quantiles.append((title, [values.quantiles.get(level) for level in _LEVELS]))
         if total := sum(values.counts):
             bins = name_bins(values.edges, values.values)
             cells = [[format_value(count), f"{count / total:.2%}"] for count in values.counts]
             table = Table(title, x_label, ["count", "share"], list(zip(bins, cells, strict=True)))
             pictures.append((histogram(title, x_label, values.counts, bins), table))
     columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
-    return pictures, Table("Quantiles", "", columns, quantiles) if quantiles else None
+    return pictures, Table.from_values("Quantiles", columns, quantiles) if quantiles else None
 
 
 def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
@@ -118,8 +131,11 @@ def draw_curves(
     scalars = {name for curves in logged for name in curves}
     pictures = []
     for name in sorted(scalars, key=lambda n: ([*_TITLES, n].index(n), n)):
-        thinned = {style: _thin(run[name]) for style, run in enumerate(logged) if name in run}
-        curves = {style: curve for style, curve in thinned.items() if curve}
+        curves = {
+            style: curve
+            for style, run in enumerate(logged)
+            if name in run and (curve := _thin_curve(run[name]))
+        }
         if not curves:
             continue
         title = _TITLES.get(name, name)
@@ -136,7 +152,7 @@ def draw_curves(
     return pictures
 
 
-def _thin(curve: Mapping[int, float]) -> dict[float, float]:
+def _thin_curve(curve: Mapping[int, float]) -> dict[float, float]:
     """The finite points; at most `POINTS` of them, evenly spaced and including the last."""
     points = [(float(at), value) for at, value in sorted(curve.items()) if math.isfinite(value)]
     every = -(-len(points) // POINTS) or 1
@@ -148,7 +164,7 @@ def tabulate_augmentation(runs: Sequence[tuple[str, int, AugmentationReport]]) -
     reports = [report for _, _, report in runs]
     models, moves = [r.reward_model for r in reports], [r.moves for r in reports]
     actions = [r.actions for r in reports]
-    rows: list[tuple[str, list[Any]]] = [
+    rows: list[tuple[str, Sequence[object]]] = [
         ("R² of the reward model, from state and action", [m.r2_without_z for m in models]),
         ("R² with the abduced z, which has seen the reward", [m.r2 for m in models]),
         ("standard deviation of the reward", [m.reward_std for m in models]),
@@ -174,11 +190,10 @@ def tabulate_augmentation(runs: Sequence[tuple[str, int, AugmentationReport]]) -
             ("mean change of their reward", [a and a.mean_change for a in actions]),
             ("share of them with a higher reward", [a and a.earns_more for a in actions]),
         ]
-    body = [(name, [format_value(value) for value in values]) for name, values in rows]
     caption = (
         "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
     )
-    return Table(caption, "", [name for name, _, _ in runs], body)
+    return Table.from_values(caption, [name for name, _, _ in runs], rows)
 
 
 def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | None:
@@ -192,3 +207,91 @@ def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | N
             curves.append((name, style, dict(zip(centers, shares, strict=True))))
     title = "Accepted edits by the length of their move"
     return line_chart(title, "‖Δ‖₂", curves) if curves else None
+
+
+def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
+    """The decision rule of the samples and one table per session; None if a run has no samples.
+
+    Args:
+        features: one row per item with its `item_id` and features to show; None for none.
+    """
+    if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
+        return None
+    samples = read_json(run / SAMPLES)
+    require_regular(run / ITEMS)
+    with damage_explained(run / SAMPLES, "restore it or train again"):
+        sessions = samples["sessions"]
+        numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
+        items = _item_cells(pq.read_table(run / ITEMS), sorted(numbers), features)
+        tables = [_tabulate_session(n, session, items) for n, session in enumerate(sessions, 1)]
+        return str(samples["rule"]), tables
+
+
+def read_features(path: Path, text_ids: bool = False) -> pa.Table:
+    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
+
+    Args:
+        text_ids: whether the ids of a CSV are read as they are written, e.g. 007.
+
+    Raises:
+        InputError: the file cannot be read as that or lacks the column.
+    """
+    require_regular(path)
+    try:
+        types = csv.ConvertOptions(column_types={schema.ITEM_ID: pa.string()} if text_ids else None)
+        text = path.suffix == ".csv"
+        table = csv.read_csv(path, convert_options=types) if text else pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path} cannot be read as Parquet or CSV: {reason}") from None
+    if schema.ITEM_ID not in table.column_names:
+        raise InputError(f"{path} has no column {schema.ITEM_ID!r}; add one with the item ids")
+    return table
+
+
+def _item_cells(
+    items: pa.Table, numbers: Sequence[int], features: pa.Table | None
+) -> dict[int, dict[str, str]]:
+    """Item number to the cells (column: text) of its row in `items` and of its features."""
+    rows = items.take(pa.array(numbers, pa.int64())).to_pylist()
+    cells = {
+        number: {name: str(value) for name, value in row.items()}
+        for number, row in zip(numbers, rows, strict=True)
+    }
+    if features is not None:
+        ids = pa.array([row[schema.ITEM_ID] for row in rows])
+        try:
+            matches = features.filter(pc.is_in(features[schema.ITEM_ID], value_set=ids)).to_pylist()
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, TypeError):
+            matches = []  # the ids are of another type, so none of them can match
+        described = {row.pop(schema.ITEM_ID): _describe_item(row) for row in matches}
+        for number, row in zip(numbers, rows, strict=True):
+            cells[number]["features"] = described.get(row[schema.ITEM_ID], "–")
+    return cells
+
+
+def _describe_item(features: Mapping[str, Any]) -> str:
+    """Text of the features that are neither missing nor zero, cut to `_MOST_CHARACTERS`."""
+    parts = [
+        f"{name} {', '.join(map(format_value, value if isinstance(value, list) else [value]))}"
+        for name, value in features.items()
+        if value
+    ]
+    text = "; ".join(parts) or "–"
+    return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 1]}…"
+
+
+def _tabulate_session(
+    number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
+) -> Table:
+    history = zip(session["history"], session["rewards"], strict=True)
+    lines = [("shown before", item, format_value(reward)) for item, reward in history]
+    lines.append(("shown next in the log", session["logged"], "–"))
+    for rank, item in enumerate(session["recommended"], start=1):
+        again = " (shown before)" if item in session["history"] else ""
+        lines.append((f"recommended {rank}{again}", item, "–"))
+    columns = list(items[session["logged"]])
+    body = [
+        (what, [reward, *(items[item][name] for name in columns)]) for what, item, reward in lines
+    ]
+    return Table(f"Held-out session {number}", "", ["reward", *columns], body)

@@ -1,4 +1,4 @@
-"""Statistics of samples: mean and spread over seeds, effective number of weights, group AUC."""
+"""Statistics of samples: mean and spread over seeds, bootstrap, effective number, group AUC."""
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from ucfrec.arrays import Array, BoolArray, Float64Array
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
+_RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -102,3 +103,24 @@ def ratio_with_error(above: Float64Array, below: Float64Array) -> tuple[float, f
         return float("nan"), float("nan")
     ratio = above.sum() / total
     return float(ratio), float(np.sqrt(np.square(above - ratio * below).sum()) / total)
+
+
+def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:
+    """95% percentile bootstrap interval (low, high) of the mean of `values` (N,)."""
+    means = resampled_ratios(values[:, None], np.ones((len(values), 1)), seed)
+    low, high = np.nanquantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
+    """Ratios Σ above / Σ below (`_RESAMPLES`, C) of rows (N, C) drawn with replacement.
+
+    Ratios whose denominator is 0 are NaN.
+    """
+    generator = np.random.default_rng(seed)
+    # Multinomial counts of the rows replace copies of them, which limits memory to O(N).
+    share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])
+    sums = np.array([generator.multinomial(len(both), share) @ both for _ in range(_RESAMPLES)])
+    numerators, denominators = np.hsplit(sums, 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(denominators > 0, numerators / denominators, np.nan)

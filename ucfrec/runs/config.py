@@ -11,9 +11,9 @@ from pydantic import Field
 
 from ucfrec.arguments import LARGEST_SEED, require_list, require_seed, shown
 from ucfrec.choosing.choice import RuleConfig
+from ucfrec.counterfactual.augmentation import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.counterfactual.state_augmentation import AugmentConfig
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_toml
 from ucfrec.fitting.loop import LoopConfig

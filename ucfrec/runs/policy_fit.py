@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ucfrec.arrays import IntArray
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
@@ -33,24 +33,25 @@ def fit_policy(
     start: Path | None = None,
     newest: IntArray | None = None,
     callbacks: Callbacks = SILENT,
+    augmented: AugmentedEpisodes | None = None,
 ) -> Fit:
     """Train the policy, or resume its training.
 
     Args:
         policy: trained in place.
-        train: episodes to learn from, with their augmented episodes.
+        train: episodes to learn from.
         validation: held-out episodes; None to keep the last weights.
         start: weights of another training to go on from; of a policy that is fitted without
             gradients, only what was chosen on held-out episodes is taken from there.
         newest: positions in `train` of episodes that half of every batch is drawn from; None to
             draw all uniformly.
+        augmented: episodes to learn from in addition to those of `train`.
 
     Raises:
         InputError: see `ucfrec.fitting.loop.fit`; or the batch has fewer windows than processes.
     """
     k, device = policy.config.context, policy.state_mean.device
-    base = train.without_augmentation()
-    solve = policy.make_solver(base, validation, out / "policy", config.seed)
+    solve = policy.make_solver(train, validation, out / "policy", config.seed)
     if start is not None:
         weights = load_tensors(start)[0]
         names = policy.state_dict().keys() if solve is None else policy.chosen
@@ -62,14 +63,15 @@ def fit_policy(
             return fit_once(policy, solve, out / "policy", validate, config.policy_name, callbacks)
     size, rows = config.train.batch_size, distributed.share(config.train.batch_size)
     newest = np.array([], dtype=np.int64) if newest is None else newest
-    recent = base.select(newest)
+    recent = train.select(newest)
+    training = train if augmented is None else TrainingEpisodes(train, augmented)
 
     def draw(generator: np.random.Generator) -> Windows:
-        episodes, steps = train.draw_steps(generator, size)
+        episodes, steps = training.draw_steps(generator, size)
         if len(newest):
             of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
             episodes[::2] = newest[of_recent]
-        return train.windows(episodes[rows], steps[rows], k).to(device)
+        return training.windows(episodes[rows], steps[rows], k).to(device)
 
     def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         lower = config.train.precision == "bfloat16"

@@ -18,10 +18,9 @@ from pydantic import (
 )
 
 from ucfrec.acting.decision import SavedRule
-from ucfrec.choosing.choice import ValueEstimate
-from ucfrec.choosing.logged import Evidence
+from ucfrec.choosing.choice import Evidence, ValueEstimate
+from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.counterfactual.screening import DimensionReport
-from ucfrec.counterfactual.state_augmentation import AugmentationReport
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import ReturnToGo
@@ -39,6 +38,8 @@ from ucfrec.user_model.session_end import SessionEndReport
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
+STORE_SUFFIX: Final = "-store"
+"""Added to the name of a run, it is the default name of its own store beside it."""
 CANDIDATES: Final = "candidates.json"
 """File of the decision rules that the choice tried."""
 

@@ -16,13 +16,16 @@ from ucfrec.arrays import IntArray
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem
-from ucfrec.counterfactual.augmentation import MODELS, counterfactual_augmentation
+from ucfrec.counterfactual.augmentation import (
+    MODELS,
+    AugmentationReport,
+    AugmentConfig,
+    augment_episodes,
+)
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.counterfactual.state_augmentation import AugmentationReport, AugmentConfig
-from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
@@ -54,7 +57,6 @@ from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE,
 from ucfrec.runs.warm_start import rule_to_start_from, start_warm
 from ucfrec.user_model.model import UserModel
 
-_OVERLAY = "overlay.safetensors"
 PHASES = 4
 """Phases of a training that have progress of their own."""
 
@@ -86,7 +88,7 @@ def train_run(
     out: Path,
     config: Config,
     about: Mapping[str, Any] | None = None,
-    more_augmentation: Overlay | None = None,
+    more_augmentation: AugmentedEpisodes | None = None,
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
     callbacks: Callbacks = SILENT,
@@ -129,9 +131,9 @@ def train_run(
         if initial is not None:
             start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
-            overlay, augmentation = _augment(run, refit_of)
+            augmented, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, overlay, more_augmentation, refit_of, callbacks)
+            fit = _train_policy(run, augmented, more_augmentation, refit_of, callbacks)
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
@@ -195,7 +197,7 @@ def _prepare_inputs(
 
 def _augment(
     run: _Inputs, refit_of: Path | None
-) -> tuple[Overlay | None, AugmentationReport | None]:
+) -> tuple[AugmentedEpisodes | None, AugmentationReport | None]:
     """Causal reward model, generator and acceptance gate (lines 1 to 3 of Algorithm 1).
 
     Made once, then read from the run folder, or from that of the run that is refitted; (None, None)
@@ -203,8 +205,9 @@ def _augment(
     """
     config, out = run.config, run.out
     if refit_of is not None:
-        overlay = Overlay.load(refit_of / _OVERLAY) if config.augment.augments else None
-        return overlay, run.record.augmentation
+        if not config.augment.augments:
+            return None, run.record.augmentation
+        return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
     if not config.augment.augments:
         return None, run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
@@ -213,36 +216,36 @@ def _augment(
     shared = OWN if has_own_view or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
-        overlay, report = counterfactual_augmentation(
+        augmented, report = augment_episodes(
             run.train, run.validation, *settings, out, config.seed, run.device
         )
-        overlay.save(out / _OVERLAY)
+        augmented.save(out / AUGMENTED)
         write_json(out / AUGMENTATION, asdict(report))
 
     with distributed.leader_first():
         if not (out / AUGMENTATION).exists():
             inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
-            files = (*MODELS, _OVERLAY, AUGMENTATION)
-            shared.provide(inputs, counterfactual_augmentation.__module__, out, files, make)
-        return Overlay.load(out / _OVERLAY), read_augmentation(out / AUGMENTATION)
+            files = (*MODELS, AUGMENTED, AUGMENTATION)
+            shared.provide(inputs, augment_episodes.__module__, out, files, make)
+        augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
+        return augmented, read_augmentation(out / AUGMENTATION)
 
 
 def _train_policy(
     run: _Inputs,
-    overlay: Overlay | None,
-    more: Overlay | None,
+    augmented: AugmentedEpisodes | None,
+    more: AugmentedEpisodes | None,
     refit_of: Path | None,
     callbacks: Callbacks,
 ) -> Fit:
     """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
     if more is not None:
-        overlay = more if overlay is None else overlay.joined(more)
-    train = run.train if overlay is None else run.train.with_overlay(overlay)
+        augmented = more if augmented is None else augmented.join(more)
     start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
     validation = run.validation if refit_of is None else None
-    newest = _newest(run.record if refit_of is None else read_record(refit_of), train)
-    given = run.policy, train, validation, run.out, run.config, start, newest, callbacks
-    return fit_policy(*given)
+    newest = _newest(run.record if refit_of is None else read_record(refit_of), run.train)
+    given = run.policy, run.train, validation, run.out, run.config, start, newest, callbacks
+    return fit_policy(*given, augmented)
 
 
 def _newest(record: RunRecord, train: EpisodeStore) -> IntArray | None:
@@ -255,7 +258,7 @@ def _newest(record: RunRecord, train: EpisodeStore) -> IntArray | None:
 
 def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
-    views = of_people(run.logged), of_people(run.held_out)
+    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated = run.record.return_to_go.per_session
     inputs_of_fit = *views, run.out / REWARD_MODEL, run.config.seed
@@ -272,7 +275,7 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
-    views = of_people(run.logged), of_people(run.held_out)
+    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     start = None if initial is None else rule_to_start_from(initial, trained)
     problem = targets, *views, config, run.config.seed, start
     choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking

@@ -1,13 +1,13 @@
 """Training on a store whose observation columns without effect are dropped, or intervened on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ucfrec.counterfactual.augmentation import interventions
-from ucfrec.counterfactual.screening import ScreeningConfig, ScreeningReport, screen
+from ucfrec.counterfactual.screening import MeasurementConfig, ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
@@ -28,12 +28,12 @@ SCREENING: Final = "screening"
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
-    """Screen the training sessions of a store, by the default settings.
+    """Screen the training sessions of a store of items.
 
     Raises:
         InputError: as `ucfrec.counterfactual.screening.screen`.
     """
-    return screen(training_views(store)[0], ScreeningConfig(), seed)
+    return screen(training_views(store)[0], MeasurementConfig(), seed)
 
 
 def train_screened(
@@ -44,6 +44,7 @@ def train_screened(
     about: Mapping[str, Any] | None = None,
     shared: SharedStages = OWN,
     callbacks: Callbacks = SILENT,
+    screen: Callable[[EpisodeStore, int], ScreeningReport] | None = None,
 ) -> RunRecord:
     """`ucfrec.runs.run.train_run` after screening.
 
@@ -54,9 +55,10 @@ def train_screened(
         shared: as `train_run` has it, and for screening; a run whose columns are dropped has its
             other stages to itself.
         callbacks: what is told of the training of the policy.
+        screen: screens a store, with a seed; None for `screen_store`.
 
     Raises:
-        InputError: as `train_run` and `screen_store`; the run was started with another `how`; or no
+        InputError: as `train_run` and `screen`; the run was started with another `how`; or no
             column of observed states would be left.
     """
     if how is not None and how not in SCREENINGS:
@@ -73,7 +75,8 @@ def train_screened(
     if how is None:
         return train_run(store, out, config, about, shared=shared, callbacks=callbacks)
     if screening is None:
-        screening = Screening.model_validate({"how": how, **_screened(store, shared)})
+        report = _screen_once(store, shared, screen or screen_store)
+        screening = Screening.model_validate({"how": how, **report})
     flagged = screening.flagged
     if len(flagged) == store.state_size:
         raise InputError(
@@ -83,8 +86,8 @@ def train_screened(
         )
     entries: dict[str, Any] = {**(about or {}), SCREENING: screening}
     if how == "drop":
-        selected = without_columns(store, flagged)
         entries["dropped_observations"] = flagged
+        selected = without_columns(store, flagged)
         return train_run(selected, out, config, entries, callbacks=callbacks)
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
@@ -92,14 +95,18 @@ def train_screened(
     return train_run(store, out, config, entries, more, shared=shared, callbacks=callbacks)
 
 
-def _screened(store: EpisodeStore, shared: SharedStages) -> dict[str, Any]:
-    """The report of `screen_store`, as a record has it."""
+def _screen_once(
+    store: EpisodeStore,
+    shared: SharedStages,
+    screen: Callable[[EpisodeStore, int], ScreeningReport],
+) -> dict[str, Any]:
+    """The report of `screen`, as a record has it; made once for runs that share stages."""
     inputs = {"screened": store.record.fingerprint, "steps": store.n_steps, "seed": SEED}
     with TemporaryDirectory() as scratch:
         file = Path(scratch) / "screening.json"
 
         def make() -> None:
-            write_json(file, asdict(screen_store(store, SEED)))
+            write_json(file, asdict(screen(store, SEED)))
 
         shared.provide(inputs, screen.__module__, file.parent, (file.name,), make)
         report: dict[str, Any] = read_json(file)

@@ -1,11 +1,12 @@
-"""The search itself: trials of an Optuna study in a folder, in one or several processes.
-
-A trial is measured on validation rows.
+"""The search: trials of an Optuna study in a folder, in one or several processes, each measured on
+validation rows; the best settings as TOML, and a page of all trials.
 """
 
+import json
+import math
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,19 +16,18 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
-from ucfrec.evaluation.liked import LikedByRange
-from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
+from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.files.atomic import atomic_file
 from ucfrec.files.locks import lock_path
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.processes import block_ctrl_c, pool_of_processes
 from ucfrec.progress import label_progress
 from ucfrec.provenance import config_hash
+from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
 from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.start import returns_of
@@ -48,6 +48,7 @@ METRICS: Final = {
 _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
 _OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
+BEST_TOML, PAGE = "best.toml", "tuning.md"
 _NAME: Final = "ucfrec"
 _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
@@ -66,7 +67,13 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
         InputError: the run or its validation rows do not have the metric.
     """
     if metric == VALUE:
-        return _value(trained.record)
+        rule = trained.record.rule
+        if rule is None or rule.simulated is None:
+            raise InputError(
+                "the decision rule of this training is not selected in simulated sessions, so "
+                f"there is no estimated value; {_OTHER_METRICS}"
+            )
+        return rule.simulated[0]
     validation = store.split("validation")
     assert trained.item_states is not None
     users = validation.episode_values(schema.USER)
@@ -81,27 +88,6 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
             "--metric, or a later split"
         )
     return float(np.sum(above) / np.sum(below))
-
-
-def _require_values(search: Search, store: EpisodeStore) -> None:
-    """Check that the user model estimates the value of every policy that is searched."""
-    for policy in search.policies:
-        config = search.config(policy, {})
-        if not (store.has_items and config.rule.choose and returns_of(store, config).per_session):
-            raise InputError(
-                f"{store.path}: {policy} has no estimated value there, because its decision rule "
-                f"is not selected in simulated sessions; {_OTHER_METRICS}"
-            )
-
-
-def _value(record: RunRecord) -> float:
-    value = None if record.rule is None else record.rule.simulated
-    if value is None:
-        raise InputError(
-            "the decision rule of this training is not selected in simulated sessions, so there is "
-            f"no estimated value; {_OTHER_METRICS}"
-        )
-    return value[0]
 
 
 @dataclass(frozen=True)
@@ -127,25 +113,28 @@ class Plan:
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     """Search until the study has so many finished trials; goes on where an earlier call ended.
 
-    The best run lies in `plan.out / "best"`; those of other trials are deleted.
+    The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
+    settings, `tuning.md` all trials.
 
     Args:
         trials: number of finished trials that the study has at the end, those ended early too.
         workers: processes that train trials side by side.
 
     Raises:
-        InputError: Optuna is not installed, the folder holds another search, the metric or the
-            numbers are out of range, the policies have no such metric on this store, or no trial
-            could be measured.
+        InputError: the folder holds another search, the numbers are out of range, the policies have
+            no such metric on this store, or no trial could be measured.
     """
     optuna = _optuna()
-    if plan.metric not in METRICS:
-        raise InputError(f"the metric is {plan.metric!r}; use {', '.join(METRICS)}")
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
     store = EpisodeStore.open(plan.store)
-    if plan.metric == VALUE:
-        _require_values(plan.search, store)
+    for policy in plan.search.policies if plan.metric == VALUE else ():
+        config = plan.search.config(policy, {})
+        if not (store.has_items and config.rule.choose and returns_of(store, config).per_session):
+            raise InputError(
+                f"{store.path}: {policy} has no estimated value there, because its decision rule "
+                f"is not selected in simulated sessions; {_OTHER_METRICS}"
+            )
     with lock_path(plan.out, "tuned"):
         plan.out.mkdir(parents=True, exist_ok=True)
         study: Study = optuna.create_study(
@@ -153,18 +142,27 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
         )
         _require_same(study, plan, store)
         _enqueue_again(study)
-        left = trials - len(finished(study))
-        shares = [len(part) for part in np.array_split(range(max(left, 0)), workers)]
-        _search(
-            plan,
-            [(n, share) for n, share in enumerate(shares) if share],
-            plan.search.seed + len(study.trials),
-        )
+        left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
+        shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
+        if len(shares) == 1:
+            _run_trials(plan, 0, shares[0], seed)
+        elif shares:
+            threads = max(1, torch.get_num_threads() // len(shares))
+            start = partial(torch.set_num_threads, threads)
+            with pool_of_processes(len(shares), start) as pool:
+                with block_ctrl_c():
+                    processes = [
+                        pool.submit(_run_trials, plan, worker, share, seed)
+                        for worker, share in enumerate(shares)
+                    ]
+                for process in processes:
+                    process.result()
         _keep_best(study, plan)
+        _write_report(study, plan)
     return study
 
 
-def finished(study: "Study") -> "list[FrozenTrial]":
+def list_finished(study: "Study") -> "list[FrozenTrial]":
     """The trials that were measured or ended early."""
     return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
@@ -177,10 +175,8 @@ def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
 
 
 def _optuna() -> Any:
-    try:
-        import optuna
-    except ModuleNotFoundError:
-        raise InputError("a search needs Optuna; install ucfrec[tune]") from None
+    import optuna
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     return optuna
@@ -226,19 +222,6 @@ def _enqueue_again(study: "Study") -> None:
     study.set_user_attr("again", sorted(again))
 
 
-def _search(plan: Plan, shares: Sequence[tuple[int, int]], seed: int) -> None:
-    if len(shares) <= 1:
-        for worker, share in shares:
-            _run_trials(plan, worker, share, seed)
-        return
-    threads = partial(torch.set_num_threads, max(1, torch.get_num_threads() // len(shares)))
-    with pool_of_processes(len(shares), threads) as pool:
-        with block_ctrl_c():
-            processes = [pool.submit(_run_trials, plan, *share, seed) for share in shares]
-        for process in processes:
-            process.result()
-
-
 def _run_trials(plan: Plan, worker: int, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
     optuna = _optuna()
@@ -261,34 +244,30 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
-    run: Path | None = None
+    run = plan.out / TRIAL
     try:
         config = plan.search.config(policy, values)
-        run = plan.out / f"{TRIAL}{config_hash(asdict(config))}"
-        shared, heard = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
+        run = _name_run(plan, config)
+        shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
         with label_progress(f"trial {trial.number}"):
-            train_run(store, run, config, shared=shared, callbacks=heard)
+            train_run(store, run, config, shared=shared, callbacks=callbacks)
             value = measure_run(TrainedPolicy.load(run), store, plan.metric, plan.k)
-    except InputError as error:
-        trial.set_user_attr("error", str(error))
-        _remove(run)
+    except (InputError, optuna.TrialPruned) as error:
+        if isinstance(error, InputError):
+            trial.set_user_attr("error", str(error))
+        shutil.rmtree(run, ignore_errors=True)
         raise
-    except optuna.TrialPruned:
-        _remove(run)
-        raise
-    if any(
-        earlier.value is not None and earlier.value >= value for earlier in _complete(trial.study)
-    ):
-        _remove(run)
+    earlier = [other.value for other in _list_measured(trial.study) if other.value is not None]
+    if value <= max(earlier, default=-math.inf):
+        shutil.rmtree(run, ignore_errors=True)
     return value
 
 
-def _remove(run: Path | None) -> None:
-    if run is not None:
-        shutil.rmtree(run, ignore_errors=True)
+def _name_run(plan: Plan, config: Config) -> Path:
+    return plan.out / f"{TRIAL}{config_hash(asdict(config))}"
 
 
-def _complete(study: "Study") -> "list[FrozenTrial]":
+def _list_measured(study: "Study") -> "list[FrozenTrial]":
     return [trial for trial in study.trials if trial.state.name == "COMPLETE"]
 
 
@@ -312,13 +291,98 @@ def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
 
 def _keep_best(study: "Study", plan: Plan) -> None:
     """Move the best run to its place and delete those of the other trials."""
-    if not _complete(study):
+    if not _list_measured(study):
         errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
-    name = f"{TRIAL}{config_hash(asdict(config_of(plan, study.best_trial)))}"
-    if (plan.out / name).is_dir():
-        _remove(plan.out / BEST)
-        (plan.out / name).rename(plan.out / BEST)
+    run = _name_run(plan, config_of(plan, study.best_trial))
+    if run.is_dir():
+        shutil.rmtree(plan.out / BEST, ignore_errors=True)
+        run.rename(plan.out / BEST)
     for folder in plan.out.glob(f"{TRIAL}*"):
-        _remove(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def importances(study: "Study") -> dict[str, float]:
+    """Share of the metric's variance that each setting explains (fANOVA: Hutter et al., ICML 2014),
+    most important first; empty with fewer than four trials or none that differ.
+
+    Of several policies, only settings that all trials have.
+    """
+    import optuna
+
+    if len({trial.value for trial in _list_measured(study)}) < 4:
+        return {}
+    try:
+        evaluator = optuna.importance.FanovaImportanceEvaluator(seed=0)
+        return dict(optuna.importance.get_param_importances(study, evaluator=evaluator))
+    except (RuntimeError, ValueError):
+        return {}
+
+
+def _write_report(study: "Study", plan: Plan) -> None:
+    """Write `best.toml` and `tuning.md` to the folder of the search."""
+    config = config_of(plan, study.best_trial)
+    names = [name for name in study.best_params if name != POLICY]
+    if "train.steps" in names:
+        names.append("train.warmup_steps")
+    chosen, tables = asdict(config), dict[str, list[str]]()
+    for name in sorted({*plan.search.fixed, *names}):
+        table, _, field = name.partition(".")
+        value = chosen[table][field] if name in names else plan.search.fixed[name]
+        tables.setdefault(table, [f"[{table}]"]).append(f"{field} = {format_toml(value)}")
+    file = plan.out / BEST_TOML
+    command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
+    count = len(list_finished(study))
+    parts = [f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"]
+    parts += ["\n".join(lines) + "\n" for lines in tables.values()]
+    with atomic_file(file) as scratch:
+        scratch.write_text("\n".join(parts), encoding="utf-8")
+    with atomic_file(plan.out / PAGE) as scratch:
+        scratch.write_text(_page(study, plan, command), encoding="utf-8")
+
+
+def _page(study: "Study", plan: Plan, command: str) -> str:
+    trials = sorted(
+        (t for t in study.trials if t.state.is_finished()),
+        key=lambda t: (t.value is None or t.state.name != "COMPLETE", -(t.value or 0.0)),
+    )
+    names = list(dict.fromkeys(name for trial in trials for name in trial.params))
+    body = []
+    for trial in trials:
+        outcome = str(trial.user_attrs.get("error", "interrupted"))[:80]
+        if trial.state.name == "COMPLETE":
+            outcome = f"{trial.value:.6g}"
+        elif trial.state.name == "PRUNED":
+            outcome = "ended early"
+        values = (trial.params.get(name, "") for name in names)
+        cells = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
+        body.append((trial.number, outcome, *cells))
+    shares = importances(study)
+    parts = [
+        f"# Search on {plan.store}",
+        f"Metric: {plan.metric}, the {METRICS[plan.metric]}. The best trial, "
+        f"{study.best_trial.number}, has {study.best_value:.6g}; its run is `{BEST}`. It was "
+        "selected on validation rows: estimate it on the test split or on later logs.",
+        f"To train it again: `{command}`",
+        "## Importance",
+        "Share of the variance of the metric between trials that a setting explains (fANOVA).",
+        markdown_table(("setting", "importance"), [(n, f"{v:.2f}") for n, v in shares.items()])
+        if shares
+        else "Too few trials to compare.",
+        "## Trials",
+        markdown_table(("trial", plan.metric, *names), body),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def format_toml(value: Any) -> str:
+    """A value of a setting as TOML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (tuple, list)):
+        return f"[{', '.join(map(format_toml, value))}]"
+    if isinstance(value, str):
+        # A JSON string is a TOML string, but for a control character that JSON leaves as it is.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

@@ -8,7 +8,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.reward_report import RewardRows, calibration, fit_line, scores_of
+from ucfrec.user_model.reward_report import RewardRows, calibration, fit_line, score_rows
 
 _GROUPS: Final = 10
 _PRIOR: Final = 0.5
@@ -100,14 +100,14 @@ def measure_drift(
     reward_rows = RewardRows(
         reward_rows.items[keep],
         reward_rows.users[keep],
-        reward_rows.shown.at(keep),
+        reward_rows.history.at(keep),
         reward_rows.states[keep],
         reward_rows.rewards[keep],
         reward_rows.observations,
     )
-    scores = scores_of(model, reward_rows)[0]
+    scores = score_rows(model, reward_rows)[0]
     predicted, observed = (
-        model.expected(scores).double().numpy(),
+        model.expect(scores).double().numpy(),
         reward_rows.rewards.double().numpy(),
     )
     slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))

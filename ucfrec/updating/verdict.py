@@ -7,13 +7,11 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import liked_rewards
-from ucfrec.episodes.store import EpisodeStore
-from ucfrec.off_policy.diagnostics import check_mean_weight
-from ucfrec.off_policy.intervals import FEWEST_USERS, cluster_intervals
+from ucfrec.episodes.states import liked_rewards
+from ucfrec.episodes.store import EpisodeStore, UserRows
+from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_intervals
 from ucfrec.off_policy.score import score_steps
-from ucfrec.off_policy.verdict import OTHERS_REMOVED
+from ucfrec.off_policy.verdict import OTHERS_REMOVED, check_mean_weight
 from ucfrec.results.statistics import effective_number
 from ucfrec.runs.record import Difference, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -1,7 +1,6 @@
 """Main tags of items, and fatigue: how much less users reward anything once they liked one main tag
 many times in a row."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,10 +11,9 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.item_counts import least_liked
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 
 LONGEST: Final = 8
 """Largest length of a run, and largest number of steps that it lasts, that are tried."""
@@ -41,9 +39,9 @@ class MainTags:
     @classmethod
     def of(cls, states: ItemStates) -> "MainTags":
         """The main tags of a store's items."""
-        tags, ends = states.tags, (states.reward_low, states.reward_high)
+        tags, low, high = states.tags, states.reward_low, states.reward_high
         if not tags.shape[1]:
-            return cls(torch.full((len(states.embeddings),), -1), *ends)
+            return cls(torch.full((len(states.embeddings),), -1), low, high)
         directions = F.normalize(states.embeddings.double(), dim=1)
         n_tags = int(tags.max()) + 1
         places = torch.where(tags < 0, n_tags, tags)
@@ -53,31 +51,31 @@ class MainTags:
         centres = F.normalize(sums, dim=1)
         columns = [(centres[column] * directions).sum(1) for column in places.unbind(1)]
         typical = torch.stack(columns, 1).masked_fill(tags < 0, -torch.inf)
-        return cls(tags.gather(1, typical.argmax(1, keepdim=True))[:, 0], *ends)
+        return cls(tags.gather(1, typical.argmax(1, keepdim=True))[:, 0], low, high)
 
     def liked(self, rewards: Tensor) -> Tensor:
         """Whether the items with the rewards (...) were liked."""
         return rewards >= least_liked(self.reward_low, self.reward_high)
 
-    def runs(self, shown: Shown) -> Tensor:
+    def runs(self, history: Shown) -> Tensor:
         """In how many steps in a row, up to each earlier one, one main tag was liked, (B, N).
 
-        0 where the item was not liked, has no tags, or none was shown. Only what `shown` holds is
+        0 where the item was not liked, has no tags, or none was shown. Only what `history` holds is
         counted.
         """
-        liked = self.liked(shown.rewards) & (shown.items >= 0)
-        tags = torch.where(liked, self.tags[shown.items], -1)
+        liked = self.liked(history.rewards) & (history.items >= 0)
+        tags = torch.where(liked, self.tags[history.items], -1)
         lengths = []
         previous, length = torch.full((len(tags),), -1), torch.zeros(len(tags), dtype=torch.int64)
         for tag in reversed(tags.unbind(1)):
             length = (torch.where(tag == previous, length, 0) + 1).masked_fill(tag < 0, 0)
             previous = tag
             lengths.append(length)
-        return torch.stack(lengths[::-1], 1) if lengths else torch.zeros_like(shown.items)
+        return torch.stack(lengths[::-1], 1) if lengths else torch.zeros_like(history.items)
 
-    def tired(self, shown: Shown, run: int) -> Tensor:
+    def find_tired(self, history: Shown, run: int) -> Tensor:
         """Main tag (B,) of the `run` items shown last, if all had it and were liked; else −1."""
-        items, rewards = (values[:, :run] for values in shown)
+        items, rewards = (values[:, :run] for values in history)
         tags = self.tags[items.clamp(min=0)]
         alike = (tags == tags[:, :1]) & (items >= 0) & self.liked(rewards)
         return torch.where(alike.all(1) & (items.shape[1] >= run), tags[:, 0], -1)
@@ -92,14 +90,14 @@ class Fatigue:
     steps: int
     factor: float
 
-    def tired(self, runs: Tensor) -> Tensor:
+    def is_tired(self, runs: Tensor) -> Tensor:
         """Whether users are fatigued, (M,) bool, from `MainTags.runs` (M, N) before a step."""
         return (runs[:, : self.steps] >= self.length).any(1)
 
 
 @dataclass(frozen=True)
 class LoggedRuns:
-    """Logged steps, the runs before each, and whether the step was liked."""
+    """M logged steps: what users liked in a row before them, and whether they liked the item."""
 
     runs: Tensor
     """(M, N) of `MainTags.runs`; nothing of the step itself or of later ones."""
@@ -118,6 +116,15 @@ class LoggedRuns:
         rewards = torch.from_numpy(view.step_values(schema.REWARD, episodes, steps))
         return cls(runs, tags.liked(rewards).numpy(), np.asarray(episodes))
 
+    def count_likes(self, fatigue: Fatigue) -> tuple[float, float]:
+        """Likes of fatigued users, and as many as they gave elsewhere in the same sessions."""
+        tired = fatigue.is_tired(self.runs).numpy()
+        count = int(self.sessions.max(initial=-1)) + 1
+        rested = np.bincount(self.sessions[~tired], minlength=count)
+        liked = np.bincount(self.sessions[~tired & self.liked], minlength=count)
+        share = liked / np.maximum(rested, 1)
+        return float(self.liked[tired].sum()), float(share[self.sessions[tired]].sum())
+
 
 def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
     """The fatigue that training rows show most clearly; None if there is none.
@@ -127,32 +134,17 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
     the fatigue, and showed what no one likes, look as if the users would have liked nothing.
     Fatigue must at least halve the likes, in held-out rows too.
     """
-    best, clearest = None, 0.0
-    for length, steps in _candidates(training.runs.shape[1]):
-        seen, expected = _likes(training, length, steps)
-        if expected < _EXPECTED or seen > _MOST * expected:
-            continue
-        # Twice the logarithm of the likelihood ratio of two Poisson rates.
-        clearness = 2 * (seen * np.log(max(seen, 1e-9) / expected) + expected - seen)
-        if clearness > clearest:
-            best, clearest = Fatigue(length, steps, seen / expected), clearness
-    if best is None:
-        return None
-    seen, expected = _likes(held_out, best.length, best.steps)
-    return best if expected >= _EXPECTED and seen <= _MOST * expected else None
-
-
-def _likes(rows: LoggedRuns, length: int, steps: int) -> tuple[float, float]:
-    """Likes of fatigued users, and as many as they gave elsewhere in the same sessions."""
-    tired = Fatigue(length, steps, 0.0).tired(rows.runs).numpy()
-    count = int(rows.sessions.max(initial=-1)) + 1
-    rested = np.bincount(rows.sessions[~tired], minlength=count)
-    liked = np.bincount(rows.sessions[~tired & rows.liked], minlength=count)
-    share = liked / np.maximum(rested, 1)
-    return float(rows.liked[tired].sum()), float(share[rows.sessions[tired]].sum())
-
-
-def _candidates(remembered: int) -> Iterator[tuple[int, int]]:
+    best, clearest, remembered = None, 0.0, training.runs.shape[1]
     for length in range(2, min(LONGEST, remembered) + 1):
         for steps in range(1, min(LONGEST, remembered - length + 1) + 1):
-            yield length, steps
+            likes, expected = training.count_likes(Fatigue(length, steps, 0.0))
+            if expected < _EXPECTED or likes > _MOST * expected:
+                continue
+            # Twice the logarithm of the likelihood ratio of two Poisson rates.
+            clearness = 2 * (likes * np.log(max(likes, 1e-9) / expected) + expected - likes)
+            if clearness > clearest:
+                best, clearest = Fatigue(length, steps, likes / expected), clearness
+    if best is None:
+        return None
+    likes, expected = held_out.count_likes(best)
+    return best if expected >= _EXPECTED and likes <= _MOST * expected else None

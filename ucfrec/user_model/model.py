@@ -1,30 +1,37 @@
-"""The user model: reward of every item, session ends and fatigue, fitted and saved together."""
+"""The user model, reward of every item, session ends and fatigue, and sessions simulated in it."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from ucfrec.arrays import Float64Array
-from ucfrec.episodes.exposure import Shown
+from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_fit import fit_item_reward_model
-from ucfrec.user_model.reward_report import ItemRewardReport
+from ucfrec.user_model.reward_fit import TrainingUsers, fit_item_reward_model, fit_training_users
+from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
 from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport, whole_sessions
-from ucfrec.user_model.training_users import TrainingUsers, UserCalibration, fit_training_users
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
 _MOST_STEPS: Final = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
+_GROUPS: Final = 32
+"""Most rewards to draw from."""
+_BEYOND: Final = 3, 100
+"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
+than so many, …"""
+_CHANCE: Final = 0.001
+"""… unless chance ends all sessions that get there with a lower probability than this."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +41,8 @@ class UserModel:
     reward: ItemRewardModel
     """Expected reward of every item, as acting knows it."""
     reward_report: ItemRewardReport
-    """Its quality on validation rows."""
     training_users: TrainingUsers | None
-    """Users with fixed tastes, who reward what simulated sessions show; nothing that acts learns of
-    them but by their rewards. None where no sessions are simulated."""
+    """Who reward what simulated sessions show; None where no sessions are simulated."""
     calibration: tuple[float, float]
     """Slope and intercept of the scores that rewards are drawn from, on held-out rows."""
     session_end: SessionEnd
@@ -48,6 +53,8 @@ class UserModel:
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new, whose tastes
     no one knows."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What simulated sessions are drawn from, as a JSON object."""
 
     @classmethod
     def fit(
@@ -62,100 +69,216 @@ class UserModel:
         """Fit the parts that are not in `folder` yet; read the others.
 
         Args:
-            train: training episodes of a store of items.
-            validation: held-out episodes of the same store.
             simulated: whether sessions are simulated.
-            first: folder of the user model of an earlier state of the store, near whose spreads of
-                effects the search begins and ends.
+            first: folder of the user model of an earlier state of the store of items, near whose
+                spreads of effects the search begins and ends.
 
         Raises:
             InputError: all training rewards are equal, there are no held-out steps, or a file is
                 damaged.
         """
         require_blas_memory()
-        reward, report = fit_item_reward_model(train, validation, folder, seed, first=first)
+        reward, report = fit_item_reward_model(train, validation, folder, seed, first)
         users = None
         if simulated and train.has_users:
             users = fit_training_users(train, folder, seed, report.new_users, first)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
-            runs = (LoggedRuns.of(v, tags, reward.lags, _MOST_STEPS) for v in (train, validation))
-            tired = fit_fatigue(*runs) if reward.binary else None
+            fatigue = calibration = None
+            if reward.binary:
+                views = train, validation
+                runs = [LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS) for view in views]
+                fatigue = fit_fatigue(runs[0], runs[1])
             logged, held_out = (
-                LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed)
+                LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line, calibration = users.report.calibration if users else (1.0, 0.0), None
+            line = users.report.calibration if users else (1.0, 0.0)
             if users is None or not report.new_users:
                 model = users.model if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
-            fitted = {
-                "fatigue": None if tired is None else dataclasses.asdict(tired),
+            fitted: dict[str, Any] = {
                 "calibration": line,
-                "calibration_report": calibration and dataclasses.asdict(calibration),
-                "session_end": dataclasses.asdict(end_report),
+                "calibration_report": calibration and asdict(calibration),
+                "session_end": asdict(end_report),
+                "fatigue": fatigue and asdict(fatigue),
             }
             save_tensors(path, dict(end.tensors), fitted)
         tensors, metadata = load_tensors(path)
         with damage_explained(path, REMEDY):
             slope, intercept = metadata["calibration"]
-            fatigue = None if metadata["fatigue"] is None else Fatigue(**metadata["fatigue"])
-            end_report = SessionEndReport(**metadata["session_end"])
-            calibration = metadata["calibration_report"] and UserCalibration(
-                **metadata["calibration_report"]
+            of_calibration, of_fatigue = metadata["calibration_report"], metadata["fatigue"]
+            return cls(
+                reward=reward,
+                reward_report=report,
+                training_users=users,
+                calibration=(slope, intercept),
+                session_end=SessionEnd.of(reward.likeness, tensors),
+                session_end_report=SessionEndReport(**metadata["session_end"]),
+                fatigue=of_fatigue and Fatigue(**of_fatigue),
+                main_tags=tags,
+                calibration_report=of_calibration and UserCalibration(**of_calibration),
+                report={**metadata, "users": users and asdict(users.report)},
             )
-            end = SessionEnd.of(reward.likeness, tensors)
-        line = slope, intercept
-        return cls(reward, report, users, line, end, end_report, fatigue, tags, calibration)
 
     @property
     def rewarding(self) -> ItemRewardModel:
         """The model that rewards of simulated sessions are drawn from."""
         return self.reward if self.training_users is None else self.training_users.model
 
-    def expected(
-        self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor
+    def expect(
+        self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in reward units.
-
-        Args:
-            states: (M, S) before the step.
-            users: (M,) rows of the training store's users.
-            items: (M,) int64.
-        """
+        """Expected rewards (M,) of one item (M,) each, in reward units, in states (M, S) of users
+        (M,), rows of the training store."""
         slope, intercept = self.calibration
-        scores = self.rewarding.score(states, shown, users, items)
-        rewards = self.rewarding.expected(slope * scores + intercept).double().numpy()
+        scores = self.rewarding.score(states, history, users, items)
+        rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
         if self.fatigue is None:
             return rewards
         low = float(self.rewarding.reward_low)
-        tired = self.fatigue.tired(self.main_tags.runs(shown)).numpy()
+        tired = self.fatigue.is_tired(self.main_tags.runs(history)).numpy()
         return np.where(tired, low + self.fatigue.factor * (rewards - low), rewards)
-
-    def report(self) -> dict[str, Any]:
-        """What simulated sessions are drawn from, as a JSON object."""
-        calibration = self.calibration_report
-        users = None if self.training_users is None else self.training_users.report
-        return {
-            "calibration": list(self.calibration),
-            "calibration_report": calibration and dataclasses.asdict(calibration),
-            "users": None if users is None else dataclasses.asdict(users),
-            "session_end": dataclasses.asdict(self.session_end_report),
-            "fatigue": None if self.fatigue is None else dataclasses.asdict(self.fatigue),
-        }
 
 
 def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
-    """The model of session ends in the folder of a user model; None if there is none.
-
-    Raises:
-        InputError: its file is damaged.
-    """
+    """The model of session ends in the folder of a user model; None if there is none."""
     path = folder / SESSIONS
     if reward is None or not path.exists():
         return None
     tensors, _ = load_tensors(path)
     with damage_explained(path, REMEDY):
         return SessionEnd.of(reward.likeness, tensors)
+
+
+class LoggedRewards:
+    """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
+    expected reward. Paying the mean itself would be wrong where what follows, as the end of the
+    session, is not linear in the reward."""
+
+    def __init__(self, store: EpisodeStore) -> None:
+        """Read those of all steps of a store."""
+        parts = [
+            np.unique(rewards, return_counts=True)
+            for (rewards,) in store.column_batches(schema.REWARD)
+        ]
+        rewards, place = np.unique(
+            np.concatenate([distinct for distinct, _ in parts]), return_inverse=True
+        )
+        counts = np.bincount(place, np.concatenate([distinct for _, distinct in parts]))
+        values, counts = rewards[::-1].astype(np.float64), counts[::-1]
+        if len(values) > _GROUPS:
+            middle = (counts.cumsum() - counts / 2) / counts.sum()
+            groups = np.unique((_GROUPS * middle).astype(int), return_inverse=True)[1]
+            sums, counts = np.bincount(groups, counts * values), np.bincount(groups, counts)
+            values = sums / counts
+        self.values: Float64Array = values
+        """(K,) distinct rewards, or means of `_GROUPS` groups of equal size, from the highest."""
+        self._log_shares = np.log(counts / counts.sum())
+        self._slopes = np.sinh(np.linspace(-8, 8, 801)) / max(float(np.ptp(values)), 1e-12)
+        self._means = self._weigh(self._slopes) @ values
+
+    def _weigh(self, slopes: Float64Array) -> Float64Array:
+        """(M, K) shares of the values (K,) under slopes (M,) per unit of reward."""
+        exponents = self._log_shares + slopes[:, None] * self.values
+        return np.asarray(torch.from_numpy(exponents).softmax(dim=1))
+
+    def draw(self, expected: Float64Array, uniform: Float64Array) -> Float64Array:
+        """Rewards (M,) with the means `expected` (M,), from `uniform` (M,) in [0, 1)."""
+        if len(self.values) == 2:
+            high, low = self.values
+            return np.asarray(np.where(uniform < (expected - low) / (high - low), high, low))
+        bounds = self._weigh(np.interp(expected, self._means, self._slopes)).cumsum(axis=1)
+        numbers = (uniform[:, None] >= bounds[:, :-1]).sum(axis=1)
+        return np.asarray(self.values[numbers])
+
+
+class UserSimulator:
+    """N sessions of logged users at once, whose rewards and ends are drawn from a user model.
+
+    A session begins as a logged one did: its user, and its observations step by step. Sessions that
+    have ended are dropped: M ≤ N go on.
+    """
+
+    def __init__(
+        self,
+        model: UserModel,
+        store: EpisodeStore,
+        sessions: int,
+        longest: int,
+        seed: int,
+        times: int = 1,
+    ) -> None:
+        """
+        Args:
+            store: view of the sessions that are begun; session i is the i-th modulo their number.
+            longest: steps after which a session ends in any case.
+            times: N / `sessions`; session i draws what session i modulo `sessions` draws.
+        """
+        self._model, self._store, self._longest = model, store, longest
+        self._different, self._rng = sessions, np.random.default_rng(seed)
+        self._logged, self._lags = LoggedRewards(store), model.rewarding.lags
+        self._numbers = np.arange(sessions * times) % sessions
+        self._episodes = self._numbers % store.n_episodes
+        length = max(self._lags, store.item_states.window)
+        self._sessions = Sessions.begun(sessions * times, length)
+        if store.has_users:
+            users = store.episode_values(schema.USER).astype(np.int64)[self._episodes]
+            self._sessions = replace(self._sessions, users=torch.from_numpy(users))
+
+    @property
+    def users(self) -> IntArray:
+        """(M,) rows of the store's users, −1 where it does not name them."""
+        return self._sessions.users.numpy()
+
+    def observations(self) -> Float32Array:
+        """(M, O) observations before the next step."""
+        if not self._store.observation_size:
+            return np.zeros((len(self._numbers), 0), dtype=np.float32)
+        steps = np.minimum(self._sessions.steps.numpy(), self._store.lengths[self._episodes] - 1)
+        values = self._store.step_values(schema.OBSERVATION, self._episodes, steps)
+        return np.asarray(values, dtype=np.float32)
+
+    def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
+        """Show one item (M,) in every session.
+
+        Returns:
+            Rewards (M,), and the positions of the sessions that go on.
+        """
+        items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
+        observations = torch.from_numpy(self.observations())
+        states = self._sessions.latest_states(self._store.item_states, observations)
+        history, users = self._sessions.shown.latest(self._lags), self._sessions.users
+        steps = self._sessions.steps.numpy()
+        expected = self._model.expect(states, history, users, items)
+        rewards = self._logged.draw(expected, self._draw_uniform())
+        ends = self._model.session_end.probabilities(history, items, rewards, steps)
+        self._sessions = self._sessions.with_step(items, torch.from_numpy(rewards))
+        ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)
+        going = np.flatnonzero(~ended)
+        if len(going) < len(ended):
+            self._sessions = self._sessions.at(going)
+            self._episodes, self._numbers = self._episodes[going], self._numbers[going]
+        return rewards.astype(np.float32), going
+
+    def _draw_uniform(self) -> Float64Array:
+        """(M,) from [0, 1)."""
+        return self._rng.random(self._different)[self._numbers]
+
+
+def longest_session(lengths: IntArray) -> int:
+    """Steps after which a simulated session ends in any case, from those of logged sessions (E,).
+
+    Policies may make sessions longer than any logged one, unless something ends them there: more
+    of the longest sessions than chance explains.
+    """
+    longest = int(lengths.max())
+    late = lengths[lengths > longest // 2]
+    ended = int((late < longest).sum())
+    hazard = ended / int((np.minimum(late, longest - 1) - longest // 2).sum() or 1)
+    if hazard ** (len(late) - ended) < _CHANCE:
+        return longest
+    times, most = _BEYOND
+    return max(longest, min(times * longest, most))

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.windows import Shown
 
 MEMORY: Final = 50
 """Steps of a session that show tastes, the latest ones."""
@@ -20,6 +21,8 @@ FITTED: Final = "item_reward.safetensors"
 """File of a fitted model in its folder."""
 LAGS: Final = 10
 """Items shown before a step whose repetition and likeness enter its expected reward."""
+_AT_ONCE: Final = 8192
+"""Items that are compared to what was shown before them at once."""
 CLIP: Final = 5.0
 """Standardised states beyond this many standard deviations are clipped."""
 
@@ -48,16 +51,16 @@ class UserPosterior(nn.Module):
         """The reward of every item with a user without tastes of their own, as `targets`."""
         self.register_buffer("weight", torch.zeros(()))
         """Scores per unit of target; 0 if sessions show nothing."""
-        self.known = False
+        self.are_known = False
         """Whether sessions show tastes."""
 
     def weigh(self, weight: Tensor | float) -> None:
         """Set the weight; 0 if sessions show nothing."""
         self.weight.fill_(weight)
-        self.known = bool(self.weight != 0)
+        self.are_known = bool(self.weight != 0)
 
-    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        super()._load_from_state_dict(*arguments, **options)
         self.weigh(self.weight)
 
     def forward(self, items: Tensor, vectors: Tensor, targets: Tensor) -> Tensor:
@@ -68,9 +71,9 @@ class UserPosterior(nn.Module):
             vectors: (n_items, D) of all items.
             targets: (B, N) what they earned, as `ItemRewardModel.target`.
         """
-        shown, items = items >= 0, items.clamp(min=0)
-        inputs = F.pad(vectors[items], (1, 0), value=1.0) @ self.root * shown.unsqueeze(2)
-        unusual = (targets - self.usual[items]) * shown
+        valid, items = items >= 0, items.clamp(min=0)
+        inputs = F.pad(vectors[items], (1, 0), value=1.0) @ self.root * valid.unsqueeze(2)
+        unusual = (targets - self.usual[items]) * valid
         matrix = inputs.mT @ inputs + torch.eye(len(self.root), device=inputs.device)
         solution = _solution(matrix, inputs.mT @ unusual.unsqueeze(2)).squeeze(2)
         return self.weight * (solution @ self.root.T)
@@ -88,6 +91,17 @@ def _solution(matrix: Tensor, right: Tensor) -> Tensor:
         row = system[:, k : k + 1] / system[:, k : k + 1, k : k + 1]
         system = system - (system[:, :, k : k + 1] - units[k]) * row
     return system[:, :, size:]
+
+
+def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Tensor:
+    """Likeness (M, L) of items (M,) to each of those shown before them, (M, L), −1 for none."""
+    parts = [history.new_zeros(history.shape, dtype=torch.float32)[:0]]
+    for start in range(0, len(items), _AT_ONCE):
+        earlier = history[start : start + _AT_ONCE]
+        profiles = likeness.profile(earlier.reshape(-1, 1), torch.ones(earlier.numel(), 1))
+        own_items = items[start : start + _AT_ONCE].repeat_interleave(history.shape[1])
+        parts.append(likeness.to_items(profiles, own_items.unsqueeze(1)).view(earlier.shape))
+    return torch.cat(parts)
 
 
 def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
@@ -149,37 +163,33 @@ class ItemRewardModel(nn.Module):
         """
         super().__init__()
         state, dim, items = sizes["state"], sizes["action"], sizes["items"]
-        users = sizes.get("users", 0)
+        users = sizes.get("users", 0) + 1  # the last row is that of unknown users
         self.lags = LAGS
-        for name in ("reward_low", "reward_mean"):
-            self.register_buffer(name, torch.zeros(()))
-        for name in ("reward_high", "reward_std"):
-            self.register_buffer(name, torch.ones(()))
+        ones = {"reward_high": (), "reward_std": (), "state_std": (state,)}
+        zeros: dict[str, tuple[int, ...]] = {
+            **{"reward_low": (), "reward_mean": (), "state_mean": (state,)},
+            **{"vectors": (items, dim), "item": (items,)},
+            **{"user": (users,), "affinity": (users, dim)},
+            **{"state": (state,), "interaction": (state, dim), "exposure": (4, LAGS)},
+        }
         self.register_buffer("binary", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("state_mean", torch.zeros(state))
-        self.register_buffer("state_std", torch.ones(state))
-        self.register_buffer("vectors", torch.zeros(items, dim))
-        self.register_buffer("item", torch.zeros(items))
-        # The last row is that of unknown users.
-        self.register_buffer("user", torch.zeros(users + 1))
-        self.register_buffer("affinity", torch.zeros(users + 1, dim))
-        self.register_buffer("state", torch.zeros(state))
-        self.register_buffer("interaction", torch.zeros(state, dim))
-        self.register_buffer("exposure", torch.zeros(4, LAGS))
+        for name, shape in (zeros | ones).items():
+            self.register_buffer(name, torch.ones(shape) if name in ones else torch.zeros(shape))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
 
     @property
     def reach(self) -> int:
         """Items shown before a step that its expected reward depends on."""
-        return max(self.lags, MEMORY) if self.tastes.known else self.lags
+        return max(self.lags, MEMORY) if self.tastes.are_known else self.lags
 
-    def scores(self, states: Tensor, shown: Shown, users: Tensor | None = None) -> Tensor:
+    def scores(self, states: Tensor, history: Shown, users: Tensor | None = None) -> Tensor:
         """Linear predictors of all items, (B, n_items).
 
         Args:
             states: (B, S) before the step.
-            shown: what the sessions showed before the step; more than `reach` items have no effect.
+            history: what the sessions showed before the step; more than `reach` items have no
+                effect.
             users: (B,) int64 numbers in the training store, −1 for an unknown user; None if all
                 users are unknown.
 
@@ -187,28 +197,28 @@ class ItemRewardModel(nn.Module):
             Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
             deviations from their mean.
         """
-        items, repeated, alike = self.exposures(shown)
+        items, repeated, alike = self.exposures(history)
         added = self.likeness.to_all(self.likeness.profile(items, alike))
         rows, lags = torch.nonzero(items >= 0, as_tuple=True)
         added = added.index_put((rows, items[rows, lags]), repeated[rows, lags], accumulate=True)
-        tastes = self.tastes_after(shown)
+        tastes = self.tastes_after(history)
         added = added + self.query(states, users, tastes) @ self.vectors.T
         return self.item + self.level(states, users, tastes).unsqueeze(1) + added
 
-    def score(self, states: Tensor, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+    def score(self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
-        level = self.standardised(states) @ self.state
-        added = ((self.standardised(states) @ self.interaction) * self.vectors[items]).sum(1)
-        scores: Tensor = self.fixed_part(shown, users, items) + level + added
+        x = self.standardise(states)
+        added = ((x @ self.interaction) * self.vectors[items]).sum(1)
+        scores: Tensor = self.score_without_state(history, users, items) + x @ self.state + added
         return scores
 
-    def fixed_part(self, shown: Shown, users: Tensor | None, items: Tensor) -> Tensor:
+    def score_without_state(self, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
-        earlier, repeated, alike = self.exposures(shown)
-        each, user_rows = items.unsqueeze(1), self._known(users, items)
-        exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), each)
-        exposure = exposure + ((earlier == each) * repeated).sum(1)
-        tastes = self.tastes_after(shown)
+        earlier, repeated, alike = self.exposures(history)
+        column, user_rows = items.unsqueeze(1), self._user_rows(users, items)
+        exposure = self.likeness.to_items(self.likeness.profile(earlier, alike), column)
+        exposure = exposure + ((earlier == column) * repeated).sum(1)
+        tastes = self.tastes_after(history)
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
         part: Tensor = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
         return part
@@ -216,20 +226,25 @@ class ItemRewardModel(nn.Module):
     def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
         `tastes_after` (B, D + 1)."""
-        of_user = self.user[self._known(users, states)] + tastes[:, 0]
-        return of_user + self.standardised(states) @ self.state
+        of_user = self.user[self._user_rows(users, states)] + tastes[:, 0]
+        return of_user + self.standardise(states) @ self.state
 
-    def tastes_after(self, shown: Shown) -> Tensor:
+    def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
+        """What multiplies the vector of every item, (B, D); the arguments are those of `level`."""
+        interaction = self.standardise(states) @ self.interaction
+        return self.affinity[self._user_rows(users, states)] + tastes[:, 1:] + interaction
+
+    def tastes_after(self, history: Shown) -> Tensor:
         """What sessions showed of their users' level and affinity, (B, D + 1)."""
-        if not self.tastes.known:
+        if not self.tastes.are_known:
             # The length of a tensor would be that of one batch in a graph that is exported.
-            size = shown.items.shape[0], self.vectors.shape[1] + 1
+            size = history.items.shape[0], self.vectors.shape[1] + 1
             return torch.zeros(size, device=self.item.device)
-        items, rewards = shown.latest(MEMORY)
+        items, rewards = history.latest(MEMORY)
         tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
         return tastes
 
-    def expected(self, scores: Tensor) -> Tensor:
+    def expect(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""
         origin = torch.where(self.binary, self.reward_low, self.reward_mean)
         scale = torch.where(self.binary, self.reward_high - self.reward_low, self.reward_std)
@@ -237,13 +252,13 @@ class ItemRewardModel(nn.Module):
 
     @torch.no_grad()
     def set_effects(
-        self, effects: Mapping[str, Tensor], of_content: Callable[[Tensor], Tensor]
+        self, effects: Mapping[str, Tensor], sum_content: Callable[[Tensor], Tensor]
     ) -> None:
         """Set the fitted effects; those that are missing become 0.
 
         Args:
             effects: by the names of `ucfrec.user_model.reward_effects.EFFECTS`.
-            of_content: effects (n_items,) of the items' tags and embeddings, from those of content.
+            sum_content: effects (n_items,) of the items' tags and embeddings from those of content.
         """
         for name in ("user", "affinity", "state", "interaction", "exposure"):
             buffer = self.get_buffer(name)
@@ -252,7 +267,7 @@ class ItemRewardModel(nn.Module):
             self.interaction[-len(effects["context"]) :] += effects["context"]
         self.item.copy_(effects["mean"] + effects.get("item", torch.zeros(())))
         if "content" in effects:
-            self.item.add_(of_content(effects["content"]))
+            self.item.add_(sum_content(effects["content"]))
         self.tastes.weigh(effects.get("tastes", 0.0))
 
     def target(self, rewards: Tensor) -> Tensor:
@@ -260,30 +275,25 @@ class ItemRewardModel(nn.Module):
         standardised = ((rewards - self.reward_mean) / self.reward_std).clamp(-CLIP, CLIP)
         return torch.where(self.binary, (rewards == self.reward_high).float(), standardised)
 
-    def standardised(self, states: Tensor) -> Tensor:
+    def standardise(self, states: Tensor) -> Tensor:
         """States (..., S) in standard deviations from their training mean, clipped."""
         return ((states - self.state_mean) / self.state_std).clamp(-CLIP, CLIP)
 
-    def _known(self, users: Tensor | None, like: Tensor) -> Tensor:
-        """Rows (B,) of the users in the effects of users, B being the length of `like`."""
-        last = len(self.user) - 1
-        if users is None:
-            return torch.full(like.shape[:1], last, device=like.device)
-        return torch.where((users >= 0) & (users < last), users, last)
-
-    def query(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
-        """What multiplies the vector of every item, (B, D); the arguments are those of `level`."""
-        interaction = self.standardised(states) @ self.interaction
-        return self.affinity[self._known(users, states)] + tastes[:, 1:] + interaction
-
-    def liked(self, rewards: Tensor) -> Tensor:
+    def scale_rewards(self, rewards: Tensor) -> Tensor:
         """Rewards (...) on a scale from 0 to 1."""
         return ((rewards - self.reward_low) / (self.reward_high - self.reward_low)).clamp(0, 1)
 
-    def exposures(self, shown: Shown) -> tuple[Tensor, Tensor, Tensor]:
+    def exposures(self, history: Shown) -> tuple[Tensor, Tensor, Tensor]:
         """Items (B, lags) shown before, and the weights (B, lags) of repetition and likeness."""
-        missing = max(0, self.lags - shown.items.shape[1])
-        items = nn.functional.pad(shown.items[:, : self.lags], (0, missing), value=-1)
-        liked = self.liked(nn.functional.pad(shown.rewards[:, : self.lags], (0, missing)))
+        missing = max(0, self.lags - history.items.shape[1])
+        items = F.pad(history.items[:, : self.lags], (0, missing), value=-1)
+        liked = self.scale_rewards(F.pad(history.rewards[:, : self.lags], (0, missing)))
         repeated, alike, repeated_liked, alike_liked = self.exposure
         return items, repeated + repeated_liked * liked, alike + alike_liked * liked
+
+    def _user_rows(self, users: Tensor | None, batch: Tensor) -> Tensor:
+        """Rows (B,) of the users in the effects of users, B being the length of `batch`."""
+        last = len(self.user) - 1
+        if users is None:
+            return torch.full(batch.shape[:1], last, device=batch.device)
+        return torch.where((users >= 0) & (users < last), users, last)

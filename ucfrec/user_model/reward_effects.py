@@ -1,16 +1,22 @@
-"""The effects that add up to the expected reward of an item, and their penalised fit."""
+"""The effects that add up to the expected reward of an item: their penalised fit, their search."""
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.user_model.reward import ItemRewardModel
-from ucfrec.user_model.reward_report import RewardRows
+from ucfrec.episodes.windows import Shown
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
+from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
+from ucfrec.user_model.reward_report import EffectTried, RewardRows
 
 EFFECTS: Final = (
     *("item", "user", "content", "affinity", "tastes", "exposure"),
@@ -25,9 +31,26 @@ _TOLERANCE: Final = 1e-6
 _ARMIJO, _SHORTEST = 1e-4, 1e-4
 """Least decrease of a step relative to the slope, and shortest step that is tried."""
 _SMALLEST: Final = 1e-6
-_CHUNK: Final = 65_536
+_SPREADS: Final = tuple(0.05 * 2 ** (k / 2) for k in range(13))
+_FIRST: Final = 6
+"""Index of the spread that is tried first, 0.4."""
+CHEAP: Final = ("item", "user", "content")
+"""Effects whose spreads are searched finely, and adjusted to each other."""
+_STRIDES: Final = {**dict.fromkeys(CHEAP, (2, 1)), "tastes": ()}
+"""Steps of the search of a spread, (2,) for others; one number alone needs no search."""
+_LEAST_KNOWN: Final = 0.1
+"""Least share of held-out rows of known users that can evaluate the effects in `LASTING`."""
+_SCALES: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Standard deviations of tastes that are tried, relative to the noise of single steps."""
+LASTING: Final = ("item", "user", "content", "affinity")
+"""Effects that are distinguished by users who were shown several items."""
+_ITEMS: Final = ("item", "content")
+"""Effects of items alone."""
+_ROWS: Final = 512
+"""Rows whose tastes are found at once; more leave the processor's cache."""
 
 Effects = dict[str, Tensor]
+_Map = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -68,14 +91,18 @@ class Design:
         """The design of `rows`, with the statistics of `model`; without `weights` all count one."""
         likeness, last = model.likeness, len(model.user) - 1
         n_tags = int(likeness.n_tags)
-        x = model.standardised(rows.states)
+        x, history = model.standardise(rows.states), rows.history.latest(model.lags)
+        repeated = (history.items == rows.items.unsqueeze(1)).float()
+        alike = compare_to_history(likeness, history.items, rows.items)
+        both = torch.cat([repeated, alike], 1)
+        liked = model.scale_rewards(history.rewards).repeat(1, 2)
         is_known = (rows.users >= 0) & (rows.users < last)
         return cls(
             items=rows.items,
             users=torch.where(is_known, rows.users, last),
             x=x,
             observed=x[:, x.shape[1] - rows.observations :],
-            exposure=_exposure(model, rows),
+            exposure=torch.cat([both, both * liked], 1),
             target=model.target(rows.rewards),
             vectors=model.vectors,
             rows=model.vectors[rows.items],
@@ -89,20 +116,11 @@ class Design:
 
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
-        return replace(
-            self,
-            items=self.items[rows],
-            users=self.users[rows],
-            x=self.x[rows],
-            observed=self.observed[rows],
-            exposure=self.exposure[rows],
-            target=self.target[rows],
-            rows=self.rows[rows],
-            weights=self.weights[rows],
-            tastes=self.tastes[rows],
-        )
+        names = ("items", "users", "x", "observed", "exposure", "target", "rows", "weights")
+        parts = {name: getattr(self, name)[rows] for name in (*names, "tastes")}
+        return replace(self, **parts)
 
-    def of_unknown_users(self) -> "Design":
+    def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
         return replace(self, users=torch.full_like(self.users, self.n_users))
 
@@ -129,7 +147,7 @@ class Design:
         if "item" in effects:
             total = total + effects["item"][self.items]
         if "content" in effects:
-            total = total + self.of_content(effects["content"])[self.items]
+            total = total + self.sum_content(effects["content"])[self.items]
         if "user" in effects:
             total = total + effects["user"][self.users]
         if "tastes" in effects:
@@ -146,7 +164,7 @@ class Design:
             total = total + ((self.observed @ effects["context"]) * self.rows).sum(1)
         return total
 
-    def of_content(self, content: Tensor) -> Tensor:
+    def sum_content(self, content: Tensor) -> Tensor:
         """Effects (n_items,) of the items' tags and embeddings."""
         tags = F.pad(content[: self.n_tags], (0, 1))
         return tags[self.tags].sum(1) + self.vectors @ content[self.n_tags :]
@@ -185,11 +203,8 @@ class Design:
         return float(self.weights.sum(dtype=torch.float64))
 
     def penalty(self, name: str, spread: float) -> float:
-        """Precision of the prior of the effect `name`, twice the factor of its squares.
-
-        Under a Gaussian prior of this precision, the effect's contribution to the predictor of a
-        mean row has the standard deviation `spread`.
-        """
+        """Precision of the Gaussian prior of the effect `name` under which it adds a number of the
+        standard deviation `spread` to the predictor of a mean row."""
         return float(self.squares(name).sum()) / self.count / spread**2
 
     def loss(self, predictor: Tensor) -> Tensor:
@@ -206,78 +221,58 @@ class Design:
         return {"mean": torch.logit(mean, _SMALLEST) if self.binary else mean}
 
 
-def _exposure(model: ItemRewardModel, rows: RewardRows) -> Tensor:
-    parts = []
-    for start in range(0, len(rows), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        items, shown = rows.items[part].unsqueeze(1), rows.shown.at(part).latest(model.lags)
-        likeness, liked = model.likeness, model.liked(shown.rewards)
-        columns = [
-            likeness.to_items(likeness.profile(earlier, torch.ones_like(earlier).float()), items)
-            for earlier in shown.items.unsqueeze(1).unbind(2)
-        ]
-        repeated, alike = (shown.items == items).float(), torch.stack(columns, 1)
-        parts.append(torch.cat([repeated, alike, repeated * liked, alike * liked], 1))
-    return torch.cat(parts)
-
-
 def fit_effects(
     design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
 ) -> Effects:
-    """Minimise the summed loss of `design` plus penalties on the effects named in `spreads`.
+    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`.
 
     Args:
         start: effects to start from; missing ones start at 0.
-        spreads: of every effect of the fit; see `Design.penalty`.
         fixed: effects that are part of the predictor, and of the result, as they are.
     """
-    constant = fixed or {}
-    names = ("mean", *spreads)
-    curvature = 0.25 if design.binary else 1.0
+    constant, curvature = fixed or {}, 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
-    units = {name: _units(design, name, curvature, penalty.get(name, 0.0)) for name in names}
-    first = {name: units[name].of(start.get(name, design.zeros(name))) for name in names}
+    first, inverses = Effects(), dict[str, _Map]()
+    for name in ("mean", *spreads):
+        scale, inverses[name] = _scale(design, name, curvature, penalty.get(name, 0.0))
+        first[name] = scale(start.get(name, design.zeros(name)))
     sizes = [value.numel() for value in first.values()]
 
-    def effects_of(numbers: Tensor) -> Effects:
+    def unpack(numbers: Tensor) -> Effects:
         parts = zip(first.items(), torch.split(numbers, sizes), strict=True)
-        return {
-            name: units[name].effect(part.view(first_numbers.shape))
-            for (name, first_numbers), part in parts
-        }
+        return {name: inverses[name](part.view(value.shape)) for (name, value), part in parts}
 
     def objective(numbers: Tensor) -> Tensor:
-        effects = effects_of(numbers)
+        effects = unpack(numbers)
         loss = design.loss(design.predictor(constant | effects)).sum(dtype=torch.float64)
         for name in spreads:
             loss = loss + 0.5 * penalty[name] * effects[name].square().sum(dtype=torch.float64)
         return loss
 
-    start_numbers = torch.cat([part.flatten() for part in first.values()])
-    return constant | effects_of(minimum(objective, start_numbers))
+    numbers = torch.cat([part.flatten() for part in first.values()])
+    return constant | unpack(minimum(objective, numbers))
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
     """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`.
 
-    Its second derivative should be about 1 in all directions, because the first step, and the first
-    step that every line search tries, has the length that this implies.
+    Its second derivative should be about 1 in all directions: that is the first step's length.
     """
 
-    def evaluated(at: Tensor) -> tuple[float, Tensor]:
+    def evaluate(at: Tensor) -> tuple[float, Tensor]:
         at = at.detach().requires_grad_(True)
         value = objective(at)
         (gradient,) = torch.autograd.grad(value, at)
         return value.item(), gradient
 
-    at, (value, gradient) = start, evaluated(start)
+    at, (value, gradient) = start, evaluate(start)
     history: deque[tuple[Tensor, Tensor]] = deque(maxlen=_HISTORY)
     for _ in range(_ITERATIONS):
         direction = -_newton(gradient, history)
         slope, length = float(gradient @ direction), 1.0
         while True:
             following = at + length * direction
-            value_there, gradient_there = evaluated(following)
+            value_there, gradient_there = evaluate(following)
             if value_there <= value + _ARMIJO * length * slope:
                 break
             length /= 2
@@ -307,21 +302,13 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
     return result
 
 
-@dataclass(frozen=True)
-class _Units:
-    """Units of an effect in which the objective is about as curved in all directions."""
-
-    effect: Callable[[Tensor], Tensor]
-    """The effect, from numbers in these units."""
-    of: Callable[[Tensor], Tensor]
-    """Its inverse."""
-
-
-def _units(design: Design, name: str, curvature: float, penalty: float) -> _Units:
+def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
+    """Maps of an effect to units in which the objective is about as curved in all directions, and
+    back."""
     if name in ("state", "exposure"):
         inputs = design.x if name == "state" else design.exposure
         factor, inverse = _factors(curvature * _moments(design, inputs), penalty)
-        return _Units(lambda numbers: inverse @ numbers, lambda effect: factor @ effect)
+        return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):
         x = design.observed if name == "context" else design.x
         # The curvature is about a Kronecker product of two second moments, each with a part of the
@@ -331,12 +318,9 @@ def _units(design: Design, name: str, curvature: float, penalty: float) -> _Unit
         ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
         left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
         right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)
-        return _Units(
-            lambda numbers: left_inverse @ numbers @ right_inverse.T,
-            lambda effect: left @ effect @ right.T,
-        )
+        return lambda x: left @ x @ right.T, lambda x: left_inverse @ x @ right_inverse.T
     unit = (curvature * design.squares(name) + penalty).clamp(min=_SMALLEST).rsqrt()
-    return _Units(lambda numbers: numbers * unit, lambda effect: effect / unit)
+    return lambda x: x / unit, lambda x: x * unit
 
 
 def _moments(design: Design, inputs: Tensor) -> Tensor:
@@ -349,3 +333,218 @@ def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
     upper = torch.linalg.cholesky(whole).T
     identity = torch.eye(len(moments), dtype=torch.float64)
     return upper.float(), torch.linalg.solve_triangular(upper, identity, upper=True).float()
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a fit to older or fewer rows found, where a search or a fit begins; nothing at first."""
+
+    spreads: dict[str, int]
+    """Numbers of the spreads of the effects that it kept."""
+    effects: Effects
+    """Its effects; those of new users and items are 0."""
+
+    @classmethod
+    def of(cls, folder: Path | None, name: str, design: Design) -> "Beginning":
+        """Read what `save_fit` wrote, if there is any, in the sizes of `design`."""
+        effects = Effects()
+        if folder is None or not (file := folder / name).exists():
+            return cls({}, effects)
+        with damage_explained(file, REMEDY):
+            entries = [EffectTried(**effect) for effect in load_tensors(file)[1]["effects"]]
+            for name, old in load_tensors(place_effects(file))[0].items():
+                new = design.zeros(name)
+                if old.dtype != new.dtype or not old.isfinite().all():
+                    raise ValueError(f"{name} has other values than finite float32")
+                if new.shape == old.shape:
+                    effects[name] = old
+                elif name in ("item", "user", "affinity") and new.shape[1:] == old.shape[1:]:
+                    # The last row of effects of users is that of unknown ones.
+                    rows = old if name == "item" else old[:-1]
+                    new[: len(rows)] = rows
+                    effects[name] = new
+        numbers = np.abs(np.subtract.outer([e.spread for e in entries], _SPREADS)).argmin(1)
+        pairs = zip(entries, numbers.tolist(), strict=True)
+        return cls({entry.effect: number for entry, number in pairs if entry.kept}, effects)
+
+
+class EffectSearch:
+    """The effects found so far, one after the other, and their loss on held-out rows."""
+
+    sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
+    """Where users are new: the model, whose `tastes` are set on the way, and what the sessions of
+    training and of held-out rows showed before them."""
+
+    def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
+        """Held-out rows choose; None for a fifth of the training rows."""
+        if held_out is None:
+            rows = len(design.items)
+            chooses = torch.arange(rows) % 5 == min(4, rows - 1)
+            design, held_out = design.select(~chooses), design.select(chooses)
+        self.design, self.held_out, self._begin = design, held_out, begin
+        self.effects = design.mean_effect()
+        self.kept: dict[str, int] = {}
+        """Numbers of the spreads of the effects that are part of the model."""
+        self.new_users = False
+        self._fixed: Effects = {}
+        self._root: Tensor | None = None
+        self.losses = self._losses(self.effects)
+        self.base_loss = self.item_loss = float(self.losses.mean())
+        self._tried: list[EffectTried] = []
+
+    @property
+    def _spreads(self) -> dict[str, float]:
+        """Of the effects that are fitted."""
+        return {
+            name: _SPREADS[number]
+            for name, number in self.kept.items()
+            if not (self.new_users and name in LASTING)
+        }
+
+    @property
+    def of_new_users(self) -> bool:
+        """Whether hardly any held-out row is of a user with training rows."""
+        trained = self._find_trained()
+        share = float(trained[self.held_out.users].float().mean())
+        return bool(trained.any()) and share < _LEAST_KNOWN
+
+    def _find_trained(self) -> Tensor:
+        """(n_users + 1,) bool: users with training rows."""
+        trained = torch.bincount(self.design.users, minlength=self.design.n_users + 1) > 0
+        trained[-1] = False
+        return trained
+
+    def add(self, name: str) -> None:
+        """Add the effect `name` with the best spread, if it lowers the held-out loss."""
+        if name == "tastes" and self._root is not None:
+            self._scale_tastes(self._root)
+        no_one = bool((self.design.users == self.design.n_users).all())
+        if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
+            return
+        near, strides = _FIRST, _STRIDES.get(name, (2,))
+        if self._begin.effects:
+            spreads = self._begin.spreads
+            near, strides = spreads.get(name, _FIRST), (1,) if name in spreads else ()
+        number, effects, losses = self._find_best(name, near, strides)
+        decrease = self.losses - losses
+        gain = float(decrease.mean())
+        error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
+        self._tried.append(EffectTried(name, _SPREADS[number], gain, error, gain > error))
+        if name == "item":
+            self.item_loss = float(losses.mean())
+        if gain > error:
+            self.effects, self.losses, self.kept[name] = effects, losses, number
+
+    def adjust(self) -> None:
+        """Choose the spreads of the effects found so far again, each given the others."""
+        for name in [*self.kept]:
+            best = self._find_best(name, self.kept[name], (1,))
+            self.kept[name], self.effects, self.losses = best
+
+    def take(self, search: "EffectSearch") -> None:
+        """Fit the effects that `search` keeps, with its spreads, to all training rows."""
+        self._tried = list(search._tried)
+        self.kept = {name: number for name, number in search.kept.items() if name == "item"}
+        self.fit_to(self.design)
+        self.item_loss = float(self.losses.mean())
+        self.kept = dict(search.kept)
+        self.fit_to(self.design)
+
+    def forget_users(self) -> None:
+        """Fit further effects as for new users, with the effects of items as they are."""
+        if self.sessions is not None and "affinity" in self.effects:
+            trained = self._find_trained()
+            level = self.effects.get("user", torch.zeros(len(trained)))[trained]
+            tastes = torch.cat([level.unsqueeze(1), self.effects["affinity"][trained]], 1)
+            self._root = root_of_tastes(tastes, self.design.rows)
+        self.new_users = True
+        self._fixed = Effects((name, self.effects[name]) for name in _ITEMS if name in self.effects)
+        self.design = self.design.forget_users()
+        self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
+        self.losses = self._losses(self.effects)
+
+    def _scale_tastes(self, root: Tensor) -> None:
+        """Choose how much users differ, relative to noise, by the held-out loss."""
+
+        def loss(scale: float) -> float:
+            self.set_tastes(scale * root)
+            return float(self._find_best("tastes", _FIRST, ())[2].mean())
+
+        self.set_tastes(min(_SCALES, key=loss) * root)
+
+    def set_tastes(self, root: Tensor) -> None:
+        """Let the sessions tell tastes, whose covariance has the root, beside `effects`."""
+        assert self.sessions is not None
+        model, *histories = self.sessions
+        usual = self.effects["mean"] + self.effects.get("item", torch.zeros(()))
+        if "content" in self.effects:
+            usual = usual + self.design.sum_content(self.effects["content"])
+        model.tastes.usual.copy_(torch.sigmoid(usual) if self.design.binary else usual)
+        model.tastes.root.copy_(root)
+        model.tastes.weigh(1.0)
+
+        def add_tastes(design: Design, history: Shown) -> Design:
+            parts = []
+            for start in range(0, len(design.items), _ROWS):
+                part = slice(start, start + _ROWS)
+                tastes = model.tastes_after(history.at(part))
+                parts.append(tastes[:, 0] + (tastes[:, 1:] * design.rows[part]).sum(1))
+            return replace(design, tastes=torch.cat(parts))
+
+        self.design = add_tastes(self.design, histories[0])
+        self.held_out = add_tastes(self.held_out, histories[1])
+
+    def fit_to(self, design: Design) -> None:
+        """Fit the effects that were kept to other rows, from those of an earlier state if any."""
+        start, self.design = design.mean_effect() | self._begin.effects, design
+        self.effects = fit_effects(design, start, self._spreads, self._fixed)
+        self.losses = self._losses(self.effects)
+
+    def report(self) -> tuple[EffectTried, ...]:
+        """The effects tried, with the final spreads of those that were kept."""
+        return tuple(
+            replace(entry, spread=_SPREADS[self.kept[entry.effect]]) if entry.kept else entry
+            for entry in self._tried
+        )
+
+    def _find_best(
+        self, name: str, number: int, strides: tuple[int, ...]
+    ) -> tuple[int, Effects, Tensor]:
+        """Number of the best spread of the effect `name` near `number`, the fit, and its losses."""
+        fits: dict[int, tuple[Effects, Tensor]] = {}
+
+        def loss(index: int) -> float:
+            if not 0 <= index < len(_SPREADS):
+                return float("inf")
+            if index not in fits:
+                start = self._begin.effects | self.effects
+                if self._begin.effects and fits:
+                    start = fits[min(fits, key=lambda i: abs(i - index))][0]
+                spreads = self._spreads | {name: _SPREADS[index]}
+                effects = fit_effects(self.design, start, spreads, self._fixed)
+                fits[index] = effects, self._losses(effects)
+            return float(fits[index][1].mean())
+
+        for stride in strides:
+            for step in (stride, -stride):
+                first = number
+                while loss(number + step) < loss(number):
+                    number += step
+                if number != first:
+                    break
+        loss(number)
+        return number, *fits[number]
+
+    def _losses(self, effects: Effects) -> Tensor:
+        return self.held_out.loss(self.held_out.predictor(effects)).double()
+
+
+def save_fit(file: Path, model: ItemRewardModel, effects: Effects, report: Any) -> None:
+    """Write a fitted model with its report, and its effects beside it; `file` is complete last."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    save_tensors(place_effects(file), effects, {})
+    save_tensors(file, model.state_dict(), dataclasses.asdict(report))
+
+
+def place_effects(file: Path) -> Path:
+    return file.with_stem(file.stem + "_effects")

@@ -1,46 +1,81 @@
-"""Fitting the reward model of items, effect by effect, on training rows."""
+"""Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
-import dataclasses
-import time
-from collections.abc import Collection
-from dataclasses import replace
+Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
+knows. Where rewards are drawn from a model that learns tastes from the session, a policy is paid
+for its own guesses: an item that pays once, by luck, counts as liked and goes on paying.
+
+Logs of policies that knew more of their users than the log shows make what they showed look better
+than it is for anybody else. Where the log has all propensities, and users are new, rows are
+therefore weighted (`weigh_by_propensity`). Known users are calibrated on weighted validation rows
+instead (`UserCalibration`), and their tastes fitted without weights, which there only cost data.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from time import process_time
+from typing import Any, Final
 
 import numpy as np
+import pydantic
 import torch
 
-from ucfrec.episodes.item_counts import least_liked
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
 from ucfrec.progress import progress
-from ucfrec.user_model.effect_search import (
+from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
+from ucfrec.user_model.reward_effects import (
+    CHEAP,
+    EFFECTS,
     LASTING,
     Beginning,
+    Design,
     EffectSearch,
-    ShownBefore,
-    added_by_tastes,
-    effects_of_items,
     save_fit,
-    set_usual,
 )
-from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
-from ucfrec.user_model.reward_effects import EFFECTS, Design, Effects, fit_effects
 from ucfrec.user_model.reward_report import (
+    SAVED,
+    EffectTried,
     ItemRewardReport,
+    Line,
     RewardRows,
-    calibration,
-    gauc_against,
-    item_rates,
-    scores_of,
+    fit_line,
+    measure_quality,
+    weigh_by_propensity,
 )
 
+_USERS_FITTED: Final = "training_users.safetensors"
+"""File of the reward model of training users in its folder."""
 _MAX_ROWS: Final = 500_000
-WARM_ROWS: Final = 25_000
+_MAX_STEPS: Final = 100_000
+_WARM_ROWS: Final = 25_000
 """Most rows of a search that begins near an earlier one."""
 _CONSTANT: Final = 1e-6
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+class TrainingUsersReport:
+    """How the tastes of training users were found."""
+
+    calibration: Line
+    """Slope and intercept of the model's scores on training rows that were held back."""
+    effects: tuple[EffectTried, ...]
+    """The effects that were tried, evaluated on these rows."""
+    steps: int
+    """Logged steps that the effects are fitted to."""
+    effective_steps: float
+    """As many steps of equal weight count as much; `steps` without propensities."""
+    weighted: bool
+    """Whether the effects are fitted to rows weighted by propensities."""
+
+
+@dataclass(frozen=True)
+class TrainingUsers:
+    """Rewards of items for training users, and how their tastes were found."""
+
+    model: ItemRewardModel
+    report: TrainingUsersReport
 
 
 def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -61,8 +96,6 @@ def fit_item_reward_model(
     validation: EpisodeStore,
     folder: Path,
     seed: int,
-    max_rows: int = _MAX_ROWS,
-    effects: Collection[str] = EFFECTS,
     first: Path | None = None,
 ) -> tuple[ItemRewardModel, ItemRewardReport]:
     """Fit the model to training rows, or read it from `folder` if it was fitted before.
@@ -73,65 +106,65 @@ def fit_item_reward_model(
 
     Where hardly any validation row is of a user with training rows, the model is for new users. A
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
-    effects of items that contain those of the users who saw them predict best. What a user's
-    effects tell of training rows, the history of the session must tell of a new user. So the
-    effects of users are dropped once those of items are known, but for how much users differ, which
-    is what `UserPosterior` start from, and the other effects are fitted without them.
+    effects of items that contain those of the users who saw them predict best. The effects of users
+    are dropped once those of items are known, but for how much users differ, which is what
+    `UserPosterior` start from, and the other effects are fitted without them.
 
     Args:
-        train: view of a store of items.
-        validation: held-out view of the same store.
-        seed: of the rows drawn from a store with more than `max_rows`.
-        max_rows: most rows of each view that are used.
+        train: view of a store of items; `validation` is another one.
+        seed: of the rows drawn from a view with too many.
         first: folder of the model of an earlier state of the store, near whose spreads the search
             begins and ends; where users are known, on fewer rows.
-
-    Returns:
-        The model, in evaluation mode, and its quality on the validation rows.
 
     Raises:
         InputError: a view has no steps, or all training rewards are equal.
     """
-    model = ItemRewardModel(reward_model_sizes(train))
-    if (folder / FITTED).exists():
-        tensors, metadata = load_tensors(folder / FITTED)
-        load_weights(folder / FITTED, model, tensors)
-        with damage_explained(folder / FITTED, REMEDY):
-            return model.eval(), ItemRewardReport(**metadata)
-    start = time.process_time()
-    rows = RewardRows.of(train, model.lags, max_rows, seed)
-    held_out = RewardRows.of(validation, model.lags, max_rows, seed)
-    set_statistics(model, rows, held_out, train.item_states)
+    model, file = ItemRewardModel(reward_model_sizes(train)), folder / FITTED
+    if (metadata := _read_fit(file, model)) is not None:
+        with damage_explained(file, REMEDY):
+            return model, ItemRewardReport(**metadata)
+    start, states = process_time(), train.item_states
+    rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
+    set_statistics(model, rows, held_out, states)
     design = Design.of(model, rows)
-    begin = None if first is None else Beginning.of(first / FITTED, design)
+    begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
-    if begin is not None and not search.of_new_users:
-        some = np.random.default_rng(seed).permutation(len(rows)) < WARM_ROWS
-        search = EffectSearch(design.select(torch.from_numpy(some)), search.held_out, begin)
     if search.of_new_users:
-        rows = RewardRows.of(train, MEMORY, max_rows, seed)
-        held_out = RewardRows.of(validation, MEMORY, max_rows, seed)
-        search.shown = ShownBefore(model, rows.shown, held_out.shown)
+        rows, held_out = (RewardRows.of(v, MEMORY, _MAX_ROWS, seed) for v in (train, validation))
+        search.sessions = model, rows.history, held_out.history
+    elif begin.effects:
+        search = EffectSearch(_select_some(design, seed), search.held_out, begin)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
-        search.add_all(bar, effects)
+        lasting = EffectSearch(design, None, begin) if search.of_new_users else search
+        for name in EFFECTS:
+            if name not in LASTING and lasting is not search:
+                search.take(lasting)
+                search.forget_users()
+                lasting = search
+            lasting.add(name)
+            if name == CHEAP[-1] and not begin.effects:
+                lasting.adjust()
+            bar.update()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
-    model.set_effects(search.effects, search.design.of_content)
-    report = _report(model, search, rows, held_out, train.item_states, start)
-    save_fit(folder / FITTED, model, search.effects, dataclasses.asdict(report))
-    return model.eval(), report
+    report = ItemRewardReport(
+        **measure_quality(_finish(model, search), rows, held_out, states),
+        effects=search.report(),
+        new_users=search.new_users,
+        base_loss=search.base_loss,
+        item_loss=search.item_loss,
+        loss=float(search.losses.mean()),
+        seconds=process_time() - start,
+    )
+    save_fit(file, model, search.effects, report)
+    return model, report
 
 
 def refit_item_reward_model(
     first: Path, store: EpisodeStore, folder: Path, seed: int
 ) -> ItemRewardModel:
-    """Fit the effects of the model in the folder `first`, as strong as there, to other rows.
-
-    Args:
-        first: folder of `fit_item_reward_model`.
-        store: view of the episodes to fit to.
-        seed: of the rows drawn from a view with too many.
-    """
+    """Fit the effects that `fit_item_reward_model` kept in the folder `first`, as strong as there,
+    to other rows of the view `store`."""
     tensors, metadata = load_tensors(first / FITTED)
     report = ItemRewardReport(**metadata)
     model = ItemRewardModel(reward_model_sizes(store))
@@ -139,26 +172,76 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
-    begin, effects = Beginning.of(first / FITTED, design), design.mean_effect()
-    if begin is not None:
-        effects |= begin.effects
-    spreads, fixed = dict(report.kept), Effects()
+    begin = Beginning.of(first, FITTED, design)
+    search = EffectSearch(design, design, begin)
+    search.kept = dict(begin.spreads)
     if report.new_users:
-        lasting: dict[str, float] = {}
-        for name in LASTING:
-            if name in spreads:
-                lasting[name] = spreads.pop(name)
-        fixed = effects_of_items(fit_effects(design, effects, lasting))
-        design = design.of_unknown_users()
-        if "tastes" in spreads:
-            alone = fit_effects(design, effects, {}, fixed)
-            set_usual(model, design, alone)
-            model.tastes.root.copy_(tensors["tastes.root"])
-            design = replace(design, tastes=added_by_tastes(model, rows.shown, rows.items))
-    effects = fit_effects(design, effects, spreads, fixed)
-    model.set_effects(effects, design.of_content)
-    save_fit(folder / FITTED, model, effects, dataclasses.asdict(report))
-    return model.eval()
+        search.kept = {name: begin.spreads[name] for name in LASTING if name in begin.spreads}
+        search.fit_to(design)
+        search.forget_users()
+        if "tastes" in begin.spreads:
+            search.sessions = model, rows.history, rows.history
+            search.set_tastes(tensors["tastes.root"])
+        search.kept = dict(begin.spreads)
+    search.fit_to(search.design)
+    save_fit(folder / FITTED, _finish(model, search), search.effects, report)
+    return model
+
+
+def fit_training_users(
+    train: EpisodeStore,
+    folder: Path,
+    seed: int,
+    weighted: bool = True,
+    first: Path | None = None,
+) -> TrainingUsers:
+    """Fit the effects of training users, or read them from `folder` if they were fitted before.
+
+    A fifth of the rows of the sessions of `draw_sessions` chooses the effects.
+
+    Args:
+        train: view of a store of items whose episodes name their users.
+        weighted: whether rows are weighted by propensities, if there are any.
+        first: see `fit_item_reward_model`.
+
+    Raises:
+        InputError: all training rewards are equal, or the file is damaged.
+    """
+    model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
+    if (metadata := _read_fit(file, model)) is not None:
+        with damage_explained(file, REMEDY):
+            return TrainingUsers(model, TrainingUsersReport(**metadata))
+    sessions, states, weights = draw_sessions(train, seed), train.item_states, None
+    episodes, steps = sessions.all_steps()
+    rows = RewardRows.at(sessions, episodes, steps, model.lags)
+    set_statistics(model, rows, rows, states)
+    # What the session shows of tastes is known already: states are features and observations.
+    model.state_std[: states.size - states.user_features.shape[1]] = torch.inf
+    if weighted:
+        weights = weigh_by_propensity(sessions, episodes, steps, len(model.item))
+    design = Design.of(model, rows, weights)
+    begin = Beginning.of(first, _USERS_FITTED, design)
+    fewer = begin.effects and not weighted
+    search = EffectSearch(_select_some(design, seed) if fewer else design, None, begin)
+    with progress(len(EFFECTS), "training users", "effects") as bar:
+        for name in EFFECTS:
+            search.add(name)
+            bar.update()
+    held_out = search.held_out
+    scores = held_out.predictor(search.effects)
+    line = fit_line(scores, held_out.target, held_out.binary, held_out.weights)
+    search.fit_to(design)
+    effects, is_weighted = search.report(), weights is not None
+    report = TrainingUsersReport(line, effects, len(rows), design.count, is_weighted)
+    save_fit(file, _finish(model, search), search.effects, report)
+    return TrainingUsers(model, report)
+
+
+def draw_sessions(train: EpisodeStore, seed: int) -> EpisodeStore:
+    """The training sessions, in an order drawn by `seed`; of many, the first 100,000 steps."""
+    order = np.random.default_rng([seed, 5]).permutation(train.n_episodes)
+    last = int(np.searchsorted(np.cumsum(train.lengths[order]), _MAX_STEPS))
+    return train.select(order[: last + 1])
 
 
 def set_statistics(
@@ -185,41 +268,29 @@ def set_statistics(
     spread = states_before.std(0, correction=0)
     constant = spread <= _CONSTANT * states_before.mean(0).abs().clamp(min=1.0)
     model.state_std.copy_(torch.where(constant, torch.inf, spread))
-    shown = states.embeddings[rows.items].double()
-    centred = states.embeddings.double() - shown.mean(0)
+    mean = states.embeddings[rows.items].double().mean(0)
+    centred = states.embeddings.double() - mean
     length = centred[rows.items].square().sum(1).mean().sqrt()
     model.vectors.copy_(centred / length.clamp(min=_CONSTANT))
     model.likeness.start_from(states)
 
 
-def _report(
-    model: ItemRewardModel,
-    search: EffectSearch,
-    rows: RewardRows,
-    held_out: RewardRows,
-    states: ItemStates,
-    start: float,
-) -> ItemRewardReport:
-    scores, levels = scores_of(model, held_out)
-    predicted = model.expected(scores).double().numpy()
-    observed = held_out.rewards.double().numpy()
-    threshold = least_liked(states.reward_low, states.reward_high)
-    rates = item_rates(rows, rows.rewards >= threshold, len(model.item))
-    ranking = gauc_against(
-        scores - levels, rates[held_out.items], held_out.rewards >= threshold, held_out.users
-    )
-    variance = float(observed.var()) or float("nan")
-    return ItemRewardReport(
-        train_rows=len(rows),
-        validation_rows=len(held_out),
-        binary=bool(model.binary),
-        effects=search.report(),
-        new_users=search.new_users,
-        base_loss=search.base_loss,
-        item_loss=search.item_loss,
-        loss=float(search.losses.mean()),
-        r2=1 - float(np.square(predicted - observed).mean()) / variance,
-        calibration=calibration(predicted, observed),
-        seconds=time.process_time() - start,
-        **ranking,
-    )
+def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
+    """Load a fitted model; its report, or None if there is no file."""
+    if not file.exists():
+        return None
+    tensors, metadata = load_tensors(file)
+    load_weights(file, model, tensors)
+    model.eval()
+    return metadata
+
+
+def _select_some(design: Design, seed: int) -> Design:
+    """At most `_WARM_ROWS` of the rows."""
+    order = np.random.default_rng(seed).permutation(len(design.items))
+    return design.select(torch.from_numpy(order < _WARM_ROWS))
+
+
+def _finish(model: ItemRewardModel, search: "EffectSearch") -> ItemRewardModel:
+    model.set_effects(search.effects, search.design.sum_content)
+    return model.eval()

@@ -1,8 +1,8 @@
-"""The steps that the reward model of items is fitted to, and how good it is on held-out ones."""
+"""The steps that reward models of items are fitted to, and how good they are on held-out ones."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pydantic
@@ -11,21 +11,28 @@ from pydantic import BeforeValidator, ConfigDict
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
 _BINS: Final = 10
 _PRIOR: Final = 10.0
-"""Impressions at the mean rate that are added to an item's counts in `item_rates`."""
+"""Impressions at the mean rate that are added to those of an item."""
 _CHUNK: Final = 16_384
 _READ_AT_ONCE: Final = 65_536
+_LARGEST_WEIGHT: Final = 10.0
+"""Larger weights are cut off, so that no single row decides."""
+_FEWEST: Final = 50
+"""Rows of a half from which on a line is fitted to it."""
 SAVED: Final = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
 _OrNaN = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]
 """Undefined in a log that shows too little, and then null in JSON."""
+Line = tuple[float, float]
+"""Slope and intercept of scores."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class RewardRows:
     """(M,) int64."""
     users: Tensor
     """(M,) int64 numbers in the store; −1 if the store does not name its users."""
-    shown: Shown
+    history: Shown
     """The items shown earlier in the session, (M, lags)."""
     states: Tensor
     """(M, S) float32 states before the step."""
@@ -52,29 +59,38 @@ class RewardRows:
     def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
         """All steps of a view of a store of items; of more than `limit`, so many drawn by `seed`.
 
-        Of what was shown earlier, the latest `lags` steps are read. Nothing of a step but its item
-        and reward is read, nor anything of later steps.
+        Nothing of a step but its item and reward is read, nor anything of later steps.
         """
-        return cls.at(view, *drawn_steps(view, limit, seed), lags)
+        return cls.at(view, *draw_steps(view, limit, seed), lags)
 
     @classmethod
     def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
-        """The given steps (M,) of a view."""
+        """The given steps (M,) of a view, with the latest `lags` items shown before them."""
         states = torch.empty(len(steps), view.state_size)
         for start in range(0, len(steps), _READ_AT_ONCE):
             part = slice(start, start + _READ_AT_ONCE)
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
+        earlier = steps[:, None] - np.arange(1, lags + 1)
+        places = episodes[:, None], np.maximum(earlier, 0)
+        items = np.where(earlier >= 0, view.step_values(schema.ITEM, *places), -1)
+        rewards = np.where(earlier >= 0, view.step_values(schema.REWARD, *places), 0)
+        users = np.full(view.n_episodes, -1)
+        if view.has_users:
+            users = view.episode_values(schema.USER).astype(np.int64)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
-            torch.from_numpy(_users(view)[episodes]),
-            _shown(view, episodes, steps, lags),
+            torch.from_numpy(users[episodes]),
+            Shown(
+                torch.from_numpy(items.astype(np.int64)),
+                torch.from_numpy(rewards.astype(np.float32)),
+            ),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
         )
 
 
-def drawn_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
+def draw_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
     """Episodes and steps (M,) of all steps of a view; of more than `limit`, so many drawn."""
     numbers = np.arange(view.n_steps)
     if view.n_steps > limit:
@@ -83,18 +99,26 @@ def drawn_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, In
     return view.locate(numbers)
 
 
-def _shown(view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> Shown:
-    earlier = steps[:, None] - np.arange(1, lags + 1)
-    at = (episodes[:, None], np.maximum(earlier, 0))
-    items = np.where(earlier >= 0, view.step_values(schema.ITEM, *at), -1).astype(np.int64)
-    rewards = np.where(earlier >= 0, view.step_values(schema.REWARD, *at), 0).astype(np.float32)
-    return Shown(torch.from_numpy(items), torch.from_numpy(rewards))
+def weigh_by_propensity(
+    view: EpisodeStore, episodes: IntArray, steps: IntArray, items: int
+) -> Tensor | None:
+    """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
-
-def _users(view: EpisodeStore) -> IntArray:
-    if not view.has_users:
-        return np.full(view.n_episodes, -1)
-    return view.episode_values(schema.USER).astype(np.int64)
+    Of each user in proportion to 1 / (p · items), cut off at 10 (inverse propensity weighting). So
+    that a few rows of large weight do not pass for much knowledge of a user, those of a user add up
+    to their effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal
+    selection probabilities in multilevel models"). None if the log does not have every p.
+    """
+    if schema.PROPENSITY not in view.record.columns:
+        return None
+    propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
+    if not (propensities > 0).all():
+        return None
+    shares = np.minimum(1 / (propensities * items), _LARGEST_WEIGHT)
+    owners = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
+    users = np.unique(owners, return_inverse=True)[1][episodes]
+    sums, squares = (np.bincount(users, weights=entry) for entry in (shares, np.square(shares)))
+    return torch.from_numpy(shares * (sums / squares)[users]).float()
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -151,11 +175,8 @@ class ItemRewardReport:
     calibration: Calibration
     """Predicted and observed rewards."""
     gauc: _OrNaN
-    """Probability that a liked step scores higher than another of the same user, by impressions.
-
-    What all items share at a step (user and state) is excluded of the scores: it does not rank
-    items, and as the state contains the last reward, it would compare a user's steps by what was
-    liked before them."""
+    """Probability that a liked step scores higher than another of the same user, by impressions;
+    without what all items share at a step (user and state), which does not rank items."""
     gauc_error: _OrNaN
     """Standard error of `gauc`, over users."""
     item_rate_gauc: _OrNaN
@@ -176,14 +197,14 @@ class ItemRewardReport:
         return {entry.effect: entry.spread for entry in self.effects if entry.kept}
 
 
-def scores_of(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]:
+def score_rows(model: ItemRewardModel, rows: RewardRows) -> tuple[Tensor, Tensor]:
     """Linear predictors (M,) of the items shown in `rows`, and what all items share in them."""
     scores, levels = [torch.zeros(0)], [torch.zeros(0)]
     for start in range(0, len(rows), _CHUNK):
         part = slice(start, start + _CHUNK)
-        states, users = rows.states[part], rows.users[part]
-        scores.append(model.score(states, rows.shown.at(part), users, rows.items[part]))
-        levels.append(model.level(states, users, model.tastes_after(rows.shown.at(part))))
+        states, users, history = rows.states[part], rows.users[part], rows.history.at(part)
+        scores.append(model.score(states, history, users, rows.items[part]))
+        levels.append(model.level(states, users, model.tastes_after(history)))
     return torch.cat(scores), torch.cat(levels)
 
 
@@ -201,48 +222,101 @@ def calibration(predicted: Float64Array, observed: Float64Array) -> Calibration:
     )
 
 
-def fit_line(
-    scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None
-) -> tuple[float, float]:
+def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
     """Slope and intercept of the scores (M,) that fit the target (M,) best.
 
-    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise. Rows of
-    `weights` (M,) count so many times.
+    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise.
     """
     from sklearn.linear_model import LinearRegression, LogisticRegression
 
     inputs, outcomes = scores.double().numpy().reshape(-1, 1), target.double().numpy()
     counts = None if weights is None else weights.double().numpy()
     if binary and 0 < outcomes.mean() < 1:
-        fitted = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0, counts)
-        return float(fitted.coef_[0, 0]), float(fitted.intercept_[0])
+        model = LogisticRegression(C=np.inf, max_iter=1000).fit(inputs, outcomes > 0, counts)
+        return float(model.coef_[0, 0]), float(model.intercept_[0])
     if binary:
         return 1.0, 0.0
-    fitted = LinearRegression().fit(inputs, outcomes, counts)
-    return float(fitted.coef_[0]), float(fitted.intercept_)
+    model = LinearRegression().fit(inputs, outcomes, counts)
+    return float(model.coef_[0]), float(model.intercept_)
 
 
-def item_rates(rows: RewardRows, liked: Tensor, n_items: int) -> Tensor:
-    """(n_items,) share of liked rows of each item, 10 impressions at the mean added."""
-    shown = torch.bincount(rows.items, minlength=n_items).double()
-    likes = torch.bincount(rows.items, weights=liked.double(), minlength=n_items)
-    return (likes + _PRIOR * likes.sum() / shown.sum()) / (shown + _PRIOR)
-
-
-def gauc_against(
-    scores: Tensor, reference: Tensor, liked: Tensor, users: Tensor
-) -> Mapping[str, float]:
-    """GAUC of `scores` and of `reference`, each (M,), and their difference, as report fields."""
-    _, owner = np.unique(users.numpy(), return_inverse=True)
-    n_users = int(owner.max(initial=-1)) + 1
-    above, below = group_auc(scores.double().numpy(), liked.numpy(), owner, n_users)
-    baseline, _ = group_auc(reference.double().numpy(), liked.numpy(), owner, n_users)
+def measure_quality(
+    model: ItemRewardModel, rows: RewardRows, held_out: RewardRows, states: ItemStates
+) -> dict[str, Any]:
+    """What `ItemRewardReport` says of the predictions of held-out rows."""
+    scores, levels = score_rows(model, held_out)
+    predicted = model.expect(scores).double().numpy()
+    observed = held_out.rewards.double().numpy()
+    variance = float(observed.var()) or float("nan")
+    least = least_liked(states.reward_low, states.reward_high)
+    impressions = torch.bincount(rows.items, minlength=len(model.item)).double()
+    likes = torch.bincount(rows.items, (rows.rewards >= least).double(), len(model.item))
+    rates = (likes + _PRIOR * likes.sum() / impressions.sum()) / (impressions + _PRIOR)
+    _, owner = np.unique(held_out.users.numpy(), return_inverse=True)
+    liked, n_users = (held_out.rewards >= least).numpy(), int(owner.max(initial=-1)) + 1
+    above, below = group_auc((scores - levels).double().numpy(), liked, owner, n_users)
+    of_rates, _ = group_auc(rates[held_out.items].numpy(), liked, owner, n_users)
     value, error = ratio_with_error(above, below)
-    gain, gain_error = ratio_with_error(above - baseline, below)
+    gain, gain_error = ratio_with_error(above - of_rates, below)
     return {
+        "train_rows": len(rows),
+        "validation_rows": len(held_out),
+        "binary": bool(model.binary),
+        "r2": 1 - float(np.square(predicted - observed).mean()) / variance,
+        "calibration": calibration(predicted, observed),
         "gauc": value,
         "gauc_error": error,
         "item_rate_gauc": value - gain,
         "gauc_gain": gain,
         "gauc_gain_error": gain_error,
     }
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
+class UserCalibration:
+    """Slope and intercept that turn scores into rewards, from validation rows."""
+
+    line: Line
+    """Of all rows."""
+    halves: tuple[Line, Line]
+    """Of the rows of either half of the users; `line` where they are too few."""
+    optimism: float
+    """Expected over observed reward, less 1, where each half is predicted by the other's line."""
+    optimism_error: float
+    """Its standard error over users."""
+    weighted: bool
+    """Whether rows are weighted by propensities."""
+
+    @classmethod
+    def fit(
+        cls, model: ItemRewardModel, view: EpisodeStore, limit: int, seed: int
+    ) -> "UserCalibration":
+        """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
+        episodes, steps = draw_steps(view, limit, seed)
+        rows, half = RewardRows.at(view, episodes, steps, model.reach), halve_users(view)[episodes]
+        weights = weigh_by_propensity(view, episodes, steps, len(model.item))
+        counts = torch.ones(len(rows)) if weights is None else weights
+        scores, target = score_rows(model, rows)[0], model.target(rows.rewards)
+
+        def fit_part(chosen: BoolArray) -> Line:
+            part = torch.from_numpy(chosen)
+            return fit_line(scores[part], target[part], bool(model.binary), counts[part])
+
+        line = fit_part(np.ones(len(rows), dtype=bool))
+        parts = half == 0, half == 1
+        first, second = (fit_part(part) if part.sum() >= _FEWEST else line for part in parts)
+        slope, intercept = torch.tensor([second, first])[torch.from_numpy(half)].unbind(1)
+        expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
+        observed = (counts * rows.rewards).double().numpy()
+        off = expected.sum() / observed.sum() - 1 if observed.sum() > 0 else 0.0
+        by_user = np.bincount(episodes, expected - (1 + off) * observed)
+        error = float(np.sqrt(np.square(by_user).sum()) / abs(observed.sum() or 1.0))
+        return cls(line, (first, second), float(off), error, weights is not None)
+
+
+def halve_users(view: EpisodeStore) -> IntArray:
+    """Half (E,) of the users, 0 or 1, to which the episodes of a view belong; of the episodes,
+    where users are not named."""
+    if not view.has_users:
+        return np.arange(view.n_episodes) % 2
+    return view.episode_values(schema.USER).astype(np.int64) % 2

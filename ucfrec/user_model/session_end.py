@@ -1,7 +1,12 @@
-"""When users leave: the probability that a session ends with a step, fitted to logged steps."""
+"""When users leave: the probability that a session ends with a step, fitted to logged steps.
 
+It may be that of gradient-boosted trees, fitted by scikit-learn and kept as tensors: data, never a
+program.
+"""
+
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -11,11 +16,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ucfrec import schema
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
+from ucfrec.user_model.reward import compare_to_history
 from ucfrec.user_model.reward_report import SAVED
-from ucfrec.user_model.trees import BoostedTrees
 
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
@@ -34,35 +40,37 @@ estimated."""
 _STEP: Final = 2.0**-10
 """Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
 on one side of a tree's threshold."""
-_LOGISTIC: Final = ("highest", "mean", "scale", "weights", "bias")
-_MOST: Final = 20.0
+_HIGHEST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
+TREES: Final = 100
+LEAVES: Final = 8
+"""Most trees, and leaves of a tree."""
+_SETTINGS: Final = {
+    "learning_rate": 0.2,
+    "max_iter": TREES,
+    "max_leaf_nodes": LEAVES,
+    "early_stopping": True,
+}
+_SPLITS: Final = LEAVES - 1
 
 
 @dataclass(frozen=True)
 class LoggedEnds:
-    """Logged steps, what was shown before each, and whether it ended its session."""
+    """Logged steps, and whether they ended their sessions."""
 
-    shown: Shown
-    """The items shown before, (N, L)."""
-    items: Tensor
-    """(N,) int64 items shown at the step."""
-    rewards: Float64Array
-    """(N,) in reward units."""
-    steps: IntArray
-    """(N,) number of the step in its session."""
+    inputs: Tensor
+    """(N, F) of `describe_steps`."""
     ended: BoolArray
     """(N,)."""
     followed: BoolArray
     """(N,) whether another session of the same user follows; true where users are not named."""
 
     @classmethod
-    def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
-        """Steps of a view of a store of items, at most `most` of them, drawn at random.
-
-        The last step of a session that is not terminated is excluded: the log may simply have ended
-        there.
-        """
+    def of(
+        cls, store: EpisodeStore, likeness: Likeness, lags: int, most: int, seed: int
+    ) -> "LoggedEnds":
+        """Steps of a view of a store of items, at most `most` of them, drawn at random; without the
+        last one of a session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
         ends = np.cumsum(usable)
         numbers = np.arange(int(ends[-1]))
@@ -71,18 +79,17 @@ class LoggedEnds:
             numbers = np.sort(sample)
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - usable)[episodes]
-        ended = steps == store.lengths[episodes] - 1
-        shown = Shown.before(store, episodes, steps, lags)
-        items = torch.from_numpy(store.step_values(schema.ITEM, episodes, steps).astype(np.int64))
+        items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+        history = Shown.before(store, episodes, steps, lags)
+        inputs = describe_steps(likeness, history, torch.from_numpy(items), rewards, steps)
         followed = ~last_sessions(store) if store.has_users else np.ones(len(store), dtype=bool)
-        return cls(shown, items, rewards, steps, ended, followed[episodes])
+        return cls(inputs, steps == store.lengths[episodes] - 1, followed[episodes])
 
     def select(self, rows: BoolArray) -> "LoggedEnds":
         """Some of the steps."""
-        shown, items = self.shown.at(torch.from_numpy(rows)), self.items[torch.from_numpy(rows)]
-        columns = self.steps[rows], self.ended[rows], self.followed[rows]
-        return LoggedEnds(shown, items, self.rewards[rows], *columns)
+        inputs = self.inputs[torch.from_numpy(rows)]
+        return LoggedEnds(inputs, self.ended[rows], self.followed[rows])
 
 
 def last_sessions(store: EpisodeStore) -> BoolArray:
@@ -98,9 +105,8 @@ def whole_sessions(
 ) -> tuple[EpisodeStore, EpisodeStore]:
     """Sessions to fit models of their ends to, and held-out ones to choose a model by.
 
-    These are training and validation sessions. But where most validation sessions go on from
-    training sessions that the split by time cut, they lack the steps that say when they end: the
-    training sessions of a fifth of the users are held out instead.
+    Where most validation sessions go on from training sessions that the split by time cut, they
+    lack the steps that say when they end: training sessions of a fifth of the users are held out.
     """
     if not (train.has_users and validation.has_users):
         return train, validation
@@ -130,7 +136,6 @@ class SessionEndReport:
     """Whether ends of users' last sessions count; see `SessionEnd.fit`."""
 
 
-@dataclass(frozen=True)
 class SessionEnd:
     """The probability that a session ends with a step.
 
@@ -139,14 +144,33 @@ class SessionEnd:
     and how often the item was shown in the last 1, 3 and 10.
     """
 
-    likeness: Likeness
-    tensors: Mapping[str, Tensor]
-    """Those of `BoostedTrees`; or the `highest` (F,) inputs that count, so that steps later than
-    logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights` (F,) and `bias`
-    (), all float64."""
-    uses_rewards: bool = field(init=False)
-    """Whether the reward of the step counts."""
-    _trees: BoostedTrees | None = field(init=False)
+    def __init__(self, likeness: Likeness, tensors: Mapping[str, Tensor]) -> None:
+        """Of tensors of `BoostedTrees`; or of the `highest` (F,) inputs that count, so that steps
+        later than logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights`
+        (F,) and `bias` (), all float64."""
+        self.tensors, self._likeness = tensors, likeness
+        self._trees = BoostedTrees(**tensors) if "thresholds" in tensors else None
+        uses = tensors["weights"][_REWARD] if self._trees is None else tensors["inputs"] == _REWARD
+        self.uses_rewards = bool(uses.any())
+        """Whether the reward of the step counts."""
+
+    @classmethod
+    def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
+        """From tensors of a file.
+
+        Raises:
+            KeyError, ValueError: they are neither trees nor a regression of these inputs.
+        """
+        if "thresholds" in tensors:
+            parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
+            _require_trees(**parts)
+            return cls(likeness, parts)
+        parts = {name: tensors[name] for name in ("highest", "mean", "scale", "weights", "bias")}
+        for name, entry in parts.items():
+            shape = () if name == "bias" else (_INPUTS,)
+            if entry.shape != shape or entry.dtype != torch.float64:
+                raise ValueError(f"{name} does not fit the inputs")
+        return cls(likeness, parts)
 
     @classmethod
     def fit(
@@ -158,29 +182,27 @@ class SessionEnd:
         everything is fitted without these ends, too, and that is kept if it clearly (by three
         standard errors) predicts held-out sessions better that another one follows.
         """
-        every = cls._best(likeness, logged, held_out, seed)
+        best = cls._fit_best(likeness, logged, held_out, seed)
         certain = held_out.select(held_out.followed)
         if logged.followed.all() or certain.ended.sum() < _FEWEST:
-            return every
-        sure, held_out = (
-            entry.select(entry.followed | ~entry.ended) for entry in (logged, held_out)
-        )
-        without, report = cls._best(likeness, sure, held_out, seed)
-        gain, error = _gain(every[0]._losses(certain), without._losses(certain))
+            return best
+        sure, held_out = (rows.select(rows.followed | ~rows.ended) for rows in (logged, held_out))
+        without, report = cls._fit_best(likeness, sure, held_out, seed)
+        gain, error = _gain(best[0]._losses(certain), without._losses(certain))
         if gain <= 3 * error:
-            return every
+            return best
         return without, replace(report, last_sessions=False)
 
     @classmethod
-    def _best(
+    def _fit_best(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
         """The best kind, fitted to all of `logged`."""
-        inputs, ended = _inputs(likeness, logged), logged.ended
+        inputs, ended = logged.inputs, logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
         if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
             kinds["logistic"] = _logistic(inputs, ended)
-            kinds["boosted"] = BoostedTrees.fit(inputs.numpy(), ended, seed).tensors()
+            kinds["boosted"] = fit_trees(inputs.numpy(), ended, seed)
         models = {kind: cls(likeness, tensors) for kind, tensors in kinds.items()}
         losses = {kind: model._losses(held_out) for kind, model in models.items()}
         gains, best = dict[str, tuple[float, float]](), "constant"
@@ -192,64 +214,29 @@ class SessionEnd:
         report = SessionEndReport(len(ended), len(held_out.ended), means, gains, best)
         return models[best], report
 
-    def _losses(self, logged: LoggedEnds) -> Tensor:
+    def _losses(self, rows: LoggedEnds) -> Tensor:
         """Log losses (N,) of logged steps."""
-        scores = self._log_odds(_inputs(self.likeness, logged))
-        signed = torch.where(torch.from_numpy(logged.ended), -scores, scores)
-        return F.softplus(signed.clamp(max=_MOST))
-
-    @classmethod
-    def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
-        """From tensors of a file.
-
-        Raises:
-            KeyError: some are missing.
-            ValueError: they are neither trees nor a regression of these inputs.
-        """
-        if "thresholds" in tensors:
-            return cls(likeness, BoostedTrees.of(tensors, _INPUTS).tensors())
-        parts = {name: tensors[name] for name in _LOGISTIC}
-        for name, entry in parts.items():
-            if (
-                entry.shape != (() if name == "bias" else (_INPUTS,))
-                or entry.dtype != torch.float64
-            ):
-                raise ValueError(f"{name} does not fit the inputs")
-        return cls(likeness, parts)
-
-    def __post_init__(self) -> None:
-        trees = BoostedTrees(**self.tensors) if "thresholds" in self.tensors else None
-        object.__setattr__(self, "_trees", trees)
-        if trees is None:
-            uses = bool(self.tensors["weights"][_REWARD] != 0)
-        else:
-            uses = bool((trees.inputs == _REWARD).any())
-        object.__setattr__(self, "uses_rewards", uses)
+        odds = self._log_odds(rows.inputs)
+        signed = torch.where(torch.from_numpy(rows.ended), -odds, odds)
+        return F.softplus(signed.clamp(max=_HIGHEST))
 
     def probabilities(
-        self, shown: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
+        self, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
     ) -> Float64Array:
-        """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
-        nothing = np.zeros(len(steps), dtype=bool)
-        inputs = _inputs(self.likeness, LoggedEnds(shown, items, rewards, steps, nothing, nothing))
+        """Probabilities (M,) that sessions end with a step; see `describe_steps`."""
+        inputs = describe_steps(self._likeness, history, items, rewards, steps)
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
-    def of_items(
-        self, shown: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
+    def score_items(
+        self, history: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
     ) -> list[Tensor]:
-        """Probabilities (B, C) that sessions end if they show items, for each of some rewards.
-
-        Args:
-            items: (B, C) int64.
-            rewards: R of (B, C) that the items would be given.
-            steps: (B,) number of the step.
-        """
+        """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
+        each of some rewards (B, C) that the items would be given."""
         batch, count = items.shape
-        lately = F.pad(shown.items[:, :_LAGS], (0, max(0, _LAGS - shown.items.shape[1])), value=-1)
-        profiles = self.likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
-        alike = self.likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
-        repeated = shown.items.unsqueeze(2) == items.unsqueeze(1)
-        number = steps.unsqueeze(1)
+        lately = _pad(history.items)
+        profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
+        alike = self._likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
+        repeated, number = history.items.unsqueeze(2) == items.unsqueeze(1), steps.unsqueeze(1)
         if self._trees is None:
             inputs = [
                 torch.stack(_columns(alike, repeated, entry, number), -1) for entry in rewards
@@ -258,8 +245,8 @@ class SessionEnd:
             return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
         columns = torch.stack(_columns(alike, repeated, rewards[0], number)).flatten(1)
         values = [entry.flatten() for entry in rewards]
-        odds_of_each = self._trees.with_values(columns.T, _REWARD, values)
-        return [torch.sigmoid(entry).view(batch, count) for entry in odds_of_each]
+        odds_of_each = self._trees.replace_input(columns.T, _REWARD, values)
+        return [torch.sigmoid(odds).view(batch, count) for odds in odds_of_each]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
         """(M,) from inputs (M, F), float64."""
@@ -287,41 +274,139 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     scale = torch.where(spread > 0, spread, 1.0)
     model = LogisticRegression(C=1 / _PENALTY, max_iter=1000)
     model.fit(((inputs - mean) / scale).numpy(), ended)
-    fitted = {
-        "weights": torch.from_numpy(model.coef_[0]),
-        "bias": torch.tensor(model.intercept_[0]),
-    }
-    return {"highest": highest, "mean": mean, "scale": scale, **fitted}
+    slopes, bias = torch.from_numpy(model.coef_[0]), torch.tensor(model.intercept_[0])
+    return {"highest": highest, "mean": mean, "scale": scale, "weights": slopes, "bias": bias}
 
 
-def _profile(likeness: Likeness, shown: Shown, lag: int) -> Tensor:
-    """(M, F) of the item that was shown `lag` steps before the last one, as `Likeness.profile`."""
-    items = shown.items[:, lag : lag + 1]
-    return likeness.profile(items, torch.ones(items.shape))
-
-
-def _gain(losses: Tensor, columns: Tensor) -> tuple[float, float]:
-    """By how much the mean of `others` is lower, and the standard error; 0 without rows."""
-    decrease = losses - columns
+def _gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
+    """By how much the mean of `lower` is lower, and the standard error; 0 without rows."""
+    decrease = losses - lower
     if not len(decrease):
         return 0.0, 0.0
     return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
 
 
-def _inputs(likeness: Likeness, logged: LoggedEnds) -> Tensor:
-    """(M, F) inputs of logged steps."""
-    shown, items = logged.shown, logged.items.unsqueeze(1)
-    alike = [likeness.to_items(_profile(likeness, shown, lag), items) for lag in range(_LAGS)]
-    rewards, steps = torch.from_numpy(logged.rewards), torch.from_numpy(logged.steps)
-    return torch.stack(_columns(torch.stack(alike, 1), shown.items == items, rewards, steps), -1)
+def _pad(items: Tensor) -> Tensor:
+    """The `_LAGS` latest of items (M, L)."""
+    return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
+
+
+def describe_steps(
+    likeness: Likeness, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
+) -> Tensor:
+    """(M, F) inputs of steps at which items (M,) were shown, after what was shown before."""
+    alike = compare_to_history(likeness, _pad(history.items), items)
+    repeated = history.items == items.unsqueeze(1)
+    columns = _columns(alike, repeated, torch.from_numpy(rewards), torch.from_numpy(steps))
+    return torch.stack(columns, -1)
 
 
 def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) -> list[Tensor]:
     """F inputs (M, ...) from likeness (M, 10, ...) and repetition (M, L, ...), latest first."""
     numbers = steps.double().expand(rewards.shape)
-    columns = [torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()]
     alike = (alike.double() / _STEP).round() * _STEP
-    columns += [*alike.unbind(1)]
-    columns += [alike[:, :reach].amax(1) for reach in (2, 3, 4, _LAGS)]
-    columns += [repeated[:, :reach].sum(1).double() for reach in (1, 3, _LAGS)]
-    return columns
+    return [
+        *(torch.log1p(numbers), numbers, numbers.clamp(max=1), rewards.double()),
+        *alike.unbind(1),
+        *(alike[:, :reach].amax(1) for reach in (2, 3, 4, _LAGS)),
+        *(repeated[:, :reach].sum(1).double() for reach in (1, 3, _LAGS)),
+    ]
+
+
+class BoostedTrees:
+    """The sum of T regression trees of at most S splits.
+
+    A tree is a table: which of its splits' inputs are at most their threshold selects the leaf.
+    """
+
+    def __init__(self, inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
+        """Args:
+        inputs: (T, S) int64 number of the input that a split looks at.
+        thresholds: (T, S) float64.
+        leaves: (T, 2^S) float64 by numbers whose bit s is set where split s finds an input that is
+            at most its threshold.
+        base: () float64, what the trees' sum starts from.
+        """
+        self._leaves, self._base = leaves, base
+        pairs = torch.stack([inputs.double(), thresholds], 2).flatten(0, 1)
+        splits, which = torch.unique(pairs, dim=0, return_inverse=True)
+        powers = (2.0 ** torch.arange(inputs.shape[1])).expand(inputs.shape)
+        bits = torch.zeros(len(inputs), len(splits))
+        self._bits = bits.scatter_add_(1, which.view(inputs.shape), powers)
+        """(T, U) float32 bits of the columns' numbers that each of the U different splits sets."""
+        self._numbers, self._thresholds = splits[:, 0].long(), splits[:, 1:]
+        """Input (U,), ascending, and threshold (U, 1) of these splits."""
+        self._sorted: list[int] = self._numbers.tolist()
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Log-odds (M,) float64 from inputs (M, F)."""
+        return self._sums(self._bits @ self._compare(inputs))
+
+    def replace_input(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:
+        """Log-odds (M,) as from `inputs` (M, F) with one of them replaced by each of some values
+        (M,); fastest if inputs are the transpose of columns (F, M)."""
+        first, end = (bisect_left(self._sorted, value) for value in (number, number + 1))
+        at_most = self._compare(inputs)
+        at_most[first:end] = 0.0
+        columns, bits = self._bits @ at_most, self._bits[:, first:end]
+        thresholds = self._thresholds[first:end]
+        return [
+            self._sums(columns + bits @ (entry.double() <= thresholds).float()) for entry in values
+        ]
+
+    def _compare(self, inputs: Tensor) -> Tensor:
+        """(U, M) float32, 1 where the input of a split is at most its threshold."""
+        return torch.le(inputs.double().T[self._numbers], self._thresholds).float()
+
+    def _sums(self, columns: Tensor) -> Tensor:
+        """The trees' sum (M,) from numbers of leaves (T, M), which float32 has exactly."""
+        return self._base + self._leaves.gather(1, columns.long()).sum(0)
+
+
+def _require_trees(inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
+    """Check the tensors of `BoostedTrees`, which may come from anywhere."""
+    if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
+        raise ValueError("inputs are not numbers of inputs")
+    if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
+        raise ValueError("inputs are beyond the last input")
+    if any(entry.dtype != torch.float64 for entry in (thresholds, leaves, base)):
+        raise ValueError("thresholds, leaves and base are not float64")
+    shapes = thresholds.shape, leaves.shape, base.shape
+    if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
+        raise ValueError("thresholds, leaves and base do not fit the inputs")
+
+
+def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
+    """Tensors of `BoostedTrees`: log-odds of a bool target (M,), from inputs (M, F).
+
+    A tenth of the rows, drawn by `seed`, decides when to stop.
+    """
+    from sklearn.ensemble import HistGradientBoostingClassifier
+
+    model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
+    tables = [_tabulate(trees[0].nodes) for trees in model._predictors]
+    splits, thresholds, leaves = (
+        torch.from_numpy(np.stack(entry)) for entry in zip(*tables, strict=True)
+    )
+    base = torch.tensor(float(model._baseline_prediction.item())).double()
+    return {"inputs": splits, "thresholds": thresholds, "leaves": leaves, "base": base}
+
+
+def _tabulate(nodes: Array) -> tuple[Array, Array, Array]:
+    """Inputs (S,), thresholds (S,) and leaves (2^S,) of the nodes of one of scikit-learn's trees.
+
+    Splits that the tree lacks look at input 0, and select nothing.
+    """
+    inner = np.flatnonzero(nodes["is_leaf"] == 0)
+    inputs, thresholds = np.zeros(_SPLITS, dtype=np.int64), np.zeros(_SPLITS)
+    inputs[: len(inner)] = nodes["feature_idx"][inner]
+    thresholds[: len(inner)] = nodes["num_threshold"][inner]
+    split = np.zeros(len(nodes), dtype=np.int64)
+    split[inner] = np.arange(len(inner))
+    outcomes = np.arange(2**_SPLITS)
+    node = np.zeros(2**_SPLITS, dtype=np.int64)
+    for _ in inner:
+        left = (outcomes >> split[node]) & 1 == 1
+        below = np.where(left, nodes["left"][node], nodes["right"][node])
+        node = np.where(nodes["is_leaf"][node] == 1, node, below).astype(np.int64)
+    return inputs, thresholds, nodes["value"][node]

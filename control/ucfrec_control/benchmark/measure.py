@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from ucfrec.benchmark.cells import Cell, measured_by, opened, training_config
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.benchmark.cells import Cell, Measurement, open_store, training_config
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -42,7 +42,7 @@ def rl_config_of(cell: Cell) -> RLConfig:
     """The configuration of an IQL or CQL training, whose settings are `field=value` in JSON."""
     parts = (setting.partition("=") for setting in cell.settings)
     settings = {name: json.loads(value) for name, _, value in parts}
-    return rl_config(dataset_of(opened(cell)), cell.policy, **settings)
+    return rl_config(dataset_of(open_store(cell)), cell.policy, **settings)
 
 
 def seed_of(cell: Cell) -> int:
@@ -55,14 +55,14 @@ def targets_of(cell: Cell) -> Sequence[float]:
     """The target returns of the preset, or the first; empty if the policy knows its own."""
     if cell.policy not in ALGORITHMS and cell.config.policy.max_return:
         return ()
-    targets = preset_of(dataset_of(opened(cell)), cell.policy).targets
+    targets = preset_of(dataset_of(open_store(cell)), cell.policy).targets
     return targets if cell.evaluation.all_targets else targets[:1]
 
 
 def train(cell: Cell) -> RunRecord | RLRecord:
     """Train the policy of the cell; returns the record of its run."""
     assert cell.run is not None
-    store = opened(cell)
+    store = open_store(cell)
     if cell.policy in ALGORITHMS:
         return train_rl(store, cell.run, rl_config_of(cell), seed_of(cell))
     return train_control(store, cell.run, cell.config, screening=cell.screening, shared=cell.shared)
@@ -88,7 +88,7 @@ def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
 def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train with the distractor, and evaluate with it fixed to 0 and to 1; returns one row."""
     assert cell.run is not None
-    record, store = train(cell), opened(cell)
+    record, store = train(cell), open_store(cell)
     # The last checkpoint: the best one is chosen on data in which the distractor varies.
     # All evaluations have the same initial states, with and without distractor.
     evaluations = [
@@ -109,5 +109,5 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     return [evaluations[0].of(row_key).extended(more)]
 
 
-SCORE_MEASUREMENT: Final = measured_by(measure_scores, config)
-ROBUSTNESS_MEASUREMENT: Final = measured_by(measure_robustness, config)
+SCORE_MEASUREMENT: Final = Measurement(measure_scores, config)
+ROBUSTNESS_MEASUREMENT: Final = Measurement(measure_robustness, config)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from ucfrec.benchmark.cells import Method, augmented_ucf
+from ucfrec.benchmark.cells import Method, make_augmented_ucf
 
 SCORES, ROBUSTNESS = "control", "robustness"
 """Suites of the rows."""
@@ -27,8 +27,8 @@ METHODS: Methods = {
     "dc-wo-time": Method("dc", (_NO_TIME,)),
     "lsdt": Method("lsdt"),
     "lsdt-wo-time": Method("lsdt", (_NO_TIME,)),
-    "ucf": augmented_ucf(),
-    "ucf-w-time": augmented_ucf("policy.max_timestep=1000"),
+    "ucf": make_augmented_ucf(),
+    "ucf-w-time": make_augmented_ucf("policy.max_timestep=1000"),
     **PAPER,
     "ucf-wo-count": Method("ucf"),
     "ucf-wo-arch": Method("dt", (_NO_TIME, "augment.copies=1")),
@@ -89,30 +89,30 @@ _TABLES: dict[str, Methods] = {
     PURSUING: _rows((*_BASELINES, *_UCF), _PURSUITS),
     # Figure 2.
     LAMBDA: {
-        f"ucf-lambda-{weight:g}": augmented_ucf(f"policy.lambda_mask={weight}")
+        f"ucf-lambda-{weight:g}": make_augmented_ucf(f"policy.lambda_mask={weight}")
         for weight in (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
     },
     # Table 9, with each generator.
     "gate": {
-        "ucf": augmented_ucf(),
-        "ucf-wo-gate": augmented_ucf(_NO_GATE),
-        "faithful": augmented_ucf(_FAITHFUL),
-        "faithful-wo-gate": augmented_ucf(_FAITHFUL, _NO_GATE),
+        "ucf": make_augmented_ucf(),
+        "ucf-wo-gate": make_augmented_ucf(_NO_GATE),
+        "faithful": make_augmented_ucf(_FAITHFUL),
+        "faithful-wo-gate": make_augmented_ucf(_FAITHFUL, _NO_GATE),
     },
     # Table 10: λ_band exists for the paper's network only; for tangent moves the band is widened.
     "band": {
-        "ucf": augmented_ucf(),
-        "ucf-wide": augmented_ucf("csg.band=[0.2, 2.0]"),
-        "ucf-wo-lower": augmented_ucf("csg.band=[0.0, 0.5]"),
-        "faithful": augmented_ucf(_FAITHFUL),
-        "faithful-wo-band": augmented_ucf(_FAITHFUL, "csg.lambda_band=0.0"),
-        "faithful-wo-lower": augmented_ucf(_FAITHFUL, "csg.band=[0.0, 0.5]"),
+        "ucf": make_augmented_ucf(),
+        "ucf-wide": make_augmented_ucf("csg.band=[0.2, 2.0]"),
+        "ucf-wo-lower": make_augmented_ucf("csg.band=[0.0, 0.5]"),
+        "faithful": make_augmented_ucf(_FAITHFUL),
+        "faithful-wo-band": make_augmented_ucf(_FAITHFUL, "csg.lambda_band=0.0"),
+        "faithful-wo-lower": make_augmented_ucf(_FAITHFUL, "csg.band=[0.0, 0.5]"),
     },
     # Does augmentation help? Each generator and variant of the copies, with and without gate.
     "augmentation": {
         "ucf-wo-count": Method("ucf"),
         **{
-            f"{name}{variant}{gate}": augmented_ucf(*kind, *copies, *gate_settings)
+            f"{name}{variant}{gate}": make_augmented_ucf(*kind, *copies, *gate_settings)
             for name, kind, gates in (
                 ("ucf", (), (("", ()), ("-wo-gate", (_NO_GATE,)))),
                 ("faithful", (_FAITHFUL,), (("", ()), ("-wo-gate", (_NO_GATE,)))),

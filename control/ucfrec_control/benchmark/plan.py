@@ -8,9 +8,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from ucfrec.benchmark.cells import Budget, Cell, Method, Task
-from ucfrec.benchmark.grid import chosen
-from ucfrec.benchmark.plan import Plan, Presets
+from ucfrec.benchmark.cells import Budget, Cell, Method, Plan, Presets, Task
+from ucfrec.benchmark.grid import select_names
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_control.benchmark.measure import DISTRACTOR, RATE
 from ucfrec_control.benchmark.methods import (
@@ -51,7 +50,7 @@ def score_cells(
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
             store = zoo_store(data, stores_of(folder), file)
-            yield from plan.trained(table, Task(file, store), selected)
+            yield from plan.list_trained(table, Task(file, store), selected)
 
 
 def set_contexts(budget: Budget, contexts: Mapping[str, int]) -> Budget:
@@ -77,7 +76,7 @@ def robustness_cells(
         for distractor in distractors or DISTRACTORS:
             store = zoo_store(data, stores_of(folder), file, distractor)
             task = Task(file, store, conditions={DISTRACTOR: distractor})
-            yield from plan.trained(ROBUSTNESS, task, selected)
+            yield from plan.list_trained(ROBUSTNESS, task, selected)
 
 
 def _plan(suite: str, folder: Path, budget: Budget) -> Plan:
@@ -90,7 +89,7 @@ def presets_of(store: EpisodeStore, policy: str) -> Presets:
 
 
 def _select(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
-    return {name: methods[name] for name in chosen(methods, names, "method")}
+    return {name: methods[name] for name in select_names(methods, names, "method")}
 
 
 def _time_settings(settings: Sequence[str]) -> tuple[str, ...]:

@@ -1,53 +1,51 @@
 """`ucfrec-control benchmark`: every method on the zoo files; resumes."""
 
-import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from typing import Annotated
 
-from ucfrec.benchmark.cells import Cell
-from ucfrec.benchmark.tables import difference_table, of_best_target, over_seeds, score_table
-from ucfrec.commands.grid_options import results_given, rows_explained, rows_of
+from ucfrec.benchmark.tables import (
+    average_seeds,
+    difference_table,
+    score_table,
+    select_best_target,
+)
+from ucfrec.commands.options import Names
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
-from ucfrec_control.benchmark.budgets import budget_of
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import MAIN, SCORES, TABLES
 from ucfrec_control.benchmark.plan import chosen_rates, score_cells
-from ucfrec_control.commands.options import (
-    context_option,
-    control_grid_options,
-    data_given,
-    data_option,
-    narrow_budget,
-)
+from ucfrec_control.commands.options import SuiteOptions
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `benchmark`."""
-    data_option(parser)
-    parser.add_argument(
-        "--table",
-        default=MAIN,
-        choices=list(TABLES),
-        help="every method (main), ways to pursue reward, all trained for as long as DT or "
-        "LSDT (equal-time), or a sweep over UCF's settings",
-    )
-    context_option(parser)
-    control_grid_options(parser)
+UCF = "ucf"
+"""The method of the main table that the others are compared with."""
+_SHOWN = (
+    *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
+    *("episodes", "validation_loss"),
+)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control benchmark`."""
-    table = options.table
-    budget = narrow_budget(budget_of(table, options.budget), options)
+class Benchmark(SuiteOptions):
+    """`ucfrec-control benchmark`."""
 
-    def cells() -> Iterator[Cell]:
-        return score_cells(data_given(options), options.out, budget, table, options.methods)
+    table: Annotated[str, Names(lambda: tuple(TABLES), closed=True)] = MAIN
+    """Every method (main), ways to pursue reward, all trained for as long as DT or LSDT
+    (equal-time), or a sweep over UCF's settings"""
 
-    rows = rows_of(options, SCORES, [table], cells, SCORE_MEASUREMENT, f"benchmark {table}")
-    with rows_explained(options):
-        print_scores(rows, table)
-    print(f"\nrows: {results_given(options)}")
+    def execute(self) -> None:
+        """Run `ucfrec-control benchmark`."""
+        table = self.table
+        rows = self.make_suite_rows(
+            SCORES,
+            table,
+            SCORE_MEASUREMENT,
+            lambda data, out, budget, methods: score_cells(data, out, budget, table, methods),
+            f"benchmark {table}",
+        )
+        with self.explain_rows():
+            print_scores(rows, table)
+        print(f"\nrows: {self.rows_file}")
 
 
 def print_scores(rows: Sequence[ResultRow], table: str) -> None:
@@ -64,8 +62,8 @@ def print_scores(rows: Sequence[ResultRow], table: str) -> None:
 
 
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
-    print(format_rows([_line(row) for row in rows], _SHOWN))
-    if len(rows) > len(rows := of_best_target(rows)):
+    print(format_rows([dict.fromkeys(_SHOWN) | row.as_line() for row in rows], _SHOWN))
+    if len(rows) > len(rows := select_best_target(rows)):
         print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
         if lines := score_table(rows, checkpoint):
@@ -78,22 +76,9 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
     by, values = ("task", "method"), ("score", "validation_loss")
     columns = (*values, "acceptance")
     print("\nlast checkpoint, mean ± standard deviation over seeds")
-    print(format_rows(over_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
+    print(format_rows(average_seeds([row.as_line() for row in last], by, columns), (*by, *columns)))
     reference = UCF if table == MAIN or not last else last[0].method
     for name in values:
         if lines := difference_table(last, reference, name):
             print(f"\n{name} less that of {reference} of the same seed, mean ± standard error")
             print(format_rows(lines, list(lines[0])))
-
-
-UCF = "ucf"
-"""The method of the main table that the others are compared with."""
-_SHOWN = (
-    *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
-    *("episodes", "validation_loss"),
-)
-
-
-def _line(row: ResultRow) -> dict[str, object]:
-    """A row as it is printed; missing values are None, printed as a dash."""
-    return dict.fromkeys(_SHOWN) | row.as_line()

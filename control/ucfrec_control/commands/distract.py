@@ -1,24 +1,29 @@
 """`ucfrec-control distract`: a store with a distractor in its states."""
 
-import argparse
 from pathlib import Path
+from typing import Annotated
 
-from ucfrec.commands.grid_options import seed_given
+from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_control.data.distractor import add_distractor
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `distract`."""
-    parser.add_argument("store", type=Path, metavar="STORE")
-    parser.add_argument("--out", type=Path, required=True, metavar="STORE")
-    parser.add_argument("--flip", type=float, default=0.0, help="probability that it is wrong (0)")
-    parser.add_argument("--early", action="store_true", help="indicate the next step's reward")
-    parser.add_argument("--seed", type=seed_given, default=0)
+class Distract(Table):
+    """`ucfrec-control distract`."""
 
+    store: Annotated[Path, ARGUMENT, "STORE"]
+    """Episode store."""
+    out: Annotated[Path, "STORE"]
+    """Folder of the new store."""
+    flip: float = 0.0
+    """Probability that it is wrong."""
+    early: bool = False
+    """Indicate the next step's reward."""
+    seed: Annotated[int, SEED] = 0
+    """Of the distractor."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control distract`."""
-    store = EpisodeStore.open(options.store)
-    add_distractor(store, options.out, options.flip, options.seed, options.early)
-    print(f"store: {options.out}; dimension {store.observation_size} is the distractor")
+    def execute(self) -> None:
+        """Run `ucfrec-control distract`."""
+        store = EpisodeStore.open(self.store)
+        add_distractor(store, self.out, self.flip, self.seed, self.early)
+        print(f"store: {self.out}; dimension {store.observation_size} is the distractor")

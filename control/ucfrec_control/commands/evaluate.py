@@ -1,17 +1,15 @@
 """`ucfrec-control evaluate`: normalised scores of trained policies."""
 
-import argparse
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from ucfrec.commands.grid_options import seed_given
+from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, InputNote
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import write_results
+from ucfrec.results.rows import ResultRow, write_results
 from ucfrec_control.commands.options import MAX_RETURN, target_given
 from ucfrec_control.training.evaluate import CHECKPOINTS, NO_TARGET, evaluate_run, takes_target
 from ucfrec_control.training.rl_baselines import read_run
@@ -23,60 +21,70 @@ SHOWN = (
 )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `evaluate`."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--env", help="environment to evaluate in (that of the data)")
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--seed", type=seed_given, default=0)
-    parser.add_argument(
-        "--target",
-        type=target_given,
-        action="append",
-        default=[],
-        help="target return, or max for the largest that the policy expects in each state; "
-        "repeatable (the preset's)",
-    )
-    parser.add_argument("--checkpoint", choices=["both", "best", "last"], default="both")
-    parser.add_argument(
-        "--distractor", type=float, default=0.0, help="value that distractors are fixed to (0)"
-    )
-    parser.add_argument(
-        "--video",
-        type=Path,
-        metavar="MP4",
-        help="record an episode: FILE.mp4, or folder for frames",
-    )
-    parser.add_argument("--json", type=Path, help="write the result rows here")
+class Evaluate(Table):
+    """`ucfrec-control evaluate`."""
 
+    runs: Annotated[Sequence[Path], ARGUMENT, "RUN"]
+    """Run folders."""
+    env: str | None = None
+    """Environment to evaluate in (default: that of the data)"""
+    episodes: int = 20
+    """Episodes of each policy and target."""
+    seed: Annotated[int, SEED] = 0
+    """Of the episodes."""
+    target: Annotated[Sequence[float | None], target_given] = ()
+    """Target return, or max for the largest that the policy expects in each state; repeatable
+    (default: the preset's)"""
+    checkpoint: Literal["both", "best", "last"] = "both"
+    """Weights to evaluate."""
+    distractor: float = 0.0
+    """Value that distractors are fixed to."""
+    video: Annotated[Path | None, "MP4"] = None
+    """Record an episode: FILE.mp4, or folder for frames."""
+    json: Path | None = None
+    """Write the result rows here."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control evaluate`.
+    def execute(self) -> None:
+        """Run `ucfrec-control evaluate`.
 
-    Raises:
-        InputError: a run or its environment cannot be used, or no run takes the --target.
-    """
-    if options.target:
-        _explain_targets(options.runs)
-    if options.video is not None:
-        _record(options)
-    rows: list[ResultRow] = []
-    for run in options.runs:
-        rows += evaluate_run(
-            run,
-            episodes=options.episodes,
-            seed=options.seed,
-            env_id=options.env,
-            targets=options.target,
-            checkpoints=CHECKPOINTS if options.checkpoint == "both" else (options.checkpoint,),
-            distractor=options.distractor,
+        Raises:
+            InputError: a run or its environment cannot be used, or no run takes the --target.
+        """
+        if self.target:
+            _explain_targets(self.runs)
+        if self.video is not None:
+            self._record(self.video)
+        rows: list[ResultRow] = []
+        for run in self.runs:
+            rows += evaluate_run(
+                run,
+                episodes=self.episodes,
+                seed=self.seed,
+                env_id=self.env,
+                targets=self.target,
+                checkpoints=CHECKPOINTS if self.checkpoint == "both" else (self.checkpoint,),
+                distractor=self.distractor,
+            )
+        print(format_rows([_shown(row) for row in rows], SHOWN))
+        mismatches: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
+        for warning in dict.fromkeys(text for texts in mismatches for text in texts):
+            print(f"warning: {warning}", file=sys.stderr)
+        if self.json is not None:
+            write_results(self.json, rows)
+
+    def _record(self, video: Path) -> None:
+        if len(self.runs) != 1:
+            raise InputError(f"--video records one run; {len(self.runs)} were given")
+        episode_return = record_episode(
+            self.runs[0],
+            video,
+            seed=self.seed,
+            checkpoint="best" if self.checkpoint == "best" else "last",
+            env_id=self.env,
+            target=next(iter(self.target), None),
+            distractor=self.distractor,
         )
-    print(format_rows([_shown(row) for row in rows], SHOWN))
-    mismatches: Iterable[Any] = (row.details.get("warnings", ()) for row in rows)
-    for warning in dict.fromkeys(text for texts in mismatches for text in texts):
-        print(f"warning: {warning}", file=sys.stderr)
-    if options.json is not None:
-        write_results(options.json, rows)
+        print(f"{video}: an episode of return {episode_return:.1f}\n")
 
 
 def _explain_targets(runs: Sequence[Path]) -> None:
@@ -106,18 +114,3 @@ def _shown(row: ResultRow) -> dict[str, Any]:
         "target_return": target,
         "return": f"{row.metrics['return']:.1f}",
     }
-
-
-def _record(options: argparse.Namespace) -> None:
-    if len(options.runs) != 1:
-        raise InputError(f"--video records one run; {len(options.runs)} were given")
-    episode_return = record_episode(
-        options.runs[0],
-        options.video,
-        seed=options.seed,
-        checkpoint="best" if options.checkpoint == "best" else "last",
-        env_id=options.env,
-        target=next(iter(options.target), None),
-        distractor=options.distractor,
-    )
-    print(f"{options.video}: an episode of return {episode_return:.1f}\n")

@@ -1,26 +1,30 @@
 """`ucfrec-control figures`: figures of runs and result rows."""
 
-import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+from ucfrec.commands.options import Table
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `figures`."""
-    parser.add_argument(
-        "--runs", nargs="*", type=Path, default=[], metavar="RUN", help="runs, or folders of runs"
-    )
-    parser.add_argument("--results", nargs="*", type=Path, default=[], metavar="ROWS")
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+class Figures(Table):
+    """`ucfrec-control figures`."""
 
+    runs: Annotated[Sequence[Path], "RUN…"] = ()
+    """Runs, or folders of runs."""
+    results: Annotated[Sequence[Path], "ROWS…"] = ()
+    """Files of result rows."""
+    out: Annotated[Path, "FOLDER"]
+    """Folder of the figures."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control figures`."""
-    from ucfrec_control.figures.figures import (
-        make_figures,  # matplotlib takes half a second to import
-    )
+    def execute(self) -> None:
+        """Run `ucfrec-control figures`."""
+        from ucfrec_control.figures.figures import (
+            make_figures,  # matplotlib takes half a second to import
+        )
 
-    files, missing = make_figures(options.runs, options.results, options.out)
-    print("\n".join(map(str, files)))
-    for line in missing:
-        print(f"missing: {line}", file=sys.stderr)
+        files, missing = make_figures(self.runs, self.results, self.out)
+        print("\n".join(map(str, files)))
+        for line in missing:
+            print(f"missing: {line}", file=sys.stderr)

@@ -2,15 +2,15 @@
 
 import argparse
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, Literal
 
-from ucfrec.benchmark.cells import Budget, Cell
-from ucfrec.benchmark.grid import Measurement
-from ucfrec.commands.grid_options import budget_options, grid_options, rows_of
+from ucfrec.benchmark.cells import Budget, Cell, Measurement
+from ucfrec.commands.benchmark import GridOptions
+from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.errors import InputError, one_line
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.methods import METHODS
 from ucfrec_control.benchmark.plan import set_contexts
@@ -20,13 +20,7 @@ from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.environments import note_unknown
 from ucfrec_control.environments.scores import find_task
 
-BUDGETS: Final = {
-    "small": "a quick look: policies have not learned all they can",
-    "medium": "averaged weights, 10 times the windows; about 20 core hours for the main table",
-    "full": "the steps, seeds and episodes of the papers",
-}
-"""What the budgets are, by name."""
-MAX_RETURN = "max"
+MAX_RETURN: Final = "max"
 """`--target` for the largest return that the policy expects in each state."""
 
 
@@ -47,28 +41,6 @@ def target_given(text: str) -> float | None:
     return value
 
 
-def source_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name a dataset to read."""
-    parser.add_argument(
-        "source", metavar="SOURCE", help="HDF5 file, Minari identifier, or folder of one"
-    )
-    parser.add_argument("--env", help="environment of the data, if the file does not name it")
-    parser.add_argument("--download", action="store_true", help="let Minari fetch the dataset")
-
-
-def context_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the history of single methods."""
-    parser.add_argument(
-        "--context",
-        dest="contexts",
-        type=context_given,
-        action="append",
-        default=[],
-        metavar="METHOD=STEPS",
-        help="steps of history of a method; repeatable (default: the budget's)",
-    )
-
-
 def context_given(text: str) -> tuple[str, int]:
     """The value of `--context`.
 
@@ -81,63 +53,106 @@ def context_given(text: str) -> tuple[str, int]:
     return method, int(steps)
 
 
-def data_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the folder of a benchmark's data."""
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of the HDF5 files")
+class SourceOptions(Table):
+    """A dataset to read."""
+
+    source: Annotated[str, ARGUMENT, "SOURCE"]
+    """HDF5 file, Minari identifier, or folder of one."""
+    env: str | None = None
+    """Environment of the data, if the file does not name it."""
+    download: bool = False
+    """Let Minari fetch the dataset."""
+
+    def read_source(self) -> Trajectories:
+        """Read the dataset.
+
+        Raises:
+            InputError: it is missing, damaged, of another format, or of other sizes than `--env`
+                has.
+        """
+        if self.env is not None:
+            note_unknown(self.env)
+        if is_minari(self.source):
+            return read_minari(self.source, self.env, self.download)
+        return read_d4rl(Path(self.source), self.env)
 
 
-def data_given(options: argparse.Namespace) -> Path:
-    """The folder of the HDF5 files.
+class ControlGridOptions(GridOptions):
+    """The data of a benchmark, how much of it is measured, and where its rows are."""
 
-    Raises:
-        InputError: no folder is given.
-    """
-    if options.data is None:
-        raise InputError(
-            "name the folder of the HDF5 files with --data, or give --show-only for the rows that "
-            "are there"
+    data: Annotated[Path | None, "FOLDER"] = None
+    """Folder of the HDF5 files."""
+    context: Annotated[Sequence[tuple[str, int]], context_given, "METHOD=STEPS"] = ()
+    """Steps of history of a method; repeatable (default: the budget's)"""
+    budget: Literal["small", "medium", "full"] = "small"
+    """small (a quick look: policies have not learned all they can), medium (averaged weights, 10
+    times the windows; about 20 core hours for the main table), full (the steps, seeds and episodes
+    of the papers)"""
+    seeds: Annotated[int | None, "N"] = None
+    """Training seeds of every method, from 0 (default: set by --budget)"""
+    out: Path = Path("runs/control")
+    workers: int = 1
+
+    def require_data(self) -> Path:
+        """The folder of the HDF5 files.
+
+        Raises:
+            InputError: no folder is given.
+        """
+        if self.data is None:
+            raise InputError(
+                "name the folder of the HDF5 files with --data, or give --show-only for the rows "
+                "that are there"
+            )
+        return self.data
+
+    def narrow_budget(
+        self, budget: Budget, files: Sequence[str] = (), evaluation_seed: int | None = None
+    ) -> Budget:
+        """`budget` with the seeds and contexts of the options.
+
+        Raises:
+            InputError: `--seeds` is below 1.
+        """
+        budget = budget.narrow(files, self.seeds, evaluation_seed=evaluation_seed)
+        return set_contexts(budget, dict(self.context))
+
+
+class SuiteOptions(ControlGridOptions):
+    """Options that select what a suite measures."""
+
+    file: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this file; repeatable (default: all of the budget)"""
+    method: Annotated[Sequence[str], "NAME"] = ()
+    """Measure only this method; repeatable (default: all of the budget)"""
+    evaluation_seed: Annotated[int | None, SEED, "SEED"] = None
+    """Seed of the evaluated episodes; the same for every training seed (default: set by
+    --budget)"""
+
+    def make_suite_rows(
+        self,
+        suite: str,
+        table: str,
+        how: Measurement,
+        list_cells: Callable[[Path, Path, Budget, Sequence[str]], Iterable[Cell]],
+        describe: str = "",
+    ) -> list[ResultRow]:
+        """The rows that a command shows, as `GridOptions.make_rows`.
+
+        Args:
+            table: the one that is measured and shown; "" for all of the suite.
+            list_cells: lists the cells of data, folder, budget and methods.
+        """
+        budget = budget_of(table or suite, self.budget)
+        budget = self.narrow_budget(budget, self.file, self.evaluation_seed)
+        tables = [table] if table else []
+        return self.make_rows(
+            suite,
+            tables,
+            lambda: list_cells(self.require_data(), self.out, budget, self.method),
+            how,
+            describe,
         )
-    folder: Path = options.data
-    return folder
-
-
-def control_grid_options(parser: argparse.ArgumentParser, budget: bool = True) -> None:
-    """Add the options for what a benchmark measures, and where it keeps its runs and rows."""
-    if budget:
-        budget_options(parser, "--file", "--seeds", BUDGETS)
-    grid_options(parser, "runs/control", 1)
-
-
-def rows_of_suite(
-    options: argparse.Namespace,
-    suite: str,
-    how: Measurement[Cell],
-    cells: Callable[..., Iterable[Cell]],
-) -> list[ResultRow]:
-    """The rows that a command shows, as `ucfrec.commands.grid_options.rows_of`.
-
-    Args:
-        cells: makes the cells of data, folder, budget and methods.
-    """
-    budget = narrow_budget(budget_of(suite, options.budget), options)
-
-    def list_cells() -> Iterable[Cell]:
-        return cells(data_given(options), options.out, budget, options.methods)
-
-    return rows_of(options, suite, (), list_cells, how)
-
-
-def read_source(options: argparse.Namespace) -> Trajectories:
-    """Read the dataset that the options of `source_options` name.
-
-    Raises:
-        InputError: it is missing, damaged, of another format, or of other sizes than `--env` has.
-    """
-    if options.env is not None:
-        note_unknown(options.env)
-    if is_minari(options.source):
-        return read_minari(options.source, options.env, options.download)
-    return read_d4rl(Path(options.source), options.env)
 
 
 def describe_source(trajectories: Trajectories) -> str:
@@ -152,15 +167,3 @@ def describe_source(trajectories: Trajectories) -> str:
         f"{env_id}\n"
         f"mean return {returns.mean():.3f}{score}; dropped: {', '.join(dropped)}"
     )
-
-
-def narrow_budget(budget: Budget, options: argparse.Namespace) -> Budget:
-    """`budget` with the files, seeds and contexts of the options.
-
-    Raises:
-        InputError: `--seeds` is below 1.
-    """
-    budget = budget.narrowed(
-        options.tasks, options.training_seeds, evaluation_seed=options.evaluation_seed
-    )
-    return set_contexts(budget, dict(options.contexts))

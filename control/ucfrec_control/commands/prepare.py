@@ -1,19 +1,19 @@
 """`ucfrec-control prepare`: a dataset to an episode store."""
 
-import argparse
 from pathlib import Path
+from typing import Annotated
 
-from ucfrec_control.commands.options import describe_source, read_source, source_options
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `prepare`."""
-    source_options(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="STORE")
+from ucfrec_control.commands.options import SourceOptions, describe_source
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control prepare`."""
-    trajectories = read_source(options)
-    trajectories.write_store(options.out)
-    print(f"{describe_source(trajectories)}\n\nstore: {options.out}")
+class Prepare(SourceOptions):
+    """`ucfrec-control prepare`."""
+
+    out: Annotated[Path, "STORE"]
+    """Folder of the store."""
+
+    def execute(self) -> None:
+        """Run `ucfrec-control prepare`."""
+        trajectories = self.read_source()
+        trajectories.write_store(self.out)
+        print(f"{describe_source(trajectories)}\n\nstore: {self.out}")

@@ -1,12 +1,10 @@
 """`ucfrec-control robustness`: scores lost to distractors; resumes."""
 
-import argparse
 from collections.abc import Sequence
 
-from ucfrec.benchmark.tables import over_seeds
-from ucfrec.commands.grid_options import results_given, rows_explained
+from ucfrec.benchmark.tables import average_seeds
 from ucfrec.reporting.tables import format_rows
-from ucfrec.results.row import ResultRow
+from ucfrec.results.rows import ResultRow
 from ucfrec_control.benchmark.measure import ROBUSTNESS_MEASUREMENT
 from ucfrec_control.benchmark.methods import ROBUSTNESS
 from ucfrec_control.benchmark.plan import robustness_cells
@@ -20,37 +18,27 @@ from ucfrec_control.benchmark.robustness import (
     loss_rises,
     screening_rows,
 )
-from ucfrec_control.commands.options import (
-    context_option,
-    control_grid_options,
-    data_option,
-    rows_of_suite,
-)
+from ucfrec_control.commands.options import SuiteOptions
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `robustness`."""
-    data_option(parser)
-    context_option(parser)
-    control_grid_options(parser)
+class Robustness(SuiteOptions):
+    """`ucfrec-control robustness`."""
 
-
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control robustness`."""
-    rows = rows_of_suite(options, ROBUSTNESS, ROBUSTNESS_MEASUREMENT, robustness_cells)
-    with rows_explained(options):
-        print_robustness(rows)
-    print(f"\nrows: {results_given(options)}")
+    def execute(self) -> None:
+        """Run `ucfrec-control robustness`."""
+        rows = self.make_suite_rows(ROBUSTNESS, "", ROBUSTNESS_MEASUREMENT, robustness_cells)
+        with self.explain_rows():
+            print_robustness(rows)
+        print(f"\nrows: {self.rows_file}")
 
 
 def print_robustness(rows: Sequence[ResultRow]) -> None:
     """Print what distractors cost, and what screening found."""
     by = ("task", "distractor", "method")
     for lines, values in ((drops(rows), SHOWN), (loss_rises(rows), SHOWN_LOSSES)):
-        print(f"{format_rows(over_seeds(lines, by, values), (*by, *values))}\n")
+        print(f"{format_rows(average_seeds(lines, by, values), (*by, *values))}\n")
     print("largest loss of a method over datasets and distractors, % of the clean score")
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     # A store is screened once, whatever method and seed it is for.
     screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
-    columns = [name for name in SHOWN_SCREENING if name != "training_seed"]
-    print(format_rows(list(screened.values()), columns))
+    print(format_rows(list(screened.values()), SHOWN_SCREENING))

@@ -1,28 +1,30 @@
 """`ucfrec-control screen`: which state dimensions have an effect."""
 
-import argparse
 import dataclasses
 from pathlib import Path
+from typing import Annotated
 
-from ucfrec.commands.grid_options import seed_given
-from ucfrec.counterfactual.screening import describe_screening
+from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import write_json
 from ucfrec.provenance import provenance
-from ucfrec.runs.screened import screen_store
 from ucfrec_control.data.trajectories import PACKAGES
+from ucfrec_control.training.screening import screen_store
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `screen`."""
-    parser.add_argument("store", type=Path, metavar="STORE")
-    parser.add_argument("--seed", type=seed_given, default=0)
-    parser.add_argument("--json", type=Path, help="write the report here")
+class Screen(Table):
+    """`ucfrec-control screen`."""
 
+    store: Annotated[Path, ARGUMENT, "STORE"]
+    """Episode store to screen."""
+    seed: Annotated[int, SEED] = 0
+    """Of the predictors."""
+    json: Path | None = None
+    """Write the report here."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control screen`."""
-    report = screen_store(EpisodeStore.open(options.store), options.seed)
-    print(describe_screening(report))
-    if options.json is not None:
-        write_json(options.json, dataclasses.asdict(report) | provenance(PACKAGES))
+    def execute(self) -> None:
+        """Run `ucfrec-control screen`."""
+        report = screen_store(EpisodeStore.open(self.store), self.seed)
+        print(report.describe())
+        if self.json is not None:
+            write_json(self.json, dataclasses.asdict(report) | provenance(PACKAGES))

@@ -1,29 +1,29 @@
 """`ucfrec-control train`: train a policy on a store; resumes."""
 
-import argparse
+from typing import Annotated
 
 import torch
 
-from ucfrec.commands.train import training_options
+from ucfrec.commands.options import Names
+from ucfrec.commands.train import TrainingOptions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.runs.config import resolve_config
 from ucfrec_control.training.train import control_policies, dataset_of, preset_of, train_control
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `train`."""
-    training_options(parser, control_policies())
+class Train(TrainingOptions):
+    """`ucfrec-control train`."""
 
+    policy: Annotated[str, "NAME", Names(control_policies, closed=True)] = "ucf"
+    """Policy."""
 
-def run(options: argparse.Namespace) -> None:
-    """Run `ucfrec-control train`."""
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    store = EpisodeStore.open(options.store)
-    preset = preset_of(dataset_of(store), options.policy)
-    config = resolve_config(
-        options.policy, options.config, options.set, options.seed, preset.tables
-    )
-    record = train_control(store, options.out, config, screening=options.screen)
-    print(record.describe())
-    print(f"\nrun: {options.out}; TensorBoard can open it")
+    def execute(self) -> None:
+        """Run `ucfrec-control train`."""
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        store = EpisodeStore.open(self.store)
+        preset = preset_of(dataset_of(store), self.policy)
+        config = resolve_config(self.policy, self.config, self.set, self.seed, preset.tables)
+        record = train_control(store, self.out, config, screening=self.screen)
+        print(record.describe())
+        print(f"\nrun: {self.out}; TensorBoard can open it")

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ucfrec.arrays import Float64Array
+from ucfrec.counterfactual.augmentation import AugmentationReport, accept
 from ucfrec.counterfactual.generators import (
     CounterfactualStateGenerator,
     TangentGenerator,
@@ -16,9 +17,8 @@ from ucfrec.counterfactual.generators import (
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.reward_model_fit import sample_transitions
-from ucfrec.counterfactual.state_augmentation import AugmentationReport, accept
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay, Transitions
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
@@ -66,17 +66,18 @@ def edit_states(run: Path, seed: int = 0) -> tuple[Float64Array, Float64Array]:
         InputError: the run made no copies, or its store is gone.
     """
     _augmentation(run)
-    store, overlay = store_of(run), Overlay.load(run / "overlay.safetensors")
-    rng, edits = np.random.default_rng(seed), len(overlay.edit_step)
+    store = store_of(run)
+    copies = AugmentedEpisodes.load(run / AUGMENTED, store)
+    rng, edits = np.random.default_rng(seed), len(copies.edit_step)
     rows = rng.choice(edits, min(edits, _POINTS), replace=False)
-    episodes = overlay.copy_source[overlay.edit_copy[rows]]
-    factual = store.windows(episodes, overlay.edit_step[rows], 1).states[:, 0]
+    episodes = copies.copy_source[copies.edit_copy[rows]]
+    factual = store.windows(episodes, copies.edit_step[rows], 1).states[:, 0]
     mean, std = training_views(store)[0].state_statistics
     # Constant dimensions are never edited.
     varies = std > 0
     scaled = [
         ((states - mean) / std)[:, varies].double().numpy()
-        for states in (factual, torch.from_numpy(overlay.edit_state[rows]))
+        for states in (factual, torch.from_numpy(copies.edit_state[rows]))
     ]
     return scaled[0], scaled[1]
 

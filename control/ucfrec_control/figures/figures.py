@@ -9,13 +9,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ucfrec.benchmark.tables import of_best_target
+from ucfrec.benchmark.tables import select_best_target
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.provenance import config_hash
-from ucfrec.reporting.plot_style import save
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_results
+from ucfrec.reporting.charts import save
+from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN, RunRecord
 from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
@@ -225,7 +224,7 @@ def _plan_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     """Of several target returns the best, as the printed tables."""
     tables = grouped(rows, lambda row: (row.conditions["budget"], row.table))
     for (budget, table), table_rows in tables.items():
-        lines = [row.as_line() for row in of_best_target(table_rows)]
+        lines = [row.as_line() for row in select_best_target(table_rows)]
         draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
         yield _Plan("scores", f"{budget}-{table}", draw)
 

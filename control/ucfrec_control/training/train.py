@@ -18,6 +18,7 @@ from ucfrec.runs.screened import train_screened
 from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
+from ucfrec_control.training.screening import screen_store
 
 _POLICIES: Final = ("ucf", "ucf-paper", "dt", "dc", "lsdt", "bc")
 """Built-in policies whose actions may be vectors."""
@@ -105,4 +106,6 @@ def train_control(
     """
     dataset_of(store)
     package_versions = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, package_versions, shared, callbacks)
+    return train_screened(
+        *(store, out, config, screening, package_versions, shared, callbacks), screen_store
+    )

@@ -3,12 +3,16 @@
 from functools import partial
 from typing import Final
 
-from ucfrec.benchmark.plots import plot_distractor, plot_methods
 from ucfrec.benchmark.suite import Benchmark, Shown
-from ucfrec.benchmark.tables import distractor_table, method_table, sweep_table
-from ucfrec_simulators.benchmark.budgets import BUDGETS
+from ucfrec.benchmark.tables import (
+    distractor_table,
+    method_table,
+    plot_distractor,
+    plot_methods,
+    sweep_table,
+)
 from ucfrec_simulators.benchmark.measure import MEASUREMENT
-from ucfrec_simulators.benchmark.methods import COMPONENTS, METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, COMPONENTS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import TASKS
 

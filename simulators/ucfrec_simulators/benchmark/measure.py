@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.benchmark.cells import Cell, measured_by, opened
-from ucfrec.evaluation.environment import Environment
+from ucfrec.benchmark.cells import Cell, Measurement, open_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.locks import claim
-from ucfrec.results.row import ResultRow, RowKey
+from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING, train_screened
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -35,7 +35,7 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     # Cells that differ only in their evaluation share a run.
     with claim(cell.run, wait=True):
         record = train_screened(
-            opened(cell), cell.run, cell.config, cell.screening, shared=cell.shared
+            open_store(cell), cell.run, cell.config, cell.screening, shared=cell.shared
         )
     training_metrics, rows = _training_metrics(record), []
     if record.screening is not None:
@@ -88,4 +88,4 @@ def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
     return replace(trained.rule, target=trained.target_return(quantile))
 
 
-MEASUREMENT: Final = measured_by(measure)
+MEASUREMENT: Final = Measurement(measure)

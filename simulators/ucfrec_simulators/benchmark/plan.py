@@ -8,17 +8,23 @@ from itertools import product
 from typing import Final
 
 from ucfrec import schema
-from ucfrec.benchmark.cells import Budget, Cell, Method, Task, augmented_ucf
-from ucfrec.benchmark.plan import Plan, folder_name
+from ucfrec.benchmark.cells import Budget, Cell, Method, Plan, Task, folder_name, make_augmented_ucf
 from ucfrec.benchmark.suite import BenchmarkRequest
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import tasks
-from ucfrec_simulators.benchmark.budgets import DISTRACTED, SHARED_TASKS, SWEPT
-from ucfrec_simulators.benchmark.methods import COMPONENTS, METHODS, PAPER, SCREENED
+from ucfrec_simulators.benchmark.methods import (
+    COMPONENTS,
+    DISTRACTED,
+    METHODS,
+    PAPER,
+    SCREENED,
+    SHARED_TASKS,
+    SWEPT,
+)
 from ucfrec_simulators.benchmark.tasks import TASKS, Log
 from ucfrec_simulators.distractor import OFF, ON, DistractorEnvironment, plant_distractor
-from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import data_folder
 
 SUITE: Final = "recommendation"
 LAMBDAS: Final = (0.0, 0.1, 0.5, 1.0)
@@ -61,7 +67,10 @@ class RecommendationCells:
             "sweeps": self._sweeps,
             "distractor": self._distractor,
         }
-        for name in self._names(table):
+        names = [name for name in self._select_tasks(table) if _available(name)]
+        if self._request.environment is not None:
+            names = [self._request.environment.title]
+        for name in names:
             for log in range(self._budget.logs):
                 yield from made_by[table](self._task(name, log), log)
 
@@ -71,32 +80,28 @@ class RecommendationCells:
             return []
         return [name for name in self._select_tasks("main") if not _available(name)]
 
-    def _names(self, table: str) -> list[str]:
-        if self._request.environment is not None:
-            return [self._request.environment.title]
-        return [name for name in self._select_tasks(table) if _available(name)]
-
     def _select_tasks(self, table: str) -> Sequence[str]:
         if not self._request.tasks:
             return self._budget.tasks_in(table)
-        available = _TASKS_OF.get(table, tuple(TASKS))
-        return [name for name in self._request.tasks if name in available]
+        known = _TASKS_OF.get(table, tuple(TASKS))
+        return [name for name in self._request.tasks if name in known]
 
     def _main(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
         if log == 0:
-            yield from self._plan.built_in("main", task, METHODS)
+            yield from self._plan.list_built_in("main", task, METHODS)
         yield from self._list_trained("main", METHODS, task, log)
 
     def _sweeps(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
-        spread = _reward_spread(EpisodeStore.open(task.store))
+        store = EpisodeStore.open(task.store)
+        spread = float(store.step_values(schema.REWARD, *store.all_steps()).std())
         sweeps = {
             **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
             **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
             **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
         }
-        methods = {f"ucf, {name}": augmented_ucf(s) for name, s in sweeps.items()}
+        methods = {f"ucf, {name}": make_augmented_ucf(s) for name, s in sweeps.items()}
         yield from self._list_trained("sweeps", {**methods, **PAPER}, task, log)
 
     def _distractor(self, task: Task, log: int) -> Iterator[Cell]:
@@ -123,14 +128,14 @@ class RecommendationCells:
         for quantile, variant in product(DISTRACTOR_TARGETS, both):
             evaluation = replace(self._budget.evaluation, target_quantile=quantile)
             conditions = {"quantiles": f"{quantile:g}"}
-            yield from self._plan.trained(
+            yield from self._plan.list_trained(
                 "distractor", variant, DISTRACTOR_METHODS, evaluation, conditions
             )
 
     def _list_trained(
         self, table: str, methods: Mapping[str, Method], task: Task, log: int
     ) -> Iterator[Cell]:
-        return self._plan.trained(table, task, methods, conditions={"quantiles": "rule"})
+        return self._plan.list_trained(table, task, methods, conditions={"quantiles": "rule"})
 
     def _task(self, name: str, log: int) -> Task:
         if (name, log) not in self._tasks:
@@ -158,8 +163,3 @@ def _settings(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
     memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
     own = budget.of_policies.get(method.policy, ())
     return (*budget.settings, *memory, *own, *method.settings, *budget.of_methods.get(name, ()))
-
-
-def _reward_spread(store: EpisodeStore) -> float:
-    """Standard deviation of the rewards of a store."""
-    return float(store.step_values(schema.REWARD, *store.all_steps()).std())

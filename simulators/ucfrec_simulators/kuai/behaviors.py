@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ucfrec.acting.rollout import Actor
-from ucfrec.acting.uniform import Memoryless, Uniform
+from ucfrec.acting.rollout import Actor, Memoryless, Uniform
 from ucfrec.arrays import BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.control_files import MADE, hopper_like, write_hdf5, write_made
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import read_rows
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of
@@ -40,42 +40,42 @@ from ucfrec_control.training.train import find_preset
 
 def resolved(table: str, budget: Budget, file: str) -> dict[str, Config]:
     """Configuration of every row of a table that the core trains."""
-    task, kind = require_task(file).name, find_kind(file)
-    return {
-        name: resolve_config(
-            method.policy,
-            None,
-            settings_of(budget, name, method),
-            0,
-            find_preset(task, kind, method.policy).tables,
-        )
-        for name, method in TABLES[table].items()
-        if method.policy not in ALGORITHMS
-    }
+    task, kind, configs = require_task(file).name, find_kind(file), {}
+    for name, method in TABLES[table].items():
+        if method.policy not in ALGORITHMS:
+            presets = find_preset(task, kind, method.policy).tables
+            settings = settings_of(budget, name, method)
+            configs[name] = resolve_config(method.policy, None, settings, 0, presets)
+    return configs
+
+
+def own_rows(table: str, budget: Budget, file: str) -> dict[str, Config]:
+    """`resolved` without the rows of the paper."""
+    configs = resolved(table, budget, file)
+    return {name: config for name, config in configs.items() if name not in PAPER}
 
 
 @pytest.mark.parametrize("size", BUDGETS)
-@pytest.mark.parametrize("table", TABLES)
-def test_every_row_of_every_table_is_a_configuration_of_its_own(table: str, size: str) -> None:
-    budget = budget_of(table, size)
-    for file in budget.tasks:
-        configs = resolved(table, budget, file)
-        assert len(set(map(repr, configs.values()))) == len(configs)
-        for config in configs.values():
-            assert config.train.warmup_steps < config.train.steps
+def test_every_row_of_a_table_is_a_configuration_of_its_own(size: str) -> None:
+    """The same in all tables, which share its runs."""
+    for file in {file for table in TABLES for file in budget_of(table, size).tasks}:
+        named: dict[str, Config] = {}
+        for table in TABLES:
+            budget = budget_of(table, size)
+            configs = resolved(table, budget, file) if file in budget.tasks else {}
+            assert len(set(map(repr, configs.values()))) == len(configs)
+            for method, config in configs.items():
+                assert config.train.warmup_steps < config.train.steps
+                assert named.setdefault(method, config) == config
 
 
 def test_rows_have_the_settings_that_they_are_named_after() -> None:
     budget = budget_of("gate", "full")
     file = budget.tasks[0]
-    for name, config in resolved("lambda", budget, file).items():
-        if name in PAPER:
-            continue
+    for name, config in own_rows("lambda", budget, file).items():
         assert config.policy.lambda_mask == float(name.removeprefix("ucf-lambda-"))
     for table in ("gate", "band", "augmentation"):
-        for name, config in resolved(table, budget, file).items():
-            if name in PAPER:
-                continue
+        for name, config in own_rows(table, budget, file).items():
             kind = next((k for k in ("faithful", "noise") if name.startswith(k)), "tangent")
             assert config.csg.kind == kind
             assert (config.augment.epsilon_r == 1e9) == name.endswith("wo-gate")
@@ -97,9 +97,9 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         steps = {name: config.train.steps for name, config in timed.items()}
         assert steps["bc-25-x8"] == 8 * steps["dt-wo-time"] == 8 * steps["lsdt-wo-time"]
         assert 2 * steps["ucf-x3"] == 3 * steps["ucf-wo-count-x2"] == 6 * steps["dc-wo-time"]
-    pursuing = resolved(PURSUING, BUDGETS["full"], file)
-    for name, config in (pursuing | resolved(EQUAL_TIME, BUDGETS["full"], file)).items():
-        if name in PAPER or name.startswith("bc"):
+    pursuing = own_rows(PURSUING, BUDGETS["full"], file)
+    for name, config in (pursuing | own_rows(EQUAL_TIME, BUDGETS["full"], file)).items():
+        if name.startswith("bc"):
             continue
         policy = config.policy
         assert policy.max_timestep == 1
@@ -108,16 +108,6 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
         assert policy.max_return == name.endswith(("-max-return", "-both"))
         assert (config.augment.copies > 0) == (name.startswith("ucf") and "-wo-count" not in name)
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
-
-
-@pytest.mark.parametrize("size", BUDGETS)
-def test_a_method_of_two_tables_is_one_configuration(size: str) -> None:
-    """They share their runs."""
-    for file in budget_of("gate", size).tasks:
-        named: dict[str, Config] = {}
-        for table in TABLES:
-            for method, config in resolved(table, budget_of(table, size), file).items():
-                assert named.setdefault(method, config) == config
 
 
 def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
@@ -138,8 +128,8 @@ def test_robustness_trains_rows_of_the_benchmark() -> None:
 
 
 def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8))
-    medium = replace(budget_of(MAIN, "medium"), tasks=("hopper_medium-made",), tasks_of={})
+    write_made(tmp_path)
+    medium = replace(budget_of(MAIN, "medium"), tasks=(MADE,), tasks_of={})
     budget = set_contexts(medium, {"dc-wo-time": 20})
     contexts = {
         cell.method: cell.config.policy.context
@@ -195,12 +185,12 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     good = np.arange(len(lengths)) % 5 == 0
     columns["rewards"][:] = np.repeat(np.where(good, 5.0, 1.0) / lengths, lengths)
     columns["actions"][:] = np.repeat(np.where(good, 0.8, -0.8), lengths)[:, None]
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", columns)
+    write_hdf5(tmp_path / f"{MADE}.hdf5", columns)
     rows = {m: METHODS[m] for m in ("bc", "bc-10", "bc-25")}
     monkeypatch.setitem(TABLES, MAIN, rows)
     settings = ("train.steps=50", "train.warmup_steps=5", "train.learning_rate=1e-2")
     settings += ("train.validate_every=25", "policy.dim=16")
-    budget = Budget("tiny", ("hopper_medium-made",), 2, Evaluation(2, 1000), settings)
+    budget = Budget("tiny", (MADE,), 2, Evaluation(2, 1000), settings)
     results = tmp_path / "rows.jsonl"
     cells = list(score_cells(tmp_path, tmp_path / "runs", budget, MAIN))
     run_grid(cells, SCORE_MEASUREMENT, results, 1)
@@ -225,13 +215,12 @@ def test_a_store_of_other_data_of_the_same_name_is_refused(tmp_path: Path) -> No
     stores = tmp_path / "stores"
     for folder, seed in (("first", 0), ("moved", 0), ("other", 1)):
         (tmp_path / folder).mkdir()
-        write_hdf5(tmp_path / folder / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8, seed))
-    made = zoo_store(tmp_path / "first", stores, "hopper_medium-made")
-    assert zoo_store(tmp_path / "moved", stores, "hopper_medium-made") == made
-    with pytest.raises(InputError, match="made from other data"):
-        zoo_store(tmp_path / "other", stores, "hopper_medium-made")
+        write_hdf5(tmp_path / folder / f"{MADE}.hdf5", hopper_like((30, 8) * 8, seed))
+    made = zoo_store(tmp_path / "first", stores, MADE)
     # Rows may be made again where the store is left of the data.
-    assert zoo_store(tmp_path / "gone", stores, "hopper_medium-made") == made
-    write_hdf5(tmp_path / "first" / "hopper_medium-made.hdf5", hopper_like((30, 8) * 8, 1))
-    with pytest.raises(InputError, match="made from other data"):
-        zoo_store(tmp_path / "first", stores, "hopper_medium-made")
+    for folder in ("moved", "gone"):
+        assert zoo_store(tmp_path / folder, stores, MADE) == made
+    write_made(tmp_path / "first")
+    for folder in ("other", "first"):
+        with pytest.raises(InputError, match="made from other data"):
+            zoo_store(tmp_path / folder, stores, MADE)

@@ -18,9 +18,9 @@ import gymnasium
 import stable_baselines3 as sb3
 from torch import nn
 
+from tests.support.control_files import control, refused
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec_control.cli import main
 from ucfrec_control.data import agents
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import read_d4rl
@@ -93,15 +93,18 @@ def rewritten(file: Path, out: Path, **parts: bytes | None) -> Path:
     return out
 
 
+def assert_refused(file: Path, reason: str, observations: int = OBSERVATIONS) -> None:
+    with pytest.raises(InputError, match=reason):
+        read_agent(file, observations, SPACE, 0.0, 0)
+
+
 def test_nothing_in_the_file_is_executed(tmp_path: Path) -> None:
     file, _ = saved(tmp_path, "sac")
     trap, sprung = _Trap(tmp_path / "sprung"), tmp_path / "sprung"
-    weights = io.BytesIO()
-    torch.save({"actor.mu.weight": trap}, weights)
+    torch.save({"actor.mu.weight": trap}, weights := io.BytesIO())
     for tensors in (pickle.dumps(trap), weights.getvalue()):
         bad = rewritten(file, tmp_path / "bad.zip", policy_pth=tensors)
-        with pytest.raises(InputError, match="cannot be read as data"):
-            read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+        assert_refused(bad, "cannot be read as data")
     with zipfile.ZipFile(file) as archive:
         data = json.loads(archive.read("data"))
     serialized = pickle.dumps(trap).hex()
@@ -111,93 +114,77 @@ def test_nothing_in_the_file_is_executed(tmp_path: Path) -> None:
     assert not sprung.exists()
 
 
-def test_what_cannot_be_told_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_files_of_no_agent_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, _ = saved(tmp_path, "td3")
-    with pytest.raises(InputError, match="observations of size 4 to actions of size 2"):
-        read_agent(file, 5, SPACE, 0.0, 0)
-    with pytest.raises(InputError, match="does not exist"):
-        read_agent(tmp_path / "none.zip", OBSERVATIONS, SPACE, 0.0, 0)
+    assert_refused(file, "observations of size 4 to actions of size 2", observations=5)
+    assert_refused(tmp_path / "none.zip", "does not exist")
     (tmp_path / "text.zip").write_text("no zip")
-    none = rewritten(file, tmp_path / "none.zip", policy_pth=None)
-    for bad in (tmp_path / "text.zip", none):
-        with pytest.raises(InputError, match="cannot be read as data"):
-            read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
-    with zipfile.ZipFile(file) as archive:
-        tensors = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
-        data = json.loads(archive.read("data"))
-    for change, reason in (
-        ({"actor.mu.1.running_mean": torch.zeros(8)}, "not a layer of a perceptron"),
-        ({name: None for name in tensors if name.startswith("actor.mu")}, "not those of a"),
-    ):
-        kept = {k: v for k, v in {**tensors, **change}.items() if v is not None}
-        torch.save(kept, weights := io.BytesIO())
-        bad = rewritten(file, tmp_path / "bad.zip", policy_pth=weights.getvalue())
-        with pytest.raises(InputError, match=reason):
-            read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
-    data["policy_kwargs"] = {"activation_fn": "<class 'somebody.Else'>"}
-    bad = rewritten(file, tmp_path / "bad.zip", data=json.dumps(data).encode())
-    with pytest.raises(InputError, match="its activation is"):
-        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
-
-
-@pytest.mark.parametrize(
-    ("name", "tensor", "reason"),
-    [
-        ("actor.latent_pi.2.weight", torch.zeros(1).expand(300_000, 300_000), "one by one"),
-        ("actor.latent_pi.2.weight", torch.full((256, 256), torch.nan), "one by one"),
-        ("actor.latent_pi.2.weight", torch.eye(256).to_sparse(), "one by one"),
-        ("actor.latent_pi.2.bias", torch.zeros(256, dtype=torch.complex64), "one by one"),
-        ("actor.latent_pi.2.weight", torch.zeros(256, 255), "256 outputs, .* 255 inputs"),
-    ],
-)
-def test_tensors_that_are_no_network_are_refused(
-    name: str, tensor: torch.Tensor, reason: str, tmp_path: Path
-) -> None:
-    file, _ = saved(tmp_path, "sac-sde")
-    with zipfile.ZipFile(file) as archive:
-        tensors = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
-    if len(tensor) > 256:
-        tensors["actor.latent_pi.2.bias"] = torch.zeros(1).expand(len(tensor))
-    torch.save({**tensors, name: tensor}, weights := io.BytesIO())
-    bad = rewritten(file, tmp_path / "bad.zip", policy_pth=weights.getvalue())
-    with pytest.raises(InputError, match=reason):
-        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
-
-
-def test_a_network_that_inflates_without_end_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file, _ = saved(tmp_path, "sac")
+    assert_refused(tmp_path / "text.zip", "cannot be read as data")
+    assert_refused(rewritten(file, tmp_path / "a.zip", policy_pth=None), "cannot be read as data")
     monkeypatch.setitem(agents._MOST_BYTES, "policy.pth", 2**20)
     with zipfile.ZipFile(bomb := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data/0", bytes(2**20 + 1))
-    bad = rewritten(file, tmp_path / "bad.zip", policy_pth=bomb.getvalue())
-    with pytest.raises(InputError, match=r"policy.pth has .* bytes, more than"):
-        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+    endless = rewritten(file, tmp_path / "b.zip", policy_pth=bomb.getvalue())
+    assert_refused(endless, r"policy.pth has .* bytes, more than")
 
 
-@pytest.mark.parametrize("bound", ["x", 0.0, -1.0, None, float("nan")])
-def test_a_bound_of_the_mean_that_is_none_is_refused(bound: object, tmp_path: Path) -> None:
-    file, _ = saved(tmp_path, "sac-sde")
-    data = {"policy_kwargs": {"clip_mean": bound}}
-    bad = rewritten(file, tmp_path / "bad.zip", data=json.dumps(data).encode())
-    with pytest.raises(InputError, match="clip_mean"):
-        read_agent(bad, OBSERVATIONS, SPACE, 0.0, 0)
+HIDDEN = "actor.latent_pi.2"
 
 
-def test_an_agent_fills_a_dataset_that_prepare_reads(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("agent", "tensors", "settings", "reason"),
+    [
+        ("td3", {"actor.mu.1.running_mean": torch.zeros(8)}, {}, "not a layer of a perceptron"),
+        ("td3", {"actor.mu.0.weight": None}, {}, "actor.mu.0.bias, which is not a layer"),
+        ("td3", {"actor.mu": None}, {}, "not those of a"),
+        ("td3", {}, {"activation_fn": "<class 'somebody.Else'>"}, "its activation is"),
+        (
+            "sac-sde",
+            {
+                f"{HIDDEN}.weight": torch.zeros(1).expand(300_000, 300_000),
+                f"{HIDDEN}.bias": torch.zeros(1).expand(300_000),
+            },
+            {},
+            "one by one",
+        ),
+        ("sac-sde", {f"{HIDDEN}.weight": torch.full((256, 256), torch.nan)}, {}, "one by one"),
+        ("sac-sde", {f"{HIDDEN}.weight": torch.eye(256).to_sparse()}, {}, "one by one"),
+        ("sac-sde", {f"{HIDDEN}.bias": torch.zeros(256, dtype=torch.cfloat)}, {}, "one by one"),
+        ("sac-sde", {f"{HIDDEN}.weight": torch.zeros(256, 255)}, {}, "256 outputs, .* 255 inputs"),
+        *(
+            ("sac-sde", {}, {"clip_mean": bound}, "clip_mean")
+            for bound in ("x", 0.0, -1.0, None, float("nan"))
+        ),
+    ],
+)
+def test_what_cannot_be_told_is_refused_with_the_reason(
+    agent: str,
+    tensors: dict[str, torch.Tensor | None],
+    settings: dict[str, object],
+    reason: str,
+    tmp_path: Path,
 ) -> None:
+    file, _ = saved(tmp_path, agent)
+    with zipfile.ZipFile(file) as archive:
+        own = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
+        data = json.loads(archive.read("data"))
+    removed = tuple(name for name, tensor in tensors.items() if tensor is None)
+    kept = {name: tensor for name, tensor in own.items() if not name.startswith(removed)}
+    kept |= {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    torch.save(kept, weights := io.BytesIO())
+    data["policy_kwargs"] = settings
+    parts = {"policy_pth": weights.getvalue(), "data": json.dumps(data).encode()}
+    assert_refused(rewritten(file, tmp_path / "bad.zip", **parts), reason)
+
+
+def test_an_agent_fills_a_dataset_that_prepare_reads(tmp_path: Path) -> None:
     model = sb3.SAC("MlpPolicy", "Hopper-v5", buffer_size=10, seed=0, device="cpu")
     model.save(tmp_path / "mine")
-    arguments = ["collect", "--env", "Hopper-v5", "--agent", str(tmp_path / "mine.zip")]
-    arguments += ["--noise", "0.1", "--size", "60", "--out", str(tmp_path / "out")]
-    assert main(arguments) == 0
-    file = tmp_path / "out" / "hopper_mine-noise0.1.hdf5"
-    read = read_d4rl(file)
+    command = ("collect", "--env", "Hopper-v5", "--agent", tmp_path / "mine.zip")
+    command += ("--noise", 0.1, "--size", 60, "--out", tmp_path / "out")
+    assert "hopper_mine-noise0.1" in control(*command)[0]
+    read = read_d4rl(tmp_path / "out" / "hopper_mine-noise0.1.hdf5")
     assert len(read.rewards) >= 60
     assert read.source["env_id"] == "Hopper-v5"
     assert isinstance(read.write_store(tmp_path / "store"), EpisodeStore)
-    assert "hopper_mine-noise0.1" in capsys.readouterr().out
-    assert main(arguments) == 2
-    assert "is complete already" in capsys.readouterr().err
+    assert "is complete already" in refused(*command)

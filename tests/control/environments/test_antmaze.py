@@ -1,6 +1,5 @@
 """AntMaze: D4RL's vectors, D4RL's environment, success times a hundred."""
 
-import json
 import sys
 import warnings
 from dataclasses import replace
@@ -14,13 +13,20 @@ import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
 
-from tests.support.control_files import hopper_like, write_hdf5
-from ucfrec.acting.rollout import rollout
+from tests.support.control_files import (
+    TINY,
+    control,
+    hopper_like,
+    refused,
+    set_options,
+    write_hdf5,
+)
+from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError
+from ucfrec.results.rows import read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_control.cli import main
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
 from ucfrec_control.environments.antmaze import antmaze_settings
@@ -33,8 +39,6 @@ needs_robotics = pytest.mark.skipif(
 )
 REBUILT = "d4rl/antmaze-umaze-v2"
 ENVIRONMENTS = (REBUILT, "AntMaze_UMaze-v4")
-TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")
-
 D4RL_MAZES = {
     "umaze": "##### #S..# ###.# #G..# #####",
     "medium": "######## #S.##..# #..#...# ##...### #..#...# #.#..#.# #...#.G# ########",
@@ -57,14 +61,14 @@ def simulated(env: gymnasium.vector.SyncVectorEnv) -> Float64Array:
 
 def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
     """A D4RL AntMaze file's: floats throughout, no successors."""
-    columns = hopper_like(lengths)
-    rng, n = np.random.default_rng(0), sum(lengths)
+    rng, n, hopper = np.random.default_rng(0), sum(lengths), hopper_like(lengths)
+    terminals, timeouts = (hopper[name].astype(np.float32) for name in ("terminals", "timeouts"))
     return {
         "observations": rng.normal(size=(n, 29)).astype(np.float32),
         "actions": rng.uniform(-1, 1, size=(n, 8)).astype(np.float32),
-        "rewards": columns["terminals"].astype(np.float32),
-        "terminals": columns["terminals"].astype(np.float32),
-        "timeouts": columns["timeouts"].astype(np.float32),
+        "rewards": terminals,
+        "terminals": terminals,
+        "timeouts": timeouts,
     }
 
 
@@ -129,15 +133,12 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     assert 0.05 < np.abs(starts).max() <= 0.1
 
 
-class Teleported:
+class Teleported(Memoryless):
     """Stands still until step 3, when every second ant is put on its goal."""
 
     def __init__(self, env: gymnasium.vector.SyncVectorEnv) -> None:
         self._env = env
         self._steps = 0
-
-    def begin(self, rows: object) -> None:
-        pass
 
     def act(self, observations: object, live: object) -> tuple[Float32Array, None]:
         self._steps += 1
@@ -148,9 +149,6 @@ class Teleported:
                 there = np.concatenate([environment.goal, ant.data.qpos[2:]])  # type: ignore[attr-defined]
                 ant.set_state(there, ant.data.qvel)
         return np.zeros((self._env.num_envs, 8), dtype=np.float32), None
-
-    def observe(self, actions: object, rewards: object) -> None:
-        pass
 
 
 @needs_robotics
@@ -171,27 +169,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("antmaze")
     file = write_hdf5(folder / "antmaze-umaze-v2.hdf5", ant_columns((9, 1, 8) * 12), env_id=None)
     read_d4rl(file).write_store(folder / "store")
-    settings = [argument for setting in TINY for argument in ("--set", setting)]
-    where = ["--out", str(folder / "run"), "--policy", "dt"]
-    assert main(["train", str(folder / "store"), *where, *settings]) == 0
+    where = (folder / "store", "--out", folder / "run", "--policy", "dt")
+    control("train", *where, *set_options(TINY))
     return folder / "run"
 
 
 @needs_robotics
-def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "rows.json"
-    asked = ["evaluate", str(run), "--checkpoint", "last", "--target", "1", "--episodes", "1"]
-    assert main([*asked, "--json", str(out)]) == 0
-    said = capsys.readouterr()
-    assert "0.0 [0.0, 0.0]" in said.out
-    assert f"warning: {REBUILT} is rebuilt" in said.err
-    (row,) = json.loads(out.read_text())
-    found = (row["environment"], row["metrics"]["length"], row["metrics"]["score"])
-    assert found == (REBUILT, 700, 0)
-    assert main([*asked, "--env", "AntMaze_UMaze-v5"]) == 2
-    assert "have sizes (107, 8)" in capsys.readouterr().err
+    asked = ("evaluate", run, "--checkpoint", "last", "--target", 1, "--episodes", 1)
+    printed, said = control(*asked, "--json", out)
+    assert "0.0 [0.0, 0.0]" in printed
+    assert f"warning: {REBUILT} is rebuilt" in said
+    (row,) = read_results(out)
+    assert (row.environment, row["length"], row["score"]) == (REBUILT, 700, 0)
+    assert "have sizes (107, 8)" in refused(*asked, "--env", "AntMaze_UMaze-v5")
 
 
 @needs_robotics
@@ -236,29 +228,24 @@ def test_minari_mazes_are_those_of_the_data(
 
 def test_names_of_d4rl_tell_its_environments() -> None:
     task = require_task("antmaze")
-    for name, maze in {
-        "antmaze-umaze-v2": "umaze",
-        "antmaze-umaze-diverse-v2": "umaze",
-        "antmaze-medium-play-v2": "medium",
-        "antmaze-large-diverse-v2": "large",
-        "Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed": "umaze",
-        "Ant_maze_big-maze_noisy_multistart_True_multigoal_True_sparse_fixed": "medium",
-        "Ant_maze_hardest-maze_noisy_multistart_True_multigoal_True_sparse_fixed": "large",
-    }.items():
-        assert require_task(name) == task
-        assert task.d4rl_env(name) == f"d4rl/antmaze-{maze}-v2"
+    file = "Ant_maze_{}-maze_noisy_multistart_True_multigoal_True_sparse_fixed"
+    for maze, *names in (
+        ("umaze", "antmaze-umaze-v2", "antmaze-umaze-diverse-v2", file.format("u")),
+        ("medium", "antmaze-medium-play-v2", file.format("big")),
+        ("large", "antmaze-large-diverse-v2", file.format("hardest")),
+    ):
+        assert all(require_task(name) == task for name in names)
+        assert {task.d4rl_env(name) for name in names} == {f"d4rl/antmaze-{maze}-v2"}
     assert task.d4rl_env("antmaze-mine") is None
     assert find_kind("antmaze-medium-diverse-v2") == "diverse"
 
 
 def test_without_gymnasium_robotics_one_line_says_what_to_install(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
-    assert main(["evaluate", str(run)]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert f"{REBUILT} needs gymnasium-robotics" in line
-    assert "install ucfrec[antmaze]" in line
+    needs = f"{REBUILT} needs gymnasium-robotics, which is not installed; install ucfrec[antmaze]"
+    assert needs in refused("evaluate", run)
     with pytest.raises(InputError, match="needs gymnasium-robotics"):
         make_env("AntMaze_UMaze-v4", 1)
 
@@ -269,7 +256,7 @@ def test_d4rl_files_keep_their_environment_in_minari(
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
-    assert main(["convert", str(file), "antmaze/mine-v0"]) == 0
+    control("convert", file, "antmaze/mine-v0")
     read = read_minari("antmaze/mine-v0")
     assert (read.source["env_id"], read.source["env_settings"]) == (REBUILT, {"maze": "umaze"})
     np.testing.assert_array_equal(read.observations, read_d4rl(file).observations)

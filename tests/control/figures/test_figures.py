@@ -8,41 +8,37 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.control_files import TINY, control, set_options, write_made
 from tests.support.result_rows import result_row
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Overlay
+from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
-from ucfrec.results.rows_file import append_rows
+from ucfrec.results.rows import append_rows
 from ucfrec_control.benchmark.robustness import drops
-from ucfrec_control.cli import main
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.figures.figures import HIGHS, LOWS, NEEDS, make_figures
 
 KINDS = ("tangent", "faithful")
-SETTINGS = {
-    "train.steps": "4", "train.validate_every": "2", "policy.dim": "16", "policy.context": "5",
-    "crm.epochs": "3", "csg.epochs": "2", "csg.lambda_band": "1.0", "augment.epsilon_r": "1.0",
-    "augment.copies": "1",
-}  # fmt: skip
+EDITS = (
+    *("crm.epochs=3", "csg.epochs=2", "csg.lambda_band=1.0"),
+    *("augment.epsilon_r=1.0", "augment.copies=1"),
+)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of UCF with each generator, and one of behaviour cloning with two seeds."""
     folder = tmp_path_factory.mktemp("figures")
-    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
-    store = str(folder / "store")
-    assert main(["prepare", str(file), "--out", store]) == 0
-    options = [a for key, value in SETTINGS.items() for a in ("--set", f"{key}={value}")]
+    store = folder / "store"
+    control("prepare", write_made(folder), "--out", store)
     for kind in KINDS:
-        out = ["--out", str(folder / "runs" / kind), "--set", f"csg.kind={kind}"]
-        assert main(["train", store, *out, *options]) == 0
-    for seed in ("0", "1"):
-        out = ["--out", str(folder / "runs" / f"bc-{seed}"), "--policy", "bc", "--seed", seed]
-        assert main(["train", store, *out, *options[:8]]) == 0
+        settings = set_options((*TINY, *EDITS, f"csg.kind={kind}"))
+        control("train", store, "--out", folder / "runs" / kind, *settings)
+    for seed in (0, 1):
+        out = ("--out", folder / "runs" / f"bc-{seed}", "--policy", "bc", "--seed", seed)
+        control("train", store, *out, *set_options())
     return folder / "runs"
 
 
@@ -131,14 +127,12 @@ def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, k
 
 def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
     run = runs / "tangent"
-    store, overlay = (
-        EpisodeStore.open(runs.parent / "store"),
-        Overlay.load(run / "overlay.safetensors"),
-    )
-    at = overlay.copy_source[overlay.edit_copy], overlay.edit_step
+    store = EpisodeStore.open(runs.parent / "store")
+    copies = AugmentedEpisodes.load(run / "augmented.safetensors", store)
+    at = copies.copy_source[copies.edit_copy], copies.edit_step
     factual = store.windows(*at, 1).states[:, 0]
     std = store.split("train").state_statistics[1]
-    lengths = ((torch.from_numpy(overlay.edit_state) - factual) / std).norm(dim=1).numpy()
+    lengths = ((torch.from_numpy(copies.edit_state) - factual) / std).norm(dim=1).numpy()
     edges, counts, band = diagnostics.move_histogram(run)
     assert band == (0.2, 0.5)
     assert sum(counts) == len(lengths)
@@ -150,7 +144,7 @@ def test_the_histogram_counts_the_moves_of_the_copies(runs: Path) -> None:
     assert np.abs(shares - expected).max() <= 2 * 100 / len(lengths)
 
 
-def test_the_overlay_shows_the_widest_direction_first(runs: Path) -> None:
+def test_the_edits_show_the_widest_direction_first(runs: Path) -> None:
     factual, edited = diagnostics.edit_states(runs / "tangent")
     assert 0.19 < np.linalg.norm(edited - factual, axis=1).mean() < 0.5
     (axes,) = plots.state_overlay(factual, edited).axes
@@ -189,13 +183,8 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [0.5, 1.5, 10.5])
     assert [text.get_text() for text in axes.get_xticklabels()] == ["0", "0.1", "1"]
     rows = [
-        {
-            "method": "ucf",
-            "target_return": target,
-            "training_seed": seed,
-            "return": target / 2 + seed,
-        }
-        for target in (2000.0, 1000.0)
+        {"method": "ucf", "target_return": at, "training_seed": seed, "return": at / 2 + seed}
+        for at in (2000.0, 1000.0)
         for seed in (0, 1)
     ]
     (axes,) = plots.return_curves(rows).axes
@@ -215,12 +204,12 @@ def test_json_of_something_else_is_refused(tmp_path: Path, content: str, says: s
 
 
 def test_one_command_draws_what_it_can_and_names_what_is_missing(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: Path, tmp_path: Path
 ) -> None:
-    results, out = tmp_path / "rows.jsonl", tmp_path / "figures"
-    evaluated = tmp_path / "evaluated.json"
-    targets = ["--target", "1000", "--target", "3000", "--episodes", "1", "--json", str(evaluated)]
-    assert main(["evaluate", str(runs / "tangent"), *targets]) == 0
+    names = ("rows.jsonl", "evaluated.json", "figures", "copied")
+    results, evaluated, out, copied = (tmp_path / name for name in names)
+    targets = ("--target", 1000, "--target", 3000, "--episodes", 1, "--json", evaluated)
+    control("evaluate", runs / "tangent", *targets)
     rows = [
         result_row(
             value,
@@ -234,34 +223,37 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
         for value in (0.0, 0.1)
     ]
     append_rows(results, rows)
-    shutil.copytree(runs, tmp_path / "copied")
-    record = read_json(tmp_path / "copied" / "tangent" / "run.json")
-    record["store"] = str(tmp_path / "gone")
-    (tmp_path / "copied" / "tangent" / "run.json").write_text(json.dumps(record))
-    arguments = ["figures", "--runs", str(tmp_path / "copied")]
-    arguments += ["--results", str(results), str(evaluated)]
-    assert main([*arguments, "--out", str(out)]) == 0
-    printed = capsys.readouterr()
-    names = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
-    names |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
-    names |= {"returns-hopper_medium-made", "scores-small-lambda"}
+    shutil.copytree(runs, copied)
+    write_run(copied / "tangent", {"store": str(tmp_path / "gone")})
+    command = ("figures", "--runs", copied, "--results", results, evaluated, "--out", out)
+    printed, said = control(*command)
+    drawn = {"lambda-small", "moves-faithful", "states-faithful", "acceptance-faithful"}
+    drawn |= {"attention-faithful", "moves-tangent", "training-hopper_medium-made"}
+    drawn |= {"returns-hopper_medium-made", "scores-small-lambda"}
     assert {path.name for path in out.iterdir()} == {
-        f"{name}.{kind}" for name in names for kind in ("png", "svg")
+        f"{name}.{kind}" for name in drawn for kind in ("png", "svg")
     }
-    assert all(f"{name}.svg" in printed.out for name in names)
+    assert all(f"{name}.svg" in printed for name in drawn)
     assert (out / "lambda-small.png").read_bytes()[:4] == b"\x89PNG"
-    assert "missing: robustness-scores: needs rows of `ucfrec-control robustness`" in printed.err
+    assert "missing: robustness-scores: needs rows of `ucfrec-control robustness`" in said
     made, missing = make_figures([], [], out)
     assert made == []
     assert {line.partition(":")[0] for line in missing} == set(NEEDS)
-    made, missing = make_figures([tmp_path / "copied" / "tangent"], [], out)
+    made, missing = make_figures([copied / "tangent"], [], out)
     assert [path.stem for path in made[::2]] == ["moves-tangent", "training-hopper_medium-made"]
-    gone = [line for line in missing if str(tmp_path / "gone") in line]
-    assert {line.partition(":")[0] for line in gone} == {
-        "states-tangent",
-        "acceptance-tangent",
-        "attention-tangent",
+    assert names_without_store(missing) == {
+        f"{figure}-tangent" for figure in ("states", "acceptance", "attention")
     }
+
+
+def write_run(run: Path, entries: dict[str, object]) -> None:
+    """Other entries in the record of a run."""
+    (run / "run.json").write_text(json.dumps(read_json(run / "run.json") | entries))
+
+
+def names_without_store(missing: list[str]) -> set[str]:
+    """Figures of runs whose store `…/gone` is not there."""
+    return {line.partition(":")[0] for line in missing if "/gone" in line}
 
 
 def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_path: Path) -> None:
@@ -269,10 +261,10 @@ def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_pa
     folder = tmp_path / "gate" / "hopper"
     for kind in KINDS:
         for seed in ("0", "1"):
-            shutil.copytree(runs / kind, folder / f"{kind}-{seed}")
-            record = read_json(runs / kind / "run.json") | {"store": str(tmp_path / "gone")}
-            (folder / f"{kind}-{seed}" / "run.json").write_text(json.dumps(record))
+            run = shutil.copytree(runs / kind, folder / f"{kind}-{seed}")
+            write_run(run, {"store": str(tmp_path / "gone")})
     (folder / "iql-0").mkdir()
+    record = read_json(run / "run.json")
     settings = {"algorithm": "iql", "steps": 4, "task": "", "kind": "medium"}
     config = {"policy_name": "iql", "policy": settings, "seed": 0}
     of_iql = {"config": config, "library": "d3rlpy", "threads": 1}
@@ -280,23 +272,11 @@ def test_runs_with_other_settings_are_no_seeds_of_one_another(runs: Path, tmp_pa
     (folder / "iql-0" / "run.json").write_text(json.dumps(own | of_iql))
     made, missing = make_figures([tmp_path], [], tmp_path / "figures")
     first = {f"gate-hopper-{kind}-0" for kind in KINDS}
-    assert {path.stem for path in made} == {
-        "training-gate-hopper",
-        *(f"moves-{name}" for name in first),
-    }
-    needs_store = {line.partition(":")[0] for line in missing if "gone" in line}
-    assert needs_store == {
+    moves = {f"moves-{name}" for name in first}
+    assert {path.stem for path in made} == {"training-gate-hopper", *moves}
+    assert names_without_store(missing) == {
         f"{figure}-{name}" for figure in ("states", "acceptance", "attention") for name in first
     }
     drawn = (tmp_path / "figures" / "training-gate-hopper.svg").read_text()
     assert all(f">{kind}<" in drawn for kind in KINDS)
     assert "iql" not in drawn
-
-
-@pytest.mark.parametrize("given", [["--results", "no.jsonl"], ["--runs", "no"]])
-def test_what_does_not_exist_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: list[str]
-) -> None:
-    option, name = given
-    assert main(["figures", option, str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
-    assert "check the path" in capsys.readouterr().err

@@ -8,20 +8,17 @@ from typing import Any
 import pytest
 import torch
 
-from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.control_files import MADE, control, refused, write_made
 from ucfrec.benchmark.cells import Budget, Evaluation, Method
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.processes import random_state_kept
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import read_rows
+from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import TABLES
 from ucfrec_control.benchmark.plan import score_cells
-from ucfrec_control.cli import main
-from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.training import rl_baselines
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.rl_baselines import RLConfig, RLRecord, rl_config, train_rl
@@ -34,11 +31,8 @@ pytest.importorskip("mujoco", reason="the extra control is not installed")
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("rl")
-    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
-    return read_d4rl(file).write_store(folder / "store")
+def store(folder: Path) -> EpisodeStore:
+    return EpisodeStore.open(folder / "store")
 
 
 class _Stops:
@@ -77,7 +71,7 @@ def test_a_training_that_was_interrupted_ends_as_one_left_alone(
 
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
 def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
-    store: EpisodeStore, tmp_path: Path, algorithm: str, capsys: pytest.CaptureFixture[str]
+    store: EpisodeStore, tmp_path: Path, algorithm: str
 ) -> None:
     config = rl_config(dataset_of(store), algorithm, steps=4)
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
@@ -87,11 +81,12 @@ def test_equal_seeds_train_equal_actors_that_are_judged_as_others_are(
     (row,) = evaluate_run(tmp_path / "a", episodes=2, seed=0)
     assert (row["method"], row["checkpoint"], row["target_return"]) == (algorithm, "last", None)
     assert row.data_fingerprint == store.record.fingerprint
-    capsys.readouterr()
-    asked = ["evaluate", str(tmp_path / "a"), "--episodes", "2"]
-    assert main(asked) == 0
-    assert main([*asked, "--checkpoint", "best"]) == 2
-    assert "keep their last checkpoint only" in capsys.readouterr().err
+    asked = ("evaluate", tmp_path / "a", "--episodes", 2)
+    control(*asked)
+    assert "keep their last checkpoint only" in refused(*asked, "--checkpoint", "best")
+    assert train_rl(store, tmp_path / "a", config, 0) == RLRecord.read(tmp_path / "a")
+    with pytest.raises(InputError, match="other settings or data"):
+        train_rl(store, tmp_path / "a", config, 1)
 
 
 def agent_of(task: str, kind: str, algorithm: str = "cql", **settings: float) -> Any:
@@ -169,23 +164,13 @@ def test_cql_sees_the_states_of_antmaze_as_they_are(store: EpisodeStore) -> None
     assert mean.any()
 
 
-def test_a_finished_run_is_read_and_another_configuration_refused(
-    store: EpisodeStore, tmp_path: Path
-) -> None:
-    config = rl_config(dataset_of(store), "iql", steps=2)
-    record = train_rl(store, tmp_path / "run", config, 0)
-    assert train_rl(store, tmp_path / "run", config, 0) == record
-    assert RLRecord.read(tmp_path / "run") == record
-    with pytest.raises(InputError, match="other settings or data"):
-        train_rl(store, tmp_path / "run", config, 1)
-
-
 def test_the_benchmark_finds_its_rl_rows_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    write_hdf5(tmp_path / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
+    write_made(tmp_path)
     monkeypatch.setitem(TABLES, "main", {"iql": Method("iql")})
-    budget = made(2, "steps=2")
+    settings = {"iql": ("steps=2",)}
+    budget = Budget("full", (MADE,), 1, Evaluation(2, 1000), of_policies=settings)
     results = tmp_path / "rows.jsonl"
 
     def measured() -> list[ResultRow]:
@@ -202,9 +187,3 @@ def test_the_benchmark_finds_its_rl_rows_again(
     assert "1 cells, 0 of them left" in printed.err
     # Neither here nor in the workers does d3rlpy report its trainings.
     assert "[info" not in re.sub(r"\x1b\[[\d;]*m", "", printed.out)
-
-
-def made(episodes: int, *settings: str) -> Budget:
-    """A budget of one file with settings of IQL."""
-    evaluation = Evaluation(episodes, 1000)
-    return Budget("full", ("hopper_medium-made",), 1, evaluation, of_policies={"iql": settings})

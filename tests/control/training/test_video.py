@@ -1,41 +1,32 @@
 """Frames and videos of an episode: what they show, and that nothing is half-written."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from matplotlib.image import imread
 
-from tests.support.control_files import hopper_like, write_hdf5
+from tests.support.control_files import control, refused
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
-from ucfrec_control.cli import main
-from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.environments.environments import make_env
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.video import record_episode
 
 SMALL = {"width": 64, "height": 48, "max_episode_steps": 4}
-TINY = ("train.steps=2", "train.validate_every=2", "policy.dim=16", "policy.context=5")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose data is of a Hopper of four steps, drawn small."""
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("video")
-    file = write_hdf5(folder / "hopper_medium-made.hdf5", hopper_like((30, 8, 25) * 8))
-    read_d4rl(file).write_store(folder / "store")
-    settings = [argument for setting in TINY for argument in ("--set", setting)]
-    where = ["--out", str(folder / "run"), "--policy", "dt"]
-    assert main(["train", str(folder / "store"), *where, *settings]) == 0
-    record = read_json(folder / "run" / "run.json")
+    run = shutil.copytree(folder / "store-run", tmp_path_factory.mktemp("video") / "run")
+    record = read_json(run / "run.json")
     record["data"]["env_settings"] = SMALL
-    (folder / "run" / "run.json").write_text(json.dumps(record))
-    return folder / "run"
+    (run / "run.json").write_text(json.dumps(record))
+    return run
 
 
 def record(run: Path, out: Path) -> float:
@@ -65,17 +56,15 @@ def test_frames_show_the_first_episode_from_its_start(run: Path, tmp_path: Path)
         record(run, tmp_path / "frames")
 
 
-def test_a_video_has_the_frames_at_the_speed_of_the_environment(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_has_the_frames_at_the_speed_of_the_environment(run: Path, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     earned = record(run, tmp_path / "a.mp4")
     read = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     about = next(read)
     assert (about["size"], about["fps"], sum(1 for _ in read)) == ((64, 48), 125, 5)
-    asked = ["evaluate", str(run), "--episodes", "1", "--checkpoint", "last"]
-    assert main([*asked, "--video", str(tmp_path / "b.mp4")]) == 0
-    assert f"b.mp4: an episode of return {earned:.1f}" in capsys.readouterr().out
+    asked = ("--episodes", 1, "--checkpoint", "last", "--video", tmp_path / "b.mp4")
+    printed = control("evaluate", run, *asked)[0]
+    assert f"b.mp4: an episode of return {earned:.1f}" in printed
     assert (tmp_path / "b.mp4").read_bytes() == (tmp_path / "a.mp4").read_bytes()
 
 
@@ -91,18 +80,10 @@ def test_a_video_has_the_frames_at_the_speed_of_the_environment(
     ],
 )
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(
-    run: Path,
-    tmp_path: Path,
-    runs: int,
-    out: str,
-    says: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs: int, out: str, says: str
 ) -> None:
     if "opengl" in out:
         monkeypatch.setenv("MUJOCO_GL", "nothing")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert main(["evaluate", *[str(run)] * runs, "--video", str(tmp_path / out)]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert says in line
+    assert says in refused("evaluate", *[run] * runs, "--video", tmp_path / out)
     assert not list(tmp_path.iterdir())

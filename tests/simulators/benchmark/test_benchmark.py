@@ -12,24 +12,22 @@ import pytest
 from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
-from ucfrec.benchmark.cells import Budget, Evaluation, key, training_config
+from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
 from ucfrec.benchmark.suite import Benchmark, BenchmarkRequest, show
 from ucfrec.benchmark.suite import measure as measured
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import evaluate_behavior
+from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import read_json
 from ucfrec.plugins import load_plugin
-from ucfrec.results.row import ResultRow
-from ucfrec.results.rows_file import append_rows, read_rows
+from ucfrec.results.rows import ResultRow, append_rows, read_rows
 from ucfrec.runs.record import RUN, read_record
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.budgets import BUDGETS
 from ucfrec_simulators.benchmark.measure import measure
-from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import Log, kuairand
 from ucfrec_simulators.kuai.environment import EXITS
@@ -229,7 +227,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.ScreeningConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)
@@ -240,7 +238,7 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     }
     assert found.keys() == set(wanted)
     assert len({(cell.run, str(training_config(cell))) for cell in found.values()}) == 3
-    rows = {name: measure(cell, key(cell)) for name, cell in found.items()}
+    rows = {name: measure(cell, make_key(cell)) for name, cell in found.items()}
     for name, own in rows.items():
         assert {row.conditions["distractor"] for row in own} == {0.0, 1.0}
         assert {"screening" in row.details for row in own} == {name in SCREENED}
@@ -263,7 +261,7 @@ def test_unknown_tables_and_budgets_are_named(
         "no table is called table-2; there are main, shared, distractor" in capsys.readouterr().err
     )
     suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="unknown budget huge"):
+    with pytest.raises(InputError, match="no budget is called huge"):
         measured(suite, BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
     assert not (tmp_path / "out").exists()
 
@@ -332,8 +330,8 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"methods": ["dt", "nothing"]}, "no method is called 'nothing'"),
-        ({"tasks": ["nowhere"]}, "no task is called 'nowhere'"),
+        ({"methods": ["dt", "nothing"]}, "no method is called nothing"),
+        ({"tasks": ["nowhere"]}, "no task is called nowhere"),
         ({"training_seeds": 0}, "0 training seeds are requested"),
         ({"logs": 0}, "0 logs are requested"),
     ],

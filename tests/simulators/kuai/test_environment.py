@@ -17,15 +17,13 @@ from tests.support.kuai_reference import Plain
 from tests.support.single_session import SingleSession
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import Step, rollout
+from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.acting.scorer import Scorer
-from ucfrec.acting.uniform import Uniform
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import collect
-from ucfrec.evaluation.environment import Environment
 from ucfrec.evaluation.evaluate import _item_numbers
-from ucfrec.evaluation.simulator import Simulator
+from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.policies.dt import DTConfig, DTPolicy
 from ucfrec.schema import FORBIDDEN
 from ucfrec_simulators.behaviors import repeat_action

@@ -12,8 +12,7 @@ import torch
 
 from tests.support.logs import store_of
 from tests.support.real_data import data_folder
-from ucfrec.acting.rollout import rollout
-from ucfrec.acting.uniform import Uniform
+from ucfrec.acting.rollout import Uniform, rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping

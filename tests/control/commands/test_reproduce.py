@@ -1,0 +1,131 @@
+"""Every table and figure of the paper has its cells, and one command makes it."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.control_files import TINY, control, refused, write_made
+from tests.support.result_rows import result_row
+from ucfrec.benchmark.cells import Budget, Evaluation
+from ucfrec.results.rows import append_rows, read_rows
+from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
+from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
+from ucfrec_control.commands.reproduce import PARTS
+from ucfrec_control.data.distractor import DISTRACTORS
+from ucfrec_control.figures.figures import make_row_figures
+
+LAST = {"suite": SCORES, "metric": "score", "checkpoint": "last"}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
+    part = PARTS[name]
+    assert set(part.methods) <= set(ROBUST if part.table == ROBUSTNESS else TABLES[part.table])
+    for size in BUDGETS:
+        own = part.budget(size)
+        assert own.tasks == (part.files or budget_of(part.table, size).tasks)
+    assert set(part.distractors) <= set(DISTRACTORS)
+    assert part.of_runs == (name in ("figure-5", "figure-6"))
+
+
+def test_one_command_makes_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_made(tmp_path, "hopper_medium-zoo")
+    settings = (*TINY, "crm.epochs=1", "csg.epochs=1")
+    tiny = Budget("small", ("unused",), 1, Evaluation(1, 1000), settings)
+    monkeypatch.setitem(BUDGETS, "small", tiny)
+    said = control("reproduce", "figure-5", "--data", tmp_path, "--out", tmp_path / "out")[1]
+    assert "reproduce figure-5: 1 cells, 1 of them left to measure" in said
+    assert {row.method for row in read_rows(tmp_path / "out" / "results.jsonl")} == {"ucf"}
+    assert list((tmp_path / "out" / "figure-5").glob("moves-*.png"))
+
+
+def test_every_other_part_is_drawn_of_its_rows(tmp_path: Path) -> None:
+    for part in PARTS.values():
+        robust = part.table == ROBUSTNESS
+        rows = [
+            result_row(
+                10.0 * number + seed,
+                **LAST | {"suite": ROBUSTNESS if robust else SCORES},
+                table=part.table,
+                task="d",
+                method=method,
+                training_seed=seed,
+                conditions=small(distractor=distractor, lambda_mask=number / 10),
+            )
+            for number, method in enumerate(part.methods or TABLES[part.table])
+            for distractor in part.distractors or (None,)
+            for seed in range(2)
+        ]
+        made = {file.name for file in make_row_figures(rows, tmp_path)}
+        wanted = "robustness-scores-small-d.png" if robust else f"scores-small-{part.table}.png"
+        assert wanted in made
+    assert (tmp_path / "lambda-small.png").exists()
+
+
+def small(**conditions: object) -> dict[str, object]:
+    return {"budget": "small", **conditions}
+
+
+def test_show_only_draws_the_rows_at_hand_and_measures_nothing(tmp_path: Path) -> None:
+    rows = [
+        result_row(
+            score,
+            **LAST,
+            table=table,
+            task="hopper_medium-zoo",
+            method=method,
+            training_seed=0,
+            conditions={"budget": budget},
+        )
+        for table, method, budget, score in (
+            (MAIN, "ucf", "small", 41.5),
+            (MAIN, "bc", "small", 42.5),
+            (MAIN, "ucf", "full", 43.5),
+            ("lambda", "ucf", "small", 44.5),
+        )
+    ]
+    results = tmp_path / "rows.jsonl"
+    append_rows(results, rows)
+    asked = ("--show-only", "--results", results, "--out", tmp_path / "out")
+    printed = control("reproduce", "table-1", *asked)[0]
+    assert [score in printed for score in ("41.5", "42.5", "43.5", "44.5")] == [True] + [False] * 3
+    assert read_rows(results) == rows
+    assert "no rows of table-9" in refused("reproduce", "table-9", *asked)
+    assert "drawn from its runs" in refused("reproduce", "figure-5", *asked)
+
+
+@pytest.mark.parametrize(
+    ("command", "suite", "conditions", "lacking"),
+    [
+        ("benchmark", SCORES, {}, "budget"),
+        ("robustness", ROBUSTNESS, small(), "distractor"),
+    ],
+)
+def test_rows_that_lack_what_is_shown_are_one_clear_error(
+    tmp_path: Path, command: str, suite: str, conditions: dict[str, object], lacking: str
+) -> None:
+    results = tmp_path / "rows.jsonl"
+    row = result_row(1.0, **LAST | {"suite": suite}, conditions=conditions)
+    append_rows(results, [row])
+    said = refused(command, "--show-only", "--results", results)
+    assert f"{results} is damaged (KeyError: '{lacking}'); measure its rows again" in said
+    said = refused("figures", "--results", results, "--out", tmp_path / "out")
+    assert f"{results} is damaged" in said
+
+
+def test_names_of_foreign_rows_do_not_steer_the_terminal(tmp_path: Path) -> None:
+    results, name = tmp_path / "rows.jsonl", "d\x1b[2J\nforged"
+    append_rows(results, [result_row(1.0, **LAST, table=MAIN, task=name, conditions=small())])
+    printed = control("benchmark", "--show-only", "--results", results)[0]
+    assert "\x1b" not in printed
+    assert "d\\x1b[2J forged" in printed
+
+
+def test_a_figure_that_cannot_be_drawn_keeps_no_other_from_it(tmp_path: Path) -> None:
+    results, out = tmp_path / "rows.jsonl", tmp_path / "out"
+    for weight in (0.5, "half"):
+        named = {"table": "lambda", "method": "ucf", "conditions": small(lambda_mask=weight)}
+        append_rows(results, [result_row(1.0, **LAST, **named)])
+    said = control("figures", "--results", results, "--out", out)[1]
+    assert "lambda-small: what it is drawn from is damaged" in said
+    assert (out / "scores-small-lambda.png").exists()

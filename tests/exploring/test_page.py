@@ -1,0 +1,196 @@
+"""The explorer in a real browser, and without one: lists, errors, sliders, two runs, no scripts."""
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from tests.recommending.test_recommend import SMALL, random_log
+from tests.support.browser import CHROMIUM, Browser
+from ucfrec import DecisionRule, Recommender
+
+httpx = pytest.importorskip("httpx")
+pytest.importorskip("fastapi")
+uvicorn = pytest.importorskip("uvicorn")
+# After the check that they are installed.
+from ucfrec.errors import InputError  # noqa: E402
+from ucfrec.exploring.page import Explorer, application  # noqa: E402
+
+HOSTILE = "<script>alert(1)</script>"
+FEATURES = pa.table(
+    {
+        "item_id": list(range(30)),
+        "title": [HOSTILE, *(f"Film {n}" for n in range(1, 30))],
+        "image_url": ["javascript:alert(1)", *("https://example.org/x.png",) * 29],
+        "genre": ["drama"] * 30,
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def explorer(tmp_path_factory: pytest.TempPathFactory) -> Explorer:
+    folder = tmp_path_factory.mktemp("explore")
+    first = Recommender("dt", settings=["train.steps=60", *SMALL[1:]]).fit(
+        random_log(), folder / "first"
+    )
+    second = Recommender("popular").fit(random_log(), folder / "second")
+    later = random_log().assign(propensity=1 / 30)
+    results = []
+    for target in (1.0, 6.0):
+        report = first.ope(later, rule=DecisionRule(target, temperature=1.0))
+        results.append(folder / f"{target}.json")
+        report.save(results[-1])
+    found = Explorer([first.trained, second.trained], FEATURES, results)
+    found.kept = first, second  # type: ignore[attr-defined]  # their stores
+    return found
+
+
+@pytest.fixture(scope="module")
+def address(explorer: Explorer) -> Iterator[str]:
+    config = uvicorn.Config(application(explorer, ["127.0.0.1"]), port=0, log_level="error")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+
+
+def got(explorer: Explorer, path: str, host: str = "127.0.0.1", **given: str) -> Any:
+    async def ask() -> Any:
+        transport = httpx.ASGITransport(app=application(explorer, ["127.0.0.1"]))
+        async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
+            return await client.get(path, params=given)
+
+    return asyncio.run(ask())
+
+
+def test_the_page_works_without_scripts(explorer: Explorer) -> None:
+    answer = got(explorer, "/", user="7", k="3", keep_seen="on")
+    assert answer.status_code == 200
+    assert answer.text.count('class="card"') == 6
+    assert "Film" in answer.text
+    rule = {"custom": "on", "reward_weight": "0", "temperature": "0"}
+    assert "only here" in got(explorer, "/", user="7", k="3", keep_seen="on", **rule).text
+    assert "script-src 'self'" in answer.headers["content-security-policy"]
+    assert "Model card" in answer.text
+    assert got(explorer, "/report/0").text.startswith("<!DOCTYPE html>")
+    assert got(explorer, "/report/7").status_code == 404
+
+
+def test_off_policy_values_are_shown_by_target(explorer: Explorer) -> None:
+    assert [target for target, _, _ in explorer.values] == [1.0, 6.0]
+    page = got(explorer, "/").text
+    assert "Off-policy value against the target return" in page
+    assert page.count("<tr><th") == 3
+    for _, _, row in explorer.values:
+        assert f"{row.value:.4g} [" in page
+    assert '<figure class="chart"><svg ' in page
+    assert "Off-policy value" not in Explorer(explorer.runs).page({})
+
+
+def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
+    page = got(explorer, "/", history=f"0, 1\n{HOSTILE}").text
+    assert HOSTILE not in page
+    assert 'role="alert"' in page
+    listed = got(explorer, "/results", history="3, 1", k="30").text
+    assert HOSTILE not in listed
+    assert "javascript:" not in listed
+    refused = got(explorer, "/", host="evil.example")
+    assert refused.status_code == 400
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"user": "nobody"}, "has no user &#39;nobody&#39;; choose one of the list, or paste"),
+        ({"user": "7", "k": "0"}, "k is &#39;0&#39;; give a number from 1 to 100"),
+        ({"user": "7", "custom": "on", "temperature": "x"}, "temperature is"),
+        ({"user": "7", "custom": "on", "temperature": "-1"}, "temperature is -1"),
+        ({"history": "99, 1"}, "does not know the items 99; take their lines out of the history"),
+        ({"history": "3, much"}, "line 1 of the history"),
+    ],
+)
+def test_what_is_wrong_is_said_on_the_page(
+    explorer: Explorer, given: dict[str, str], message: str
+) -> None:
+    answer = got(explorer, "/", **given)
+    assert answer.status_code == 200
+    assert message in answer.text
+
+
+def test_without_the_store_a_history_can_be_pasted(explorer: Explorer) -> None:
+    trained = explorer.runs[0]
+    gone = trained.record.model_copy(update={"store": "gone", "store_from_run": None})
+    alone = Explorer([replace(trained, record=gone)])
+    said = "the store of the run first, gone, is gone or has changed; paste a history"
+    assert said in alone.results({"user": "7"})
+    assert 'class="card"' in alone.results({"history": "3, 1"})
+
+
+def test_one_run_or_two(explorer: Explorer) -> None:
+    with pytest.raises(InputError, match="0 runs are named"):
+        Explorer([])
+    alone = Explorer(explorer.runs[:1])
+    assert "only here" not in alone.results({"user": "7"})
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_a_visitor_moves_a_slider_and_pastes_a_history(address: str, tmp_path: Path) -> None:
+    first = "[...document.querySelectorAll('section:first-of-type .card')].map(c => c.dataset.item)"
+    with Browser(tmp_path / "profile") as browser:
+        browser.view(1200, 900)
+        browser.open(f"{address}/?user=7&k=6&keep_seen=on")
+        before = browser.run(first)
+        assert len(before) == 6
+        browser.run(
+            "(() => { const s = document.getElementById('reward_weight'); s.value = 32;"
+            "s.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+        browser.until(f"JSON.stringify({first}) !== JSON.stringify({json.dumps(before)})")
+        assert browser.run("form.elements.custom.checked")
+        assert browser.run("document.querySelector('output[for=reward_weight]').value") == "32"
+        assert "reward_weight=32" in browser.run("location.search")
+        browser.run(
+            "(() => { const t = document.getElementById('history'); t.value = '3, 1\\n4, much';"
+            "t.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+        browser.until("document.querySelector('[role=alert]') !== null")
+        assert "line 2" in browser.run("document.querySelector('[role=alert]').textContent")
+        browser.run(
+            "(() => { const t = document.getElementById('history'); t.value = '3, 1\\n4, 0';"
+            "t.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+        browser.until("document.querySelectorAll('.card').length === 12")
+        browser.view(375, 800, dark=True)
+        assert browser.run("document.documentElement.scrollWidth") <= 375
+        assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_every_control_has_a_name_and_is_reached_by_keyboard(address: str, tmp_path: Path) -> None:
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(f"{address}/?user=7&k=3")
+        nameless = browser.run(
+            "[...document.querySelectorAll('input, textarea')]"
+            ".filter(c => !c.labels.length).map(c => c.id)"
+        )
+        assert nameless == []
+        reached = []
+        for _ in range(12):
+            for kind in ("keyDown", "keyUp"):
+                browser.send("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab",
+                             windowsVirtualKeyCode=9)  # fmt: skip
+            reached.append(
+                browser.run("document.activeElement.id || document.activeElement.tagName")
+            )
+        assert {"user", "history", "k", "keep_seen", "custom", "reward_weight"} <= set(reached)

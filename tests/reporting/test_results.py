@@ -1,0 +1,114 @@
+"""The forest plot draws what each verdict is of, and whether it stands."""
+
+from typing import Any
+
+from tests.support.report_page import estimate, row
+from ucfrec.off_policy.estimators import LOGGED
+from ucfrec.reporting.results import (
+    NO_RESULTS,
+    Estimates,
+    Results,
+    conclude,
+    draw_forest,
+    find_quoted,
+)
+from ucfrec.results.rows import ResultRow
+
+
+def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
+    """The forest of policies a, b, … with the logged return and the rows of each."""
+    estimates = [
+        Estimates(name, estimate(LOGGED, logged), rows, ())
+        for name, (logged, rows) in zip("ab", policies, strict=False)
+    ]
+    return draw_forest(Results({}, estimates))
+
+
+def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
+    good = [
+        estimate("IPS", 3.0),
+        estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True}),
+    ]
+    bad = [estimate("DR", 9.0, details={"verdict_of": "DR", "reliable": False})]
+    first, second, _ = forest_of((2.0, good), (2.0, bad)).summary.split(". ")
+    assert first == "a: DR: 4, 95% interval 3.5 to 5.5, the estimate stands"
+    assert second == "b: DR: 9, 95% interval 8.5 to 10.5, do not rely on it"
+
+
+def test_without_an_interval_there_is_no_line() -> None:
+    models = [estimate("DM", 1.0, interval=None), estimate("FQE", 2.0, interval=None)]
+    assert forest_of((2.0, models)) is None
+    assert forest_of() is None
+    snips = estimate("SNIPS", 1.0, details={"verdict_of": "SNIPS"})
+    assert find_quoted([*models, snips]) == snips
+
+
+def test_logs_that_differ_have_no_common_reference() -> None:
+    rows = [estimate("DR", 4.0, details={"verdict_of": "DR"})]
+    alike, different = forest_of((2.0, rows), (2.0, rows)), forest_of((2.0, rows), (3.0, rows))
+    assert alike.summary.endswith("For comparison, logged sessions: 2")
+    assert "logged sessions" not in different.summary
+    assert different.summary.count("do not rely on it") == 2
+
+
+def earned(policy: str, value: float, **more: Any) -> ResultRow:
+    return row("a", policy, value, interval=(value - 0.1, value + 0.1), **more)
+
+
+def of_environment(*rows: ResultRow) -> str:
+    (said,) = conclude(Results({"a": rows}, ()))
+    return said
+
+
+def test_without_results_nothing_is_said_of_returns() -> None:
+    assert conclude(Results({}, ())) == [NO_RESULTS]
+    assert "the returns of these policies are unknown" in NO_RESULTS
+
+
+def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
+    said = of_environment(
+        earned("random", 1.0), earned("optimal", 9.0), earned("logging", 2.95),
+        earned("dt", 2.0, training_seed=0), earned("ucf", 3.0, training_seed=0),
+    )  # fmt: skip
+    assert "ucf has the highest return of 2 trained policies: 3 (95% interval 2.9 to 3.1)" in said
+    assert "lies above those of the others, the next being dt (2)" in said
+    assert "higher than that of random (1), and lower than that of optimal (9)" in said
+    assert "Whether it is higher or lower than that of logging (2.95) is open" in said
+    assert "Each policy was trained once" in said
+
+
+def test_intervals_that_overlap_leave_it_open() -> None:
+    said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
+    assert "overlaps that of dt (2.9): which of them has the higher return is open" in said
+    assert "to compare it with" in said
+
+
+def test_seeds_of_training_are_taken_together() -> None:
+    rows = [earned("ucf", value, training_seed=seed) for seed, value in enumerate((3.0, 4.0, 5.0))]
+    said = of_environment(*rows, earned("random", 3.5), earned("bad", 1.0))
+    assert "4 in the mean of 3 trainings (their 95% intervals span 2.9 to 5.1)" in said
+    assert "higher than that of bad (1)" in said
+    assert "lower than that of random (3.5) is open" in said
+    assert "trained once" not in said
+
+
+def test_checkpoints_of_one_run_are_no_seeds() -> None:
+    rows = [earned("ucf", 3.0, training_seed=0, checkpoint="best"),
+            earned("ucf", 2.0, training_seed=0, checkpoint="last")]  # fmt: skip
+    said = of_environment(*rows)
+    assert "ucf, checkpoint best has the highest return of 2 trained policies: 3 (" in said
+    assert "trained once" in said
+
+
+def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
+    assert of_environment(earned("random", 1.0)) == (
+        "In a, only built-in policies were evaluated: random (1)."
+    )
+
+
+def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
+    rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
+    (said,) = conclude(Results({}, [Estimates("ucf", None, rows, ())]))
+    assert said == "For ucf: higher."
+    (said,) = conclude(Results({}, [Estimates("ucf", None, rows[:1], ())]))
+    assert "no verdict" in said

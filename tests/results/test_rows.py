@@ -1,0 +1,336 @@
+"""Result rows: read as they were written, and nothing else is read."""
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.support.result_rows import read_configurations, result_row
+from ucfrec.errors import InputError
+from ucfrec.provenance import config_hash
+from ucfrec.results.rows import (
+    CONFIGURATIONS,
+    Measured,
+    ResultRow,
+    RowKey,
+    append_rows,
+    benchmarking,
+    latest,
+    read_results,
+    read_rows,
+    row_from_json,
+)
+
+WHOLE = result_row(
+    2.5,
+    metrics={"length": 3.0},
+    log_seed=1,
+    evaluation_seed=1_000_000,
+    conditions={"budget": "small", "episodes": 5, "rate": 0.5, "on": True, "none": None},
+    config_hash="ab",
+    data_fingerprint="ef",
+    interval=(1.0, 3.0),
+    target_return=4.0,
+    rule="target return: the largest",
+    details={"validation": {"4": [1, {"a": None}]}},
+    wall_time_s=0.5,
+    peak_memory_mib=300.0,
+    command="ucfrec benchmark",
+    commit="12",
+    versions={"python": "3.11"},
+)
+
+
+@pytest.mark.parametrize("row", [WHOLE, result_row()], ids=["every field", "few fields"])
+def test_a_row_is_read_as_it_was_written(row: ResultRow) -> None:
+    written = json.loads(json.dumps(row.to_json(), allow_nan=False))
+    assert row_from_json(written, "here") == row
+
+
+def test_what_a_row_does_not_say_is_not_written() -> None:
+    assert result_row().to_json().keys() == {
+        *("suite", "table", "task", "method", "policy", "environment", "checkpoint"),
+        *("training_seed", "metric", "metrics"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"suite": 1}, "'suite'"),
+        ({"training_seed": True}, "'training_seed'"),
+        ({"training_seed": 10**30}, "'training_seed'"),
+        ({"evaluation_seed": 1.5}, "'evaluation_seed'"),
+        ({"metrics": {"R_cum": float("nan")}}, "'metrics.R_cum'"),
+        ({"metrics": {"R_cum": 10**400}}, "'metrics.R_cum'"),
+        ({"metrics": {"R_cum": "3"}}, "'metrics.R_cum'"),
+        ({"metrics": {"other": 3}}, "its metrics lack 'R_cum'"),
+        ({"metrics": [3]}, "'metrics'"),
+        ({"interval": [1, 2, 3]}, "'interval"),
+        ({"conditions": {"a": [1]}}, "'conditions.a"),
+        ({"details": {"a": float("inf")}}, "every number should be finite"),
+        ({"wall_time_s": "1"}, "'wall_time_s'"),
+        ({"versions": {"numpy": 2}}, "'versions.numpy'"),
+        ({"seed": 3}, "'seed': Unexpected"),
+    ],
+)
+def test_what_is_of_another_kind_is_refused(change: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=r"x\.jsonl, line 3 is not a result row") as refused:
+        row_from_json(result_row().to_json() | change, "x.jsonl, line 3")
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["suite", "table", "task", "method", "policy", "metric"])
+def test_a_missing_field_is_named(name: str) -> None:
+    written = result_row().to_json()
+    del written[name]
+    with pytest.raises(InputError, match=f"'{name}'"):
+        row_from_json(written, "here")
+
+
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=4,
+)
+
+
+@settings(max_examples=40)
+@given(name=st.sampled_from([*WHOLE.to_json(), "other"]), value=_JSON)
+def test_whatever_stands_in_a_field_it_is_a_row_or_refused(name: str, value: Any) -> None:
+    written = json.loads(json.dumps(WHOLE.to_json() | {name: value}))
+    try:
+        row = row_from_json(written, "here")
+    except InputError:
+        return
+    assert row_from_json(json.loads(json.dumps(row.to_json(), allow_nan=False)), "again") == row
+
+
+@settings(max_examples=40)
+@given(value=_JSON)
+def test_whatever_is_no_row_is_refused(value: Any) -> None:
+    with pytest.raises(InputError, match="here is not a result row"):
+        row_from_json(value, "here")
+
+
+def test_a_key_covers_its_rows_and_no_others() -> None:
+    names = RowKey.__dataclass_fields__
+    key = RowKey(**{name: getattr(WHOLE, name) for name in names})
+    assert key.covers(WHOLE)
+    more = ResultRow(**vars(WHOLE) | {"conditions": {**WHOLE.conditions, "distractor": 0.0}})
+    assert key.covers(more)
+    for name in names:
+        value: Any = {"budget": "full"} if name == "conditions" else "9"
+        value = 9 if name.endswith("seed") else value
+        assert not key.covers(ResultRow(**vars(WHOLE) | {name: value})), name
+    fewer = {name: value for name, value in WHOLE.conditions.items() if name != "none"}
+    assert not key.covers(ResultRow(**vars(WHOLE) | {"conditions": fewer}))
+
+
+def test_a_line_has_every_number_under_its_name() -> None:
+    line = WHOLE.as_line()
+    assert (line["R_cum"], line["R_cum_low"], line["R_cum_high"]) == (2.5, 1.0, 3.0)
+    assert (line["length"], line["budget"], line["training_seed"]) == (3.0, "small", 0)
+
+
+def test_rows_are_read_as_they_were_appended(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "rows.jsonl"
+    assert read_rows(path) == []
+    rows = [result_row(float(n), training_seed=n) for n in range(3)]
+    append_rows(path, rows[:1])
+    append_rows(path, rows[1:])
+    assert read_rows(path) == rows
+
+
+def test_configurations_lie_once_beside_the_rows(tmp_path: Path) -> None:
+    config = {"policy": {"dim": 8}, "seed": 0}
+    named = config_hash(config)
+    for seed in range(2):
+        append_rows(tmp_path / "a.jsonl", [result_row(config_hash=named)], config)
+        append_rows(tmp_path / "b.jsonl", [result_row(training_seed=seed)])
+    assert read_configurations(tmp_path) == {named: config}
+    assert len((tmp_path / CONFIGURATIONS).read_text().splitlines()) == 1
+    with pytest.raises(InputError, match="have the hash of another configuration"):
+        append_rows(tmp_path / "a.jsonl", [result_row(config_hash="other")], config)
+
+
+@pytest.mark.parametrize(
+    ("torn", "says"),
+    [
+        *((torn, "line 2 is not a result row") for torn in
+          (b"[broken", b'{"suite": "x"', b"1" * 5000, b"[" * 100_000, b'"text"')),
+        (b"\xff\xfe\n", r"rows\.jsonl is not UTF-8 text"),
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_row_is_named_and_kept(tmp_path: Path, torn: bytes, says: str) -> None:
+    path = tmp_path / "rows.jsonl"
+    append_rows(path, [result_row()])
+    path.write_bytes(path.read_bytes() + torn)
+    with pytest.raises(InputError, match=says):
+        read_rows(path)
+
+
+def test_numbers_that_are_none_are_never_written(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    with pytest.raises(InputError, match="is not a result row"):
+        append_rows(path, [result_row(), result_row(float("nan"))])
+    assert not path.exists()
+
+
+def test_a_last_line_without_its_end_is_not_run_into(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    path.write_text(json.dumps(result_row(1.0).to_json()))
+    append_rows(path, [result_row(2.0)])
+    assert [row.value for row in read_rows(path)] == [1.0, 2.0]
+
+
+_FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from tests.support.result_rows import result_row
+from ucfrec.results.rows import append_rows
+signal.signal(signal.SIGXFSZ, signal.SIG_DFL if sys.argv[2] == "kill" else signal.SIG_IGN)
+path = Path(sys.argv[1])
+limit = path.stat().st_size + 100
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+append_rows(path, [result_row(9.0), result_row(10.0)])
+"""
+
+
+@pytest.mark.parametrize("how", ["kill", "raise"])
+def test_an_append_that_breaks_off_leaves_the_file_as_it_was(tmp_path: Path, how: str) -> None:
+    """The system stops the process in the middle of its write."""
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
+    path = tmp_path / "rows.jsonl"
+    append_rows(path, [result_row(1.0)])
+    before = path.read_bytes()
+    done = subprocess.run([sys.executable, "-c", _FULL_DISK, str(path), how], check=False)
+    assert done.returncode != 0
+    assert path.read_bytes() == before
+    append_rows(path, [result_row(2.0)])
+    assert [row.value for row in read_rows(path)] == [1.0, 2.0]
+
+
+_APPEND = """
+import sys
+from pathlib import Path
+from tests.support.result_rows import result_row
+from ucfrec.results.rows import append_rows
+for n in range(30):
+    rows = [result_row(float(n), method=sys.argv[2], training_seed=n, table=t) for t in "ab"]
+    append_rows(Path(sys.argv[1]), rows)
+"""
+
+
+def test_processes_that_append_at_once_lose_no_row(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    names = ("x", "y", "z")
+    running = [subprocess.Popen([sys.executable, "-c", _APPEND, str(path), n]) for n in names]
+    assert [process.wait() for process in running] == [0, 0, 0]
+    rows = read_rows(path)
+    assert len(rows) == 3 * 30 * 2
+    for name in names:
+        own = [(row.training_seed, row.table) for row in rows if row.method == name]
+        assert own == [(n, table) for n in range(30) for table in "ab"]
+
+
+def test_of_rows_that_measure_the_same_the_last_counts() -> None:
+    old = result_row(1.0)
+    rows = [
+        old,
+        result_row(2.0, training_seed=1),
+        result_row(3.0, data_fingerprint="b", conditions={}),
+        result_row(4.0, conditions={"budget": "full"}),
+    ]
+    assert sorted(row.value for row in latest(rows)) == [2.0, 3.0, 4.0]
+
+
+_BENCHMARK = """
+import sys
+from pathlib import Path
+from ucfrec.results.rows import benchmarking
+with benchmarking(Path(sys.argv[1])):
+    print("measuring", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_one_command_at_a_time_fills_a_file_and_its_processes_append(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    other = subprocess.Popen(
+        [sys.executable, "-c", _BENCHMARK, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert other.stdout is not None
+    assert other.stdout.readline() == b"measuring\n"
+    with (
+        pytest.raises(InputError, match=rf"rows\.jsonl is being filled by process {other.pid} "),
+        benchmarking(path),
+    ):
+        raise AssertionError("the block must not run")
+    with benchmarking(tmp_path / "others.jsonl"):
+        append_rows(path, [result_row()])
+    other.kill()
+    other.wait()
+    with benchmarking(path):
+        append_rows(path, [result_row(training_seed=7)])
+    assert len(read_rows(path)) == 2
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.jsonl"]
+
+
+mpl.use("Agg")
+_KEY = {"suite": "rank", "table": "rank", "task": "logs", "policy": "dt", "metric": "R"}
+ROWS = [
+    ResultRow(
+        **_KEY,
+        method="<b>",
+        metrics={"R": 1.5, "S": 0.25},
+        interval=(1.0, 2.5),
+        details={"intervals": {"S": [0.125, 0.5]}},
+        conditions={"k": 10},
+    ),
+    ResultRow(**_KEY, method="popular", metrics={"R": 1.0}, conditions={"k": 10}),
+]
+
+
+def test_a_frame_has_metrics_with_their_intervals() -> None:
+    frame = Measured(ROWS).to_frame().set_index("method")
+    assert frame.loc["<b>", ["R", "R_low", "R_high", "S", "S_low", "S_high"]].tolist() == [
+        *(1.5, 1.0, 2.5),
+        *(0.25, 0.125, 0.5),
+    ]
+    assert frame.loc["popular", ["S", "R_low"]].isna().all()
+    assert (frame.k == 10).all()
+
+
+def test_a_notebook_shows_rows_and_warnings_and_no_markup_of_names() -> None:
+    html = Measured(ROWS, ["mind <this>"])._repr_html_()
+    assert "&lt;b&gt;" in html
+    assert "<b>" not in html
+    assert "mind &lt;this&gt;" in html
+    shown = repr(Measured(ROWS, ["mind <this>"])).splitlines()
+    assert "popular" in shown[-2]
+    assert shown[-1] == "warning: mind <this>"
+
+
+def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
+    axes = Measured(ROWS).plot()
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["popular", "<b>"]
+    assert axes.lines[0].get_xdata().tolist() == [1.0, 1.5]  # type: ignore[union-attr]
+    again = Measured(ROWS).plot("S", ax=axes)
+    assert again is axes
+    for name in ("T", "method", "k"):
+        with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
+            Measured(ROWS).plot(name)
+
+
+def test_saved_rows_are_read_again(tmp_path: Path) -> None:
+    Measured(ROWS).save(tmp_path / "rows.json")
+    assert read_results(tmp_path / "rows.json") == ROWS

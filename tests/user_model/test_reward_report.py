@@ -1,0 +1,246 @@
+"""Training users stand for new ones: their tastes are found, also in logs of who knew them."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.support.tagged import tagged_store
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.fitting.checkpoint import save_tensors
+from ucfrec.runs.run import training_views
+from ucfrec.user_model.reward import LAGS, ItemRewardModel
+from ucfrec.user_model.reward_fit import (
+    TrainingUsers,
+    draw_sessions,
+    fit_item_reward_model,
+    fit_training_users,
+    reward_model_sizes,
+)
+from ucfrec.user_model.reward_report import RewardRows, UserCalibration, weigh_by_propensity
+
+USERS, LENGTH, ITEMS, KINDS = 250, 40, 20, 5
+LIKED, OTHER = 0.8, 0.1
+HALF = ITEMS // 2
+
+
+def log_of_tastes() -> tuple[EpisodeStore, IntArray]:
+    """Sessions of users who like one of five kinds of items, shown at random; and the kinds."""
+    rng = np.random.default_rng(0)
+    kind = rng.integers(KINDS, size=USERS)
+    items = rng.integers(ITEMS, size=(USERS, LENGTH))
+    chance = np.where(items % KINDS == kind[:, None], LIKED, OTHER)
+    rewards = rng.random(items.shape) < chance
+    return store_of(items, rewards, np.full(items.shape, 1 / ITEMS)), kind
+
+
+def log_of_moods(knowing: float, told: bool = True) -> EpisodeStore:
+    """Sessions whose every second step, by chance, is one where everything is liked.
+
+    Args:
+        knowing: share of the steps in which the log's policy knows this, and shows one of the first
+            ten items then, and one of the others in other steps; it shows any item otherwise.
+        told: whether the log has propensities.
+    """
+    rng = np.random.default_rng(1)
+    mood = rng.random((USERS, LENGTH)) < 0.5
+    by_mood = rng.integers(HALF, size=mood.shape) + np.where(mood, 0, HALF)
+    acts = rng.random(mood.shape) < knowing
+    items = np.where(acts, by_mood, rng.integers(ITEMS, size=mood.shape))
+    right = np.where((items < HALF) == mood, knowing / HALF, 0) + (1 - knowing) / ITEMS
+    rewards = rng.random(mood.shape) < np.where(mood, LIKED, OTHER)
+    return store_of(items, rewards, right if told else None)
+
+
+def store_of(
+    items: IntArray, rewards: BoolArray, right: Float64Array | None, seen: BoolArray | None = None
+) -> EpisodeStore:
+    """A store of what (USERS, LENGTH) was shown, with `right` propensities and what was `seen`."""
+    columns: dict[str, Any] = {"item": items.ravel(), "reward": rewards.ravel() * 1.0}
+    if right is not None:
+        columns["propensity"] = right.ravel()
+    if seen is not None:
+        columns["observation"] = seen.reshape(-1, 1).astype(np.float32)
+    kinds = torch.eye(KINDS)[torch.arange(ITEMS) % KINDS]
+    states = ItemStates(kinds, torch.zeros(USERS, 0), 0.0, 1.0)
+    episodes = {"user": np.arange(USERS)}
+    return EpisodeStore.from_arrays(columns, np.full(USERS, LENGTH), episodes, states)
+
+
+def chances(users: TrainingUsers, rows: RewardRows) -> Float64Array:
+    """(M,) the calibrated chances that users like what is shown in the rows."""
+    slope, intercept = users.report.calibration
+    scores = users.model.score(rows.states, rows.history, rows.users, rows.items)
+    return torch.sigmoid(slope * scores + intercept).double().numpy()
+
+
+def test_tastes_are_found(tmp_path: Path) -> None:
+    train, kind = log_of_tastes()
+    users = fit_training_users(train, tmp_path, seed=0)
+    rows = RewardRows.at(train, *train.all_steps(), LAGS)
+    liked = rows.items.numpy() % KINDS == kind[rows.users.numpy()]
+    found = chances(users, rows)
+    assert "affinity" in {tried.effect for tried in users.report.effects if tried.kept}
+    assert found[liked].mean() == pytest.approx(LIKED, abs=0.15)
+    assert found[~liked].mean() == pytest.approx(OTHER, abs=0.05)
+
+
+def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> None:
+    anything = log_of_moods(knowing=0.0)
+    rows = RewardRows.at(anything, *anything.all_steps(), LAGS)
+    first = rows.items.numpy() < HALF
+    users = fit_training_users(log_of_moods(0.7), tmp_path / "weighted", seed=0)
+    crude = fit_training_users(log_of_moods(0.7, told=False), tmp_path / "crude", seed=0)
+    assert users.report.weighted
+    assert (
+        users.report.effective_steps
+        < users.report.steps
+        == USERS * LENGTH
+        == crude.report.effective_steps
+    )
+    assert not crude.report.weighted
+    mean = (LIKED + OTHER) / 2
+    found, without = chances(users, rows), chances(crude, rows)
+    assert without[first].mean() - without[~first].mean() > 0.3
+    assert abs(found[first].mean() - found[~first].mean()) < 0.1
+    assert found.mean() == pytest.approx(mean, abs=0.05)
+
+
+def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    items, seen = rng.integers(ITEMS, size=(USERS, LENGTH)), rng.random((USERS, LENGTH)) < 0.5
+    rewards = rng.random(seen.shape) < np.where(seen, LIKED, OTHER)
+    train = store_of(items, rewards, None, seen)
+    users = fit_training_users(train, tmp_path, seed=0)
+    found = chances(users, RewardRows.at(train, *train.all_steps(), LAGS))
+    assert found[seen.ravel()].mean() == pytest.approx(LIKED, abs=0.03)
+    assert found[~seen.ravel()].mean() == pytest.approx(OTHER, abs=0.03)
+    states = torch.randn(3, train.state_size)
+    other = states.clone()
+    other[:, : train.item_states.size] += 1
+    nothing = torch.zeros(3, users.model.vectors.shape[1] + 1)
+    assert torch.equal(
+        users.model.level(states, None, nothing), users.model.level(other, None, nothing)
+    )
+
+
+def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
+    train, _ = log_of_tastes()
+    users = fit_training_users(train, tmp_path, seed=0)
+    file = tmp_path / "training_users.safetensors"
+    report = dataclasses.asdict(users.report)
+    for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
+        save_tensors(file, users.model.state_dict(), other)
+        with pytest.raises(InputError, match="damaged"):
+            fit_training_users(train, tmp_path, seed=0)
+
+
+@given(
+    st.lists(st.sampled_from([0.01, 0.05, 0.2, 0.5, 1.0]), min_size=8, max_size=8),
+    st.integers(2, 50),
+)
+def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
+    propensities: list[float], items: int
+) -> None:
+    logged, zeros = np.array(propensities), np.zeros(8)
+    columns = {"item": zeros.astype(np.int64), "reward": zeros, "propensity": logged}
+    states = ItemStates(torch.ones(1, 2), torch.zeros(2, 0), 0.0, 1.0)
+    users = np.array([1, 0, 1])
+    view = EpisodeStore.from_arrays(columns, np.array([3, 4, 1]), {"user": users}, states)
+    weights = weigh_by_propensity(view, *view.all_steps(), items)
+    assert weights is not None
+    shares = np.minimum(10.0, 1 / (np.float32(logged) * items))
+    for user in (0, 1):
+        of_user = np.repeat(users, [3, 4, 1]) == user
+        found, expected = weights.double().numpy()[of_user], shares[of_user]
+        assert np.allclose(found / found.max(), expected / expected.max(), rtol=1e-5)
+        effective = expected.sum() ** 2 / np.square(expected).sum()
+        assert found.sum() == pytest.approx(effective, rel=1e-4)
+
+
+@pytest.mark.parametrize("told", [{}, {"propensity": np.array([0.5, np.nan, 0.5])}])
+def test_logs_without_all_propensities_have_no_weights(told: dict[str, Float64Array]) -> None:
+    columns = {"item": np.zeros(3, dtype=np.int64), "reward": np.array([0.0, 1.0, 0.0]), **told}
+    states = ItemStates(torch.ones(1, 2), torch.zeros(1, 0), 0.0, 1.0)
+    view = EpisodeStore.from_arrays(columns, np.array([3]), {"user": np.array([0])}, states)
+    assert weigh_by_propensity(view, *view.all_steps(), 1) is None
+
+
+def test_sessions_are_drawn_by_the_seed() -> None:
+    train, _ = log_of_tastes()
+    users = [draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1)]
+    assert np.array_equal(users[0], users[1])
+    assert not np.array_equal(users[0], users[2])
+    assert sorted(users[0]) == sorted(train.episode_values("user"))
+
+
+MANY_USERS, FEW_STEPS = 300, 20
+
+
+def test_calibration_undoes_a_stretched_and_shifted_score(tmp_path: Path) -> None:
+    train, validation = training_views(tagged_store(tmp_path))
+    model, _ = fit_item_reward_model(train, validation, tmp_path / "model", 0)
+    slope, intercept = UserCalibration.fit(model, train, 10_000, 0).line
+    for name in ("item", "user", "state", "affinity", "interaction", "exposure"):
+        model.get_buffer(name).mul_(2)
+    model.item.add_(1)
+    again = UserCalibration.fit(model, train, 10_000, 0).line
+    assert again[0] == pytest.approx(slope / 2, rel=1e-3)
+    assert again[1] == pytest.approx(intercept - slope / 2, abs=1e-3)
+
+
+def log_of(told: bool, off: float = 0.0) -> EpisodeStore:
+    """A log whose policy shows item 0 mostly to users who like it (odds 3 : 1, else 1 : 3).
+
+    Args:
+        told: whether the log has propensities.
+        off: added to the chance of a like by users of odd numbers.
+    """
+    rng = np.random.default_rng(0)
+    likes = rng.random((MANY_USERS, FEW_STEPS)) < 0.5
+    first = np.where(likes, 0.9, 0.1)
+    items = (rng.random(likes.shape) >= first).astype(np.int64)
+    chance = np.where(items == 1, 0.5, np.where(likes, 0.75, 0.25)) + off * (
+        np.arange(MANY_USERS)[:, None] % 2
+    )
+    columns = {"item": items.ravel(), "reward": (rng.random(likes.shape) < chance).ravel() * 1.0}
+    if told:
+        columns["propensity"] = np.where(items == 0, first, 1 - first).ravel()
+    states = ItemStates(torch.eye(2), torch.zeros(MANY_USERS, 0), 0.0, 1.0)
+    episodes = {"user": np.arange(MANY_USERS)}
+    return EpisodeStore.from_arrays(columns, np.full(MANY_USERS, FEW_STEPS), episodes, states)
+
+
+def even(store: EpisodeStore) -> ItemRewardModel:
+    """A model to which items differ by 2 in log-odds."""
+    model = ItemRewardModel(reward_model_sizes(store))
+    model.binary.fill_(True)
+    model.item.copy_(torch.tensor([1.0, -1.0]))
+    return model.eval()
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_with_propensities_items_are_worth_what_they_are_to_anyone(told: bool) -> None:
+    store = log_of(told)
+    found = UserCalibration.fit(even(store), store, 10**6, 0)
+    slope, intercept = found.line
+    chances = [1 / (1 + np.exp(-(slope * score + intercept))) for score in (1.0, -1.0)]
+    assert found.weighted is told
+    assert chances == pytest.approx([0.5 if told else 0.7, 0.5], abs=0.05)
+    assert abs(found.optimism) < 3 * found.optimism_error < 0.1
+
+
+def test_optimism_is_what_one_half_expects_too_much_of_the_other() -> None:
+    store = log_of(told=False, off=0.2)
+    found = UserCalibration.fit(even(store), store, 10**6, 0)
+    intercepts = [line[1] for line in found.halves]
+    assert intercepts[1] - intercepts[0] > 0.5
+    assert found.optimism_error < 0.1

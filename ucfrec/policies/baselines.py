@@ -1,0 +1,413 @@
+"""Simple policies: of the state alone, of popularity, of neighbours, of two factors per item."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar, Final, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ucfrec import schema
+from ucfrec.arrays import Array, BoolArray
+from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Windows
+from ucfrec.errors import InputError
+from ucfrec.policies.base import (
+    Context,
+    PolicyConfig,
+    SequencePolicy,
+    draw_normal,
+    embedding,
+    require_items,
+)
+from ucfrec.policies.heads import ItemHead, VectorHead
+from ucfrec.policies.ucf import Dropout
+from ucfrec.settings import settings_table
+
+PRIOR: Final = 10.0
+"""Steps at the mean rate that are added to every item's own."""
+HALF_LIVES: Final = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
+"""Hours after which a row counts half; those that are tried."""
+_HOUR_MS: Final = 3_600_000
+_SMOOTHING: Final = 1.0
+"""Likes that are added to all items together."""
+_WITHIN = 0.999
+"""Largest share of an action's range that the hyperbolic tangent of the head is to reach."""
+_ROWS = 1024
+_HOTTEST = 64.0
+"""Largest factor on the cosines of neighbours."""
+_HALVINGS = 30
+
+_Scored = Literal["steps", "likes", "rate"]
+LikedOf = Callable[[EpisodeStore, Array], BoolArray]
+
+
+@settings_table("policy")
+class BCConfig(PolicyConfig):
+    """Settings of behaviour cloning, a two-layer perceptron on the current state."""
+
+    context: Context = 1
+    """K, steps of a training window; each prediction uses its own state only."""
+
+
+class BCPolicy(SequencePolicy):
+    """Imitates the logging policy; returns-to-go and history are not used."""
+
+    Config = BCConfig
+    config: BCConfig
+
+    def __init__(self, config: BCConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        dim = config.dim
+        self.net = nn.Sequential(
+            nn.Linear(sizes["state"], dim),
+            nn.ReLU(),
+            Dropout(config.dropout),
+            nn.Linear(dim, dim),
+            nn.ReLU(),
+            nn.LayerNorm(dim),
+        )
+
+    def features(self, windows: Windows) -> Tensor:
+        """Features (B, K, d), each from its own state."""
+        return self.net(windows.states)  # type: ignore[no-any-return]
+
+
+class PopularPolicy(SequencePolicy):
+    """Scores items by their training rows, whatever the session shows: only biases matter.
+
+    The score is the logarithm of the item's share of all `steps`, one step added to each item; the
+    logarithm of its share of the `likes`; or the log-odds of its `rate` of liked steps. For action
+    vectors, it is the mean logged action. Only the components of the head that settings switch on
+    (exposure, values) are learned by gradient, and only by shares of steps.
+
+    With a half-life, a row that is h half-lives older than the last training row counts 2^−h.
+    """
+
+    scored_by: ClassVar[_Scored] = "steps"
+    half_life: Tensor
+
+    def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        if isinstance(config, RecentConfig):
+            self.register_buffer("half_life", torch.tensor(config.half_life or math.inf))
+
+    def make_solver(
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+    ) -> Callable[[], None] | None:
+        """Sets the biases, unless settings add something to learn.
+
+        Raises:
+            InputError: likes of actions that are vectors.
+        """
+        config, head = self.config, self.head
+        if self.scored_by != "steps":
+            if isinstance(head, ItemHead):
+                return lambda: self._set_scores(head, train, validation)
+            raise InputError("item rates need a store of items; this store has vector actions")
+        if config.exposure or config.advantage_weights or config.max_return:
+            return None
+        return lambda: self._set_mean(train)
+
+    @torch.no_grad()
+    def _set_mean(self, train: EpisodeStore) -> None:
+        if isinstance(self.head, VectorHead):
+            actions = torch.from_numpy(train.column(schema.ACTION))
+            mean = actions.double().mean(0).to(self.head.scale) / self.head.scale
+            self.head.out.bias.copy_(torch.atanh(mean.clamp(-_WITHIN, _WITHIN)))
+
+    @torch.no_grad()
+    def _set_scores(
+        self, head: ItemHead, train: EpisodeStore, validation: EpisodeStore | None
+    ) -> None:
+        if not isinstance(self.config, RecentConfig):
+            head.bias.copy_(self.scores_of(TrainingCounts.of(train)))
+            return
+        if validation is not None and not self.config.half_life:
+            self.half_life.fill_(self.best_half_life(train, validation))
+        head.bias.copy_(self.scores_of(count_decayed(train, float(self.half_life))))
+
+    def features(self, windows: Windows) -> Tensor:
+        """(B, K, d) of zeros."""
+        return windows.states.new_zeros(*windows.mask.shape, self.config.dim)
+
+    @classmethod
+    def scores_of(cls, counts: TrainingCounts) -> Tensor:
+        """Log-odds (n_items,) of the rate of likes, or logarithms of the shares of likes."""
+        if cls.scored_by == "rate":
+            return torch.logit(shrink_rates(counts))
+        likes = counts.liked.double() + _SMOOTHING / len(counts.liked)
+        return torch.log(likes / likes.sum()).float()
+
+    @classmethod
+    def best_half_life(
+        cls, train: EpisodeStore, validation: EpisodeStore, liked_of: LikedOf = liked_rewards
+    ) -> float:
+        """The half-life (hours) with the lowest loss on validation episodes; of equal ones, the
+        longest. The loss is the log loss of likes by rates, otherwise that of the liked items."""
+        held_out, losses = TrainingCounts.of(validation, liked_of), list[float]()
+        likes = held_out.liked.double()
+        for hours in HALF_LIVES:
+            scores = cls.scores_of(count_decayed(train, hours, liked_of))
+            if cls.scored_by == "rate":
+                rates = torch.sigmoid(scores.double())
+                nats = likes * rates.log() + (held_out.shown - likes) * torch.log1p(-rates)
+                losses.append(-float(nats.sum() / held_out.shown.sum()))
+            else:
+                losses.append(-float((likes * scores).sum() / likes.sum()))
+        finite = [loss if math.isfinite(loss) else math.inf for loss in losses]
+        return HALF_LIVES[len(losses) - 1 - int(np.argmin(finite[::-1]))]
+
+
+class ItemRatePolicy(PopularPolicy):
+    """`PopularPolicy` by the rate of likes.
+
+    With a tag window of the decision rule, it is the baseline "item click rate with a tag mask".
+    """
+
+    scored_by = "rate"
+
+
+@settings_table("policy")
+class RecentConfig(PolicyConfig):
+    """Settings of clicks and click rate with a half-life."""
+
+    half_life: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Hours after which a training row counts half; 0 chooses them on the validation rows."""
+
+
+class RecentRatePolicy(PopularPolicy):
+    """`PopularPolicy` by the rate of likes, with the half-life that fits validation rows best."""
+
+    Config = RecentConfig
+    chosen = ("half_life",)
+    scored_by: ClassVar[_Scored] = "rate"
+
+
+class RecentClicksPolicy(RecentRatePolicy):
+    """`PopularPolicy` by shares of likes, with the half-life that fits validation rows best."""
+
+    scored_by = "likes"
+
+
+def shrink_rates(counts: TrainingCounts) -> Tensor:
+    """Share of each item's training steps that were liked, (n_items,), shrunk to the mean share.
+
+    `PRIOR` steps at the mean are added to every item, and half a step to both outcomes of the mean,
+    so that no rate is 0 or 1.
+    """
+    impressions, liked = counts.shown.double(), counts.liked.double()
+    mean = (liked.sum() + 0.5) / (impressions.sum() + 1)
+    rates: Tensor = (liked + PRIOR * mean) / (impressions + PRIOR)
+    return rates.float()
+
+
+def count_decayed(
+    train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_rewards
+) -> TrainingCounts:
+    """Counts of shown and liked steps, float64, in which older steps count less.
+
+    Args:
+        train: a view of a store of items.
+        half_life: hours; infinite, or without times in the store, all steps count alike.
+    """
+    n_items = len(train.item_states.embeddings)
+    impressions, liked = np.zeros(n_items), np.zeros(n_items)
+    timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
+    last = int(train.column(schema.TIMESTAMP).max()) if timed else 0
+    names = (schema.ITEM, schema.REWARD, *([schema.TIMESTAMP] if timed else []))
+    for items, rewards, *times in train.column_batches(*names):
+        weights = np.ones(len(items))
+        if timed:
+            weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
+        impressions += np.bincount(items, weights, n_items)
+        liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
+    return TrainingCounts(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
+
+
+@settings_table("policy")
+class ItemKNNConfig(PolicyConfig):
+    """Settings of item-kNN; of the general policy settings, only `context` has an effect."""
+
+    neighbors: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """Neighbours of each item, those with the highest cosines; at most the number of items."""
+
+
+class ItemKNNPolicy(SequencePolicy):
+    """Scores items by their cosines to the session's earlier items, weighted by their rewards.
+
+    Cosines are between columns of the session × item matrix of rewards minus the lowest reward.
+    A bias per item, the log of its share of the training steps, is added to the cosines times a
+    temperature, which is chosen on held-out steps. States and returns are not used.
+    """
+
+    Config = ItemKNNConfig
+    chosen = ("temperature",)
+    config: ItemKNNConfig
+    neighbors: Tensor
+    cosines: Tensor
+    reward_low: Tensor
+    temperature: Tensor
+
+    def __init__(self, config: ItemKNNConfig, sizes: Mapping[str, int]) -> None:
+        require_items("item-knn", sizes)
+        super().__init__(config, sizes)
+        shape = (sizes["items"], min(config.neighbors, sizes["items"]))
+        self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))
+        self.register_buffer("cosines", torch.zeros(shape))
+        self.register_buffer("reward_low", torch.zeros(()))
+        self.register_buffer("temperature", torch.ones(()))
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Find the neighbours of every item; an item is a neighbour of itself."""
+        # Imported here because loading a trained policy does not need scipy.
+        from scipy import sparse
+
+        episodes, steps = train.all_steps()
+        items = train.step_values(schema.ITEM, episodes, steps)
+        rewards = train.step_values(schema.REWARD, episodes, steps)
+        self.reward_low.fill_(float(rewards.min()))
+        shape = (train.n_episodes, len(self.cosines))
+        liked = sparse.csr_matrix((rewards - rewards.min(), (episodes, items)), shape=shape)
+        lengths = np.sqrt(np.asarray(liked.multiply(liked).sum(axis=0))).ravel()
+        columns = (liked @ sparse.diags(1 / np.where(lengths > 0, lengths, 1.0))).tocsc()
+        for start in range(0, shape[1], _ROWS):
+            rows = slice(start, start + _ROWS)
+            cosines = torch.from_numpy((columns[:, rows].T @ columns).toarray()).float()
+            self.cosines[rows], self.neighbors[rows] = cosines.topk(self.cosines.shape[1])
+
+    def make_solver(
+        self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
+    ) -> Callable[[], None]:
+        """Chooses the temperature; everything else is set by `start_from`."""
+        return lambda: None if validation is None else self._choose_temperature(validation)
+
+    @torch.no_grad()
+    def _choose_temperature(self, held_out: EpisodeStore) -> None:
+        """Minimise the negative log-likelihood, convex in the temperature, by bisection."""
+        numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
+        episodes, steps = held_out.locate(numbers)
+        windows = held_out.windows(episodes, steps, self.config.context)
+        windows = windows.to(self.cosines.device)
+        scores, items = self.features(windows)[:, -1], windows.actions[:, -1:]
+        of_shown = scores.gather(1, items).mean()
+        assert isinstance(self.head, ItemHead)
+        low, high = 0.0, _HOTTEST
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            expected = (middle * scores + self.head.bias).softmax(-1).mul(scores).sum(-1).mean()
+            low, high = (low, middle) if expected > of_shown else (middle, high)
+        self.temperature.fill_((low + high) / 2)
+
+    def features(self, windows: Windows) -> Tensor:
+        """Cosines to the earlier items, summed with their rewards as weights, (B, K, n_items).
+
+        Windows must not be normalised.
+        """
+        weights = (windows.rewards - self.reward_low) * windows.mask
+        weighted = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
+        scores = weighted.new_zeros(*windows.mask.shape, len(self.cosines))
+        scores.scatter_add_(-1, self.neighbors[windows.actions], weighted)
+        # Row t sums earlier steps only. Subtracting step t from its sum would round.
+        return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
+
+    def similarity(self, items: Tensor, rewards: Tensor) -> Tensor:
+        """Cosines to some items, summed with their rewards as weights, (B, n_items).
+
+        Args:
+            items: (B, N) int64; −1 for none.
+            rewards: (B, N) of these, in reward units.
+        """
+        weights = (rewards - self.reward_low) * (items >= 0)
+        items = items.clamp(min=0)
+        weighted = (self.cosines[items] * weights.unsqueeze(-1)).flatten(1)
+        scores = weighted.new_zeros(len(items), len(self.cosines))
+        return scores.scatter_add_(1, self.neighbors[items].flatten(1), weighted)
+
+    def _logits(self, windows: Windows) -> Tensor:
+        assert isinstance(self.head, ItemHead)
+        return self.temperature * self.features(windows) + self.head.bias
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean negative log-likelihood (nats) of the logged items, and scalars to log."""
+        value = F.cross_entropy(self._logits(windows)[windows.mask], windows.actions[windows.mask])
+        return value, {"action_loss": value.detach()}
+
+    def action_loss(self, windows: Windows) -> Tensor:
+        """Mean negative log-likelihood (nats) over the windows' last steps."""
+        return F.cross_entropy(self.act(windows), windows.actions[:, -1])
+
+    def act(self, windows: Windows) -> Tensor:
+        """Logits over items at the last step, (B, n_items)."""
+        return self._logits(windows)[:, -1]
+
+
+@settings_table("policy")
+class BPRConfig(PolicyConfig):
+    """Settings of BPR; `dim` is the number of factors, `context` − 1 the items that make a user."""
+
+
+class BPRPolicy(SequencePolicy):
+    """Scores items by the product of their factors with the user's, plus a bias per item.
+
+    A user's factors are the mean of factors of the items that the session liked before, as in FISM
+    (Kabbur et al., 2013), so that users who are new have some as well. The loss is
+    −log σ(s(i) − s(j)) of a liked item i and a uniformly drawn item j. States and returns are not
+    used.
+    """
+
+    Config = BPRConfig
+    config: BPRConfig
+    reward_low: Tensor
+    reward_high: Tensor
+
+    def __init__(self, config: BPRConfig, sizes: Mapping[str, int]) -> None:
+        require_items("bpr", sizes)
+        super().__init__(config, sizes)
+        self.of_history = embedding(sizes["items"], config.dim)
+        draw_normal(self.of_history.weight, std=0.1)
+        for name in ("reward_low", "reward_high"):
+            self.register_buffer(name, torch.zeros(()))
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Set the range of the rewards, by which a step counts as liked."""
+        rewards = train.column(schema.REWARD)
+        self.reward_low.fill_(float(rewards.min()))
+        self.reward_high.fill_(float(rewards.max()))
+
+    def features(self, windows: Windows) -> Tensor:
+        """Factors (B, K, d) of the user before each step."""
+        liked = self._find_liked(windows).unsqueeze(-1)
+        sums = (self.of_history(windows.actions) * liked).cumsum(1)
+        means = sums / liked.cumsum(1).clamp(min=1)
+        return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
+
+    def _find_liked(self, windows: Windows) -> Tensor:
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
+        least = least_liked(self.reward_low, self.reward_high)
+        return ((windows.rewards >= least) & windows.mask).float()
+
+    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean loss over the liked steps of the windows, and scalars to log."""
+        head = self.head
+        assert isinstance(head, ItemHead)
+        normalized, liked = self.normalize(windows), self._find_liked(windows) > 0
+        features, items = self.features(normalized)[liked], windows.actions[liked]
+        exposed = self.exposed(normalized, liked)
+        negative = torch.randint(len(head.bias), items.shape, device=items.device)
+        apart = head.logit(features, items, exposed) - head.logit(features, negative, exposed)
+        value = -F.logsigmoid(apart).sum() / max(1, len(items))
+        return value, {"bpr_loss": value.detach()}
+
+    def action_loss(self, windows: Windows) -> Tensor:
+        """Mean loss over the liked last steps and all items, the validation loss."""
+        liked = self._find_liked(windows)[:, -1] > 0
+        if not bool(liked.any()):
+            return windows.rewards.new_zeros(())
+        scores, items = self.act(windows)[liked], windows.actions[liked, -1:]
+        return -F.logsigmoid(scores.gather(1, items) - scores).mean()

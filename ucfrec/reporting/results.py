@@ -1,0 +1,370 @@
+"""Results of `ucfrec evaluate` and `ucfrec ope` in the report: conclusions, charts and tables.
+
+Conclusions call two results different only if their 95% intervals do not overlap, which is stricter
+than a test of the difference at 5%.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ucfrec.errors import InputError
+from ucfrec.evaluation.diversity import COLUMNS
+from ucfrec.off_policy.estimators import LOGGED, SUITE
+from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
+from ucfrec.reporting.tables import Table, evaluation_line, format_value
+from ucfrec.results.rows import ResultRow, read_results
+from ucfrec.results.statistics import grouped
+from ucfrec.runs.record import Candidate, RunRecord
+
+_METRICS = ("R_avg_pooled", "R_avg_episode", "length", *COLUMNS, "target_return", "episodes")
+_SEEDS = ("seed", "train_seed")
+_STEP = "R_step"
+"""Metric of rows per step, where only some steps of the logs have propensities."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """The estimates of one `ucfrec ope` for one policy."""
+
+    name: str
+    logged: ResultRow | None
+    """Row of the logged sessions' own return."""
+    rows: Sequence[ResultRow]
+    """One row per estimator, without `logged`."""
+    warnings: tuple[str, ...]
+    steps: Sequence[ResultRow] = ()
+    """Rows per step, with that of the logged steps."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The result rows of a report."""
+
+    environments: Mapping[str, Sequence[ResultRow]]
+    """Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
+    estimates: Sequence[Estimates]
+
+
+def read_evidence(paths: Sequence[Path]) -> Results:
+    """Read result rows from JSON lines (files named `.jsonl`) or JSON.
+
+    Raises:
+        InputError: a file is missing or has a row without the required fields.
+    """
+    environments: dict[str, list[ResultRow]] = {}
+    estimates: list[Estimates] = []
+    for path in paths:
+        calls: list[list[ResultRow]] = []
+        for number, row in enumerate(read_results(path), start=1):
+            by_step = row.suite == SUITE and row.metric == _STEP
+            session = row.metric == "R_cum" and (row.interval is not None or row.suite == SUITE)
+            if not (session or by_step):
+                raise InputError(
+                    f"{path}, row {number}, has no R_cum with an interval; give rows that `ucfrec "
+                    "evaluate --json`, `ucfrec ope --json` or `ucfrec demo` wrote"
+                )
+            if row.suite != SUITE:
+                environments.setdefault(row.environment or row.task, []).append(row)
+                continue
+            # The rows of one call of `ucfrec ope` begin with `logged`.
+            if (row.method == LOGGED and not by_step) or not calls:
+                calls.append([])
+            calls[-1].append(row)
+        estimates += map(_group_estimates, calls)
+    return Results(environments, estimates)
+
+
+def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
+    steps = [row for row in group if row.metric == _STEP]
+    sessions = [row for row in group if row.metric != _STEP]
+    logged = next((row for row in sessions if row.method == LOGGED), None)
+    rows = [row for row in sessions if row is not logged]
+    first = rows[0] if rows else group[0]
+    run, choice = first.conditions.get("run"), first.conditions.get("choice")
+    name = first.policy
+    name += "" if choice is None else f" ({choice})"
+    name += "" if run is None else f" of {run}"
+    if first.details.get("selection") is not None:
+        name = f"{first.policy} ({first.details.get('candidate')})"
+    warnings = (row.details.get("warnings") for row in group)
+    texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
+    return Estimates(name, logged, rows, tuple(dict.fromkeys(texts)), steps)
+
+
+def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
+    """The row that the verdict is of, if it has an interval."""
+    quoted = (row for row in rows if row.interval and row.method == row.details.get("verdict_of"))
+    return next(quoted, None)
+
+
+def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
+    """Bar chart and table of each environment."""
+    pictures = []
+    for environment, rows in results.environments.items():
+        names, lines = _name_rows(rows), [evaluation_line(row) for row in rows]
+        columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
+        body = [
+            (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
+            for name, row, line in zip(names, rows, lines, strict=True)
+        ]
+        table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
+        title = f"R_cum in {environment}, with 95% intervals"
+        pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
+    return pictures
+
+
+def draw_estimates(results: Results) -> list[tuple[Chart, Table, Sequence[str]]]:
+    """Chart, table and warnings of each policy with estimates from logs, and of those per step."""
+    pictures: list[tuple[Chart, Table, Sequence[str]]] = []
+    for estimates in results.estimates:
+        logged = [] if estimates.logged is None else [estimates.logged]
+        parts = [
+            _draw_rows(
+                [*logged, *estimates.rows],
+                "sessions",
+                ("mean return of a session", f"Mean return of a session: {estimates.name}"),
+                f"Estimates for {estimates.name}",
+            )
+        ]
+        if estimates.steps:
+            title = f"Mean reward of a step with a propensity: {estimates.name}"
+            parts.append(
+                _draw_rows(
+                    estimates.steps,
+                    "steps",
+                    ("mean reward of a step", title),
+                    f"Estimates per step for {estimates.name}",
+                )
+            )
+        # The warnings come once, below both.
+        pictures += [(*part, ()) for part in parts[:-1]]
+        pictures.append((*parts[-1], estimates.warnings))
+    return pictures
+
+
+def _draw_rows(
+    rows: Sequence[ResultRow], unit: str, value: tuple[str, str], caption: str
+) -> tuple[Chart, Table]:
+    """Chart and table of estimates.
+
+    Args:
+        unit: "sessions" or "steps".
+        value: name of the value, as the head of its column and as the title of the chart.
+    """
+    columns = {
+        f"effective_{unit}": "effective sample",
+        "largest_weight": "share of the largest weight",
+        **({"sessions": "sessions", "overlap": "overlap"} if unit == "sessions" else {}),
+    }
+    names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
+    body = [
+        (name, [format_interval(row), *(format_value(row.as_line().get(key)) for key in columns)])
+        for name, row in zip(names, rows, strict=True)
+    ]
+    head, title = value
+    chart = interval_chart(f"{title}, with 95% intervals", _list_intervals(names, rows))
+    return chart, Table(caption, "", [head, *columns.values()], body)
+
+
+def draw_forest(results: Results) -> Chart | None:
+    """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
+    names, rows = [], []
+    for estimates in results.estimates:
+        if (row := find_quoted(estimates.rows)) is not None:
+            names.append(f"{estimates.name}: {row.method}")
+            rows.append(row)
+    if not rows:
+        return None
+    intervals = [
+        replace(interval, reliable=row.details.get("reliable") is True)
+        for interval, row in zip(_list_intervals(names, rows), rows, strict=True)
+    ]
+    # The line is of one set of logs; several have a line each in their own charts.
+    logged = {policy.logged.value for policy in results.estimates if policy.logged is not None}
+    title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
+    return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
+
+
+def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Interval]:
+    return [
+        Interval(name, row.value, *row.interval)
+        for name, row in zip(names, rows, strict=True)
+        if row.interval is not None
+    ]
+
+
+def format_interval(row: ResultRow) -> str:
+    """The value with its 95% interval, if it has one."""
+    if row.interval is None:
+        return f"{format_value(row.value)} [–]"
+    low, high = row.interval
+    return f"{format_value(row.value)} [{format_value(low)}, {format_value(high)}]"
+
+
+def _name_rows(rows: Sequence[ResultRow]) -> list[str]:
+    """Policy of each row, with the fields that differ if a policy has several rows."""
+    names, lines = [], [evaluation_line(row) for row in rows]
+    for line in lines:
+        same = [row for row in lines if row["policy"] == line["policy"]]
+        fields = ("run", "checkpoint", *_SEEDS)
+        differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
+        parts = [line["policy"], *(f"{key} {_format_cell(line, key)}" for key in differing)]
+        names.append(", ".join(parts))
+    return names
+
+
+def _format_cell(line: Mapping[str, Any], column: str) -> str:
+    value = line.get(column)
+    return str(value) if column in _SEEDS and value is not None else format_value(value)
+
+
+def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
+    """The highest estimated value of the rules that leave so many effective users of the log.
+
+    None where the log has no propensities.
+    """
+    if record.rule is None:
+        return None
+    evidence = [
+        (candidate.evidence.effective_users, candidate.value, candidate.rule,
+         candidate.evidence.interval)
+        for candidate in candidates
+        if candidate.value is not None
+        and candidate.evidence
+        and candidate.evidence.effective_users is not None
+    ]  # fmt: skip
+    highest, curve, body = -math.inf, dict[float, float](), []
+    for users, value, rule, ends in sorted(evidence, key=lambda rule: (-rule[0], -rule[1])):
+        if value > highest:
+            highest = curve[users] = value
+            between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
+            body.append((str(rule), [format_value(value), f"{users:.0f}", between]))
+    if not curve:
+        return None
+    curves = [("best rule", 0, curve)]
+    chosen = [(users, value) for users, value, rule, _ in evidence if rule == record.rule.rule]
+    if chosen:
+        curves.append(("chosen rule", 1, dict(chosen[:1])))
+    title = "Value in the search for a rule, against evidence"
+    chart = line_chart(title, "effective users of the log", curves)
+    head = ["value in the search", "effective users", "off-policy interval"]
+    return chart, Table(title, "rule", head, body)
+
+
+NO_RESULTS = (
+    "No results are given, so the returns of these policies are unknown. A validation loss "
+    "measures how well logged choices are predicted, not the return. Evaluate the policies in a "
+    "simulator (ucfrec evaluate --json) or from logs (ucfrec ope --json), and give the rows with "
+    "--results."
+)
+
+
+@dataclass(frozen=True)
+class _Return:
+    """Return of one policy in one environment, over all its rows."""
+
+    policy: str
+    trained: bool
+    trainings: int
+    """Number of distinct training seeds."""
+    value: float
+    """Mean R_cum over rows."""
+    low: float
+    """Lowest end of the rows' 95% intervals."""
+    high: float
+    """Highest end of the rows' 95% intervals."""
+
+    def above(self, reference: "_Return") -> bool:
+        """Whether all intervals are above all intervals of `reference`."""
+        return self.low > reference.high
+
+    def __str__(self) -> str:
+        return f"{self.policy} ({format_value(self.value)})"
+
+
+def conclude(results: Results) -> list[str]:
+    """One paragraph per environment, then one per policy with estimates from logs."""
+    conclusions = [_conclude(name, rows) for name, rows in results.environments.items()]
+    return conclusions + [_quote(estimates) for estimates in results.estimates] or [NO_RESULTS]
+
+
+def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
+    """One summary per policy and checkpoint, in order of first appearance."""
+    groups = grouped(rows, lambda row: (row.method, row.checkpoint))
+    policies = [policy for policy, _ in groups]
+    return [
+        _Return(
+            policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}",
+            any(row.training_seed is not None for row in group),
+            len({row.training_seed for row in group}),
+            sum(row.value for row in group) / len(group),
+            min(row.interval[0] for row in group if row.interval),
+            max(row.interval[1] for row in group if row.interval),
+        )
+        for (policy, checkpoint), group in groups.items()
+    ]
+
+
+def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
+    returns = _collect_returns(rows)
+    trained = sorted((policy for policy in returns if policy.trained), key=lambda p: -p.value)
+    references = [policy for policy in returns if not policy.trained]
+    if not trained:
+        return f"In {environment}, only built-in policies were evaluated: {_join(references)}."
+    best, *lower = trained
+    ends = f"{format_value(best.low)} to {format_value(best.high)}"
+    value = f"{format_value(best.value)} (95% interval {ends})"
+    if best.trainings > 1:
+        value = f"{format_value(best.value)} in the mean of {best.trainings} trainings "
+        value += f"(their 95% intervals span {ends})"
+    if lower:
+        text = (
+            f"In {environment}, {best.policy} has the highest return of {len(trained)} trained "
+            f"policies: {value} per episode."
+        )
+        if close := [policy for policy in lower if not best.above(policy)]:
+            text += f" Its interval overlaps that of {_join(close)}:"
+            text += " which of them has the higher return is open."
+        else:
+            text += f" Its interval lies above those of the others, the next being {lower[0]}."
+    else:
+        text = f"In {environment}, {best.policy} has a return of {value} per episode."
+    text += _compare(best, references)
+    if max(policy.trainings for policy in trained) < 2:
+        once = "Each policy was" if lower else "It was"
+        text += f" {once} trained once; the spread over training seeds is unknown."
+    return text
+
+
+def _compare(best: _Return, references: Sequence[_Return]) -> str:
+    """Compare the best trained policy with the built-in policies."""
+    if not references:
+        return " No built-in policy (random, logging or best) was evaluated to compare it with."
+    below = [policy for policy in references if best.above(policy)]
+    above = [policy for policy in references if policy.above(best)]
+    unclear = [policy for policy in references if policy not in (*above, *below)]
+    parts = [f"higher than that of {_join(below)}"] if below else []
+    parts += [f"lower than that of {_join(above)}"] if above else []
+    text = f" Its return is {', and '.join(parts)}." if parts else ""
+    if unclear:
+        text += f" Whether it is higher or lower than that of {_join(unclear)} is open: intervals "
+        text += "overlap."
+    return text
+
+
+def _quote(estimates: Estimates) -> str:
+    """What `ucfrec ope` concluded of a policy, as its rows say."""
+    rows = [*estimates.rows, *([estimates.logged] if estimates.logged else [])]
+    verdicts = (row.details["verdict"] for row in rows if row.details.get("verdict"))
+    if (quoted := next(verdicts, None)) is None:
+        return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
+    return f"For {estimates.name}: {quoted}."
+
+
+def _join(policies: Sequence[_Return]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    *names, last = map(str, policies)
+    return f"{', '.join(names)} and {last}" if names else last

@@ -1,0 +1,466 @@
+"""Result rows of all measurements: what was measured, its numbers and their origin.
+
+Rows are lines of JSON in files that several processes may append to. In Python they are a table: a
+data frame, a chart, HTML for notebooks.
+"""
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, field, fields, replace
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+
+from annotated_types import Ge, Lt
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    ConfigDict,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
+
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file, read_json, write_json
+from ucfrec.files.locks import claim, lock_path, remove_leftovers
+from ucfrec.provenance import config_hash
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+CONFIGURATIONS: Final = "configurations.jsonl"
+"""File next to the rows with each of their configurations, by hash."""
+Text = Annotated[str, Strict()]
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Whole = Annotated[int, Strict()]
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON; numbers that are not finite are None."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _finite(value: Any) -> Any:
+    if plain(value) != value:
+        raise ValueError("every number should be finite")
+    return value
+
+
+Json = Annotated[Any, AfterValidator(_finite)]
+Seed = Annotated[int, Strict(), Ge(0), Lt(2**63)]
+Scalar = Text | Annotated[bool, Strict()] | Whole | Number | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowKey:
+    """Identifies a measurement; rows with equal keys are of the same one."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    suite: Text
+    """Benchmark suite or command, e.g. recommendation, control, evaluate, off-policy."""
+    table: Text
+    """Table of the suite."""
+    task: Text
+    """Benchmark task or data file: the training data and the environment of the evaluation."""
+    method: Text
+    """Row of the table."""
+    policy: Text
+    """Policy that `method` uses: a trained one by its kind, or a built-in one of an environment."""
+    training_seed: Seed | None = None
+    log_seed: Seed | None = None
+    """Seed of simulated logs; None for real logs."""
+    evaluation_seed: Seed | None = None
+    """Seed of the evaluated episodes; the same for every training seed."""
+    conditions: Mapping[Text, Scalar] = field(default_factory=dict)
+    """Other settings of the measurement: budget, episodes, distractor, …"""
+    config_hash: Text | None = None
+    """Hash of the training configuration, which `configurations.jsonl` holds."""
+    data_fingerprint: Text | None = None
+    """Fingerprint of the store."""
+
+    def covers(self, row: "ResultRow") -> bool:
+        """Whether `row` is of this measurement; `row` may have more conditions."""
+        values = {name: getattr(self, name) for name in _KEY_FIELDS}
+        return all(getattr(row, name) == value for name, value in values.items()) and all(
+            name in row.conditions and row.conditions[name] == value
+            for name, value in self.conditions.items()
+        )
+
+
+_KEY_FIELDS: Final = tuple(f.name for f in fields(RowKey) if f.name != "conditions")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultRow(RowKey):
+    """One measurement and its numbers; a line of a file of result rows is its `to_json`."""
+
+    metric: Text
+    """Name of the metric that tables show."""
+    metrics: Mapping[Text, Number]
+    """Name to finite number, of the measured metrics only."""
+    interval: tuple[Number, Number] | None = None
+    """95% interval of the value of `metric`, over episodes."""
+    environment: Text | None = None
+    """Simulator of the evaluation."""
+    checkpoint: Text | None = None
+    """Evaluated weights, e.g. "best" or "last"."""
+    target_return: Number | None = None
+    """Target return of the evaluation, in reward units."""
+    rule: Text | None = None
+    """How the policy acts and how its target return was chosen, in words."""
+    details: Mapping[Text, Json] = field(default_factory=dict)
+    """JSON values other than metrics, e.g. the screening result of each dimension."""
+    wall_time_s: Number | None = None
+    """Wall time of the evaluation in seconds; that of the training is `train_wall_time_s`."""
+    peak_memory_mib: Number | None = None
+    """Peak resident memory of the process during the measurement, in MiB."""
+    command: Text = ""
+    commit: Text | None = None
+    versions: Mapping[Text, Text] = field(default_factory=dict)
+
+    @property
+    def value(self) -> float:
+        """Value of `metric`, which tables show."""
+        return self.metrics[self.metric]
+
+    def __getitem__(self, name: str) -> Any:
+        """A field, condition, metric or end of the interval by its name, as in `as_line`."""
+        return self.as_line()[name]
+
+    def extended(self, values: Mapping[str, Any], **changes: Any) -> "ResultRow":
+        """The row with further values: finite numbers are metrics, the rest that is not None are
+        details.
+        """
+        metrics = {
+            name: float(value)
+            for name, value in values.items()
+            if isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and math.isfinite(value)
+        }
+        details = {
+            name: plain(value)
+            for name, value in values.items()
+            if name not in metrics and plain(value) is not None
+        }
+        return replace(
+            self,
+            metrics={**self.metrics, **metrics},
+            details={**self.details, **details},
+            **changes,
+        )
+
+    def of(self, key: RowKey) -> "ResultRow":
+        """The row as a measurement `key`, whose conditions are added to its own."""
+        conditions = {**self.conditions, **key.conditions}
+        return replace(self, **{**vars(key), "conditions": conditions})
+
+    def as_line(self) -> dict[str, Any]:
+        """Every field, condition and metric in one flat mapping, for tables and figures."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NESTED}
+        low, high = self.interval or (None, None)
+        ends = {f"{self.metric}_low": low, f"{self.metric}_high": high}
+        return {**plain, **self.conditions, **ends, **self.metrics}
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as JSON values, without fields at their default."""
+        written = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            factory = f.default_factory
+            default = f.default if factory is MISSING else factory()
+            if value != default:
+                written[f.name] = list(value) if isinstance(value, tuple) else value
+        return written
+
+
+_NESTED: Final = ("conditions", "metrics", "interval", "details", "versions")
+_ROWS: Final = TypeAdapter(ResultRow)
+
+
+def row_from_json(value: object, where: str) -> ResultRow:
+    """Inverse of `ResultRow.to_json`.
+
+    Args:
+        where: origin of `value` (file and line), for messages.
+
+    Raises:
+        InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
+    """
+    if not isinstance(value, dict):
+        raise InputError(f"{where} is not a result row; delete it to measure it again")
+    try:
+        row = _ROWS.validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"{where} is not a result row: {place!r:.60}: {first['msg']}") from None
+    except RecursionError:
+        raise InputError(f"{where} is not a result row: it is nested too deeply") from None
+    if row.metric not in row.metrics:
+        raise InputError(f"{where} is not a result row: its metrics lack {row.metric!r:.60}")
+    return row
+
+
+def read_rows(path: Path) -> list[ResultRow]:
+    """Read the rows of a file; none if it does not exist.
+
+    Raises:
+        InputError: a line is not a result row, or the file is not UTF-8 text.
+    """
+    return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
+
+
+def read_results(path: Path) -> list[ResultRow]:
+    """Read the rows of JSON lines, or of a JSON list (`.json`) as commands write with `--json`.
+
+    Raises:
+        InputError: the file is missing or has other content.
+    """
+    if path.suffix != ".json":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; check the path")
+        return read_rows(path)
+    rows = read_json(path)
+    if not isinstance(rows, list):
+        raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
+    return [row_from_json(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
+
+
+def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
+    """Write rows as a JSON list, for `read_results`."""
+    write_json(path, [row.to_json() for row in rows])
+
+
+def read_lines(path: Path) -> list[tuple[int, object]]:
+    """Read (line number, JSON value) of every line that is not blank; none if there is no file.
+
+    Raises:
+        InputError: a line is not JSON, or the file is not UTF-8 text.
+    """
+    values: list[tuple[int, object]] = []
+    if not path.exists():
+        return values
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not UTF-8 text; name a file of result rows") from None
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            values.append((number, json.loads(line)))
+        except (ValueError, RecursionError):
+            raise InputError(
+                f"{path}, line {number} is not a result row; delete the line to measure it again"
+            ) from None
+    return values
+
+
+def append_rows(
+    path: Path, rows: Sequence[ResultRow], config: Mapping[str, Any] | None = None
+) -> None:
+    """Append rows to a file, and their configuration to `configurations.jsonl` next to it.
+
+    Atomic: after an interruption either all rows are in the file or none. Other processes that
+    append to a file of the folder wait.
+
+    Args:
+        path: file of result rows; made if missing.
+        config: configuration with the rows' `config_hash`; None for rows without one.
+
+    Raises:
+        InputError: a row has a number that is not finite, or another `config_hash` than `config`.
+    """
+    digest = None if config is None else config_hash(config)
+    if any(row.config_hash != digest for row in rows):
+        raise InputError(f"rows for {path} have the hash of another configuration; pass their own")
+    for row in rows:
+        row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
+    configurations = path.with_name(CONFIGURATIONS)
+    with claim(configurations, wait=True):
+        configured = [value for _, value in read_lines(configurations) if isinstance(value, dict)]
+        if config is not None and digest not in [value.get("hash") for value in configured]:
+            _append(configurations, [{"hash": digest, "config": config}])
+    with claim(path, wait=True):
+        _append(path, [row.to_json() for row in rows])
+
+
+def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
+    """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
+    with claim(path, wait=True):
+        rows = read_rows(path)
+        remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
+        if len(remaining) < len(rows):
+            _write(path, b"", [row.to_json() for row in remaining])
+
+
+def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """The last row of each measurement, regardless of data and configuration."""
+    last = {
+        (*(getattr(row, name) for name in _SAME), str(sorted(row.conditions.items()))): row
+        for row in rows
+    }
+    return list(last.values())
+
+
+_SAME: Final = (
+    *("suite", "table", "task", "method", "environment", "checkpoint"),
+    *("training_seed", "log_seed", "evaluation_seed"),
+)
+
+
+@contextmanager
+def benchmarking(path: Path) -> Iterator[None]:
+    """Let no other command measure for the file `path` of result rows.
+
+    Raises:
+        InputError: another command does; the message names it.
+    """
+    with lock_path(path, "filled", part="benchmark"):
+        remove_leftovers(path.parent)
+        yield
+
+
+def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
+    head = path.read_bytes() if path.exists() else b""
+    if head and not head.endswith(b"\n"):
+        head += b"\n"
+    _write(path, head, values)
+
+
+def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
+    with atomic_file(path) as scratch, scratch.open("wb") as file:
+        file.write(head)
+        for value in values:
+            line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+            file.write(line.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+_IDENTITY = ("suite", "table", "command", "commit", "config_hash", "data_fingerprint", "checkpoint")
+"""Fields that a frame leaves out; a file of the rows has them."""
+
+
+class ResultTable:
+    """What is shown of result rows, and how they are kept."""
+
+    rows: Sequence[ResultRow]
+    shown: ClassVar[tuple[str, ...]] = ()
+    """Columns of the HTML table, after `method`; empty for those of the rows' own metrics."""
+
+    def __iter__(self) -> Iterator[ResultRow]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __repr__(self) -> str:
+        return "\n".join([self._table().to_string(index=False), *self._said()])
+
+    def _said(self) -> list[str]:
+        """What to know of the rows, shown below them."""
+        return []
+
+    def to_frame(self) -> "pd.DataFrame":
+        """One row per method: its metrics, each with the ends of its 95% interval where it has one
+        (`NAME_low`, `NAME_high`), then the conditions of the measurement."""
+        import pandas as pd
+
+        frame = pd.DataFrame([_line(row) for row in self.rows])
+        return frame.dropna(axis="columns", how="all")
+
+    def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
+        """Draw one metric of every method with its 95% interval.
+
+        Args:
+            metric: name of a metric; None for the one that the rows are about.
+            ax: matplotlib axes to draw on; None for new ones.
+
+        Raises:
+            InputError: no row has the metric.
+        """
+        from matplotlib import pyplot
+
+        metric, frame = metric or self.rows[0].metric, self.to_frame()
+        names = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        if metric not in names:
+            raise InputError(f"no row has the metric {metric!r}; they have {', '.join(names)}")
+        frame = frame[frame[metric].notna()].iloc[::-1]
+        axes = pyplot.subplots()[1] if ax is None else ax
+        low, high = (
+            frame.get(f"{metric}_{end}", frame[metric]).fillna(frame[metric])
+            for end in ("low", "high")
+        )
+        errors = [frame[metric] - low, high - frame[metric]]
+        axes.errorbar(frame[metric], range(len(frame)), xerr=errors, fmt="o", capsize=3)
+        axes.set_yticks(range(len(frame)), frame["method"].tolist())
+        axes.set_xlabel(f"{metric}, with 95% intervals")
+        return axes
+
+    def save(self, file: Path | str) -> None:
+        """Write the rows as JSON, as `--json` of the commands does, for `report`."""
+        write_results(Path(file), self.rows)
+
+    def _table(self) -> "pd.DataFrame":
+        frame = self.to_frame()
+        columns = self.shown or tuple(dict.fromkeys(n for row in self.rows for n in row.metrics))
+        return frame[["method", *(name for name in columns if name in frame)]]
+
+    def _repr_html_(self) -> str:
+        table = self._table().to_html(index=False, float_format="{:.4g}".format, na_rep="–")
+        return str(table) + "".join(f"<p>{escape(text)}</p>" for text in self._said())
+
+
+def _line(row: ResultRow) -> dict[str, Any]:
+    """The cells of a row: the method, metrics with intervals, conditions, other fields."""
+    ends = {name: ends for name, ends in row.details.get("intervals", {}).items() if ends}
+    if row.interval is not None:
+        ends[row.metric] = row.interval
+    line: dict[str, Any] = {"method": row.method}
+    for name, value in row.metrics.items():
+        line[name] = value
+        if name in ends:
+            line[f"{name}_low"], line[f"{name}_high"] = ends[name]
+    fields = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
+    return {**line, **{name: value for name, value in fields.items() if name not in line}}
+
+
+@dataclass(frozen=True, repr=False)
+class Measured(ResultTable):
+    """Results of one measurement of several methods."""
+
+    rows: Sequence[ResultRow]
+    warnings: Sequence[str] = ()
+    """What makes the numbers less reliable."""
+
+    def _said(self) -> list[str]:
+        return [f"warning: {text}" for text in self.warnings]
+
+
+class Evaluation(Measured):
+    """Returns in a simulator, one row per policy."""
+
+    shown = ("R_cum", "R_cum_low", "R_cum_high", "R_avg_pooled", "length", "coverage", "diversity")
+
+
+class Ranking(Measured):
+    """How policies and baselines rank what users were shown and liked later."""
+
+    shown = (
+        *("hit_rate_shown", "hit_rate_liked", "ndcg_liked", "recall_liked", "gauc", "item_rate"),
+        "coverage",
+    )

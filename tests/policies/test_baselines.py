@@ -67,20 +67,6 @@ def test_the_half_life_is_short_where_tastes_change(
     assert {*hours.values()} <= {*HALF_LIVES}
 
 
-def test_a_run_beats_the_item_rate_where_tastes_change(tmp_path: Path) -> None:
-    store = drifting_store(tmp_path, drifts=True)
-    test, rates = store.split("test"), []
-    liked = test.column("reward") > 0
-    for name in ("item-rate", "recent-rate", "recent-clicks"):
-        run = tmp_path / name
-        train_run(store, run, resolve_config(name, None, ["rule.choose=false"]))
-        policy = TrainedPolicy.load(run).policy
-        best = policy.head.bias.topk(5).indices.numpy()  # type: ignore[operator]
-        shown = np.isin(test.column("item"), best)
-        rates.append(liked[shown].mean())
-    assert min(rates[1:]) > rates[0] + 0.1
-
-
 def test_rates_are_shrunk_to_the_mean() -> None:
     counts = TrainingCounts(torch.tensor([0, 10, 1000]), torch.tensor([0, 10, 100]), 5)
     mean = 110.5 / 1011

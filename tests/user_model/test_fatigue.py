@@ -107,11 +107,9 @@ def shown_of(history: list[tuple[int, float]], reach: int) -> Shown:
 
 def run_by_hand(history: list[tuple[int, float]]) -> int:
     """Length of the run of one main tag that ends with the last step."""
-    tags = [int(TAGS.tags[item]) if reward >= 1.2 else -1 for item, reward in history]
-    length = 0
-    while length < len(tags) and tags[-1] >= 0 and tags[-1 - length] == tags[-1]:
-        length += 1
-    return length
+    tags = np.array([int(TAGS.tags[item]) for item, _ in history])
+    likes = np.array([reward >= 1.2 for _, reward in history], dtype=bool)
+    return on_end(tags, likes & (tags >= 0))
 
 
 @given(steps)

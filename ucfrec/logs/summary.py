@@ -187,11 +187,7 @@ def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution
     edges = np.linspace(low, high, FEW_VALUES + 1)
     within = np.array([-np.inf, *edges[1:-1], np.inf])
     filled = sum(np.histogram(e.rows[schema.REWARD], within)[0] for e in read_episodes(rows, cut))
-    return {
-        "edges": edges.tolist(),
-        "counts": np.asarray(filled).tolist(),
-        "quantiles": quantiles,
-    }
+    return {"edges": edges.tolist(), "counts": np.asarray(filled).tolist(), "quantiles": quantiles}
 
 
 def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:

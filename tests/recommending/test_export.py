@@ -30,7 +30,7 @@ from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.export import (

@@ -19,7 +19,7 @@ from tests.support.served import histories as tagged_histories
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.recommending import histories

@@ -16,8 +16,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import COLUMNS, Catalog, Environment, environment_items
 from ucfrec.processes import random_state_kept

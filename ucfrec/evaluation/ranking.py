@@ -18,13 +18,11 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import LIKED, least_liked, liked_rewards
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import FrameTable
 from ucfrec.results.statistics import group_auc, resampled_ratios
@@ -88,7 +86,7 @@ class LikedExpression:
         source = Path(_ROWS)
         types = tuple((name, "DOUBLE") for name in self._names.values())
         table = FrameTable((source,), types)
-        with engine_in_memory() as connection, explain_errors(connection, (table,), source):
+        with engine((), None) as connection, explain_errors(connection, (table,), source):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
             sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":

@@ -19,7 +19,7 @@ from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.runs.trained_policy import TrainedPolicy

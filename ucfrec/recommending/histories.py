@@ -13,8 +13,8 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories

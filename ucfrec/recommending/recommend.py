@@ -16,7 +16,7 @@ from ucfrec.acting.scorer import Scorer
 from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.rows import mix_bits
 from ucfrec.recommending.histories import Histories

@@ -30,9 +30,9 @@ from typing_extensions import TypedDict
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.rows import DAY_MS, choose_rows
@@ -229,7 +229,7 @@ class RowRewards:
 
     def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
         if self._connection is None:
-            self._connection = self._stack.enter_context(engine_in_memory(_MEMORY))
+            self._connection = self._stack.enter_context(engine((), None, _MEMORY))
         connection, source = self._connection, Path(_ROWS)
         names, columns = {name.casefold() for row in rows for name in row}, {}
         for name in columns_of(connection, self._expression):

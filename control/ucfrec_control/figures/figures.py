@@ -1,11 +1,10 @@
 """`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -149,9 +148,8 @@ def _runs(folder: Path) -> Iterator[_Run]:
 
 def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
     """The runs, of which those with other settings go by their folder's name, less the seed."""
-    settings: dict[tuple[str, str], set[str]] = {}
-    for run in runs:
-        settings.setdefault((run.group, run.method), set()).add(run.settings)
+    of = grouped(runs, lambda run: (run.group, run.method))
+    settings = {named: {run.settings for run in same} for named, same in of.items()}
     return [
         replace(run, method=re.sub(r"(-[0-9a-f]{12})?-\d+$", "", run.path.resolve().name))
         if len(settings[run.group, run.method]) > 1
@@ -161,20 +159,12 @@ def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
 
 
 def _plan_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
-    for run in _first(runs, lambda run: (run.group, run.method)):
+    for run, *_ in grouped(runs, lambda run: (run.group, run.method)).values():
         kinds = ("moves", "states", "acceptance") if diagnostics.is_augmented(run.path) else ()
         for kind in (*kinds, *(("attention",) if run.policy == "ucf" else ())):
             yield _Plan(kind, run.name, partial(_draw_run, run, kind))
-    for run in _first(runs, lambda run: run.group):
-        same = [sibling for sibling in runs if sibling.group == run.group]
-        yield _Plan("training", run.group, partial(_training, same))
-
-
-def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
-    first: dict[Any, _Run] = {}
-    for run in runs:
-        first.setdefault(key(run), run)
-    return first.values()
+    for group, same in grouped(runs, lambda run: run.group).items():
+        yield _Plan("training", group, partial(_training, same))
 
 
 def _draw_run(run: _Run, kind: str) -> Figure:

@@ -22,7 +22,7 @@ from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import draw_steps
 

@@ -32,7 +32,7 @@ from ucfrec.choosing.choice import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Windows
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
 from ucfrec.user_model.reward_report import halve_users

@@ -247,7 +247,7 @@ class UserSimulator:
         expected = self._model.expect(states, history, users, items)
         rewards = self._logged.draw(expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
-        self._sessions = self._sessions.with_step(items, torch.from_numpy(rewards))
+        self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))
         ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)
         going = np.flatnonzero(~ended)
         if len(going) < len(ended):

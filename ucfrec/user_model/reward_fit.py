@@ -21,7 +21,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import (
     CHEAP,

@@ -131,21 +131,6 @@ def test_the_last_features_are_the_last_row_of_all(name: str, sizes: dict[str, i
 
 
 @both_heads
-@pytest.mark.parametrize("name", [*HISTORY, "bc"])
-@pytest.mark.parametrize("t", [2, 5])
-def test_neither_the_action_nor_the_future_moves_its_prediction(
-    name: str, sizes: dict[str, int], t: int
-) -> None:
-    policy, windows = build(name, sizes), random_windows(sizes)
-    changed = changed_at(windows, (slice(None), slice(t, None)), ("actions", "rewards"))
-    changed = changed_at(changed, (slice(None), slice(t + 1, None)), ("states", "returns_to_go"))
-    before, after = predictions(policy, windows), predictions(policy, changed)
-    early = windows.mask & (torch.arange(K) <= t)
-    torch.testing.assert_close(before[early], after[early])
-    assert not torch.allclose(before[:, t + 1 :], after[:, t + 1 :])
-
-
-@both_heads
 @sequence
 @pytest.mark.parametrize("field", ["states", "actions", "returns_to_go"])
 def test_the_past_moves_a_prediction(name: str, sizes: dict[str, int], field: str) -> None:

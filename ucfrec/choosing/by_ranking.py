@@ -213,11 +213,9 @@ class _Candidate:
 
     rule: DecisionRule
     users: IntArray
-    """(M,) whose rows they are."""
     rates: Float64Array
     """(M,) mean rate, in the period, of the items shown."""
     liked: BoolArray
-    """(M,)."""
     hits: BoolArray
     """(M,) whether the row's item is among those shown."""
     ahead: Float64Array

@@ -73,9 +73,7 @@ class Outcomes:
     """What happened in n simulated sessions of one rule."""
 
     returns: Float64Array
-    """(n,), in reward units."""
     lengths: IntArray
-    """(n,), steps."""
     items: IntArray
     """(M,), all that were shown."""
 
@@ -604,5 +602,4 @@ def _mean(values: Float64Array) -> float:
 
 
 def _standard_error(values: Float64Array) -> float:
-    """Of the mean."""
     return float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0

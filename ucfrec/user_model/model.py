@@ -48,7 +48,6 @@ class UserModel:
     session_end: SessionEnd
     session_end_report: SessionEndReport
     fatigue: Fatigue | None
-    """None if the log shows none."""
     main_tags: MainTags
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new."""

@@ -61,7 +61,6 @@ class TrainingUsersReport:
     effects: tuple[EffectTried, ...]
     """The effects that were tried, evaluated on these rows."""
     steps: int
-    """Logged steps that the effects are fitted to."""
     effective_steps: float
     """As many steps of equal weight count as much; `steps` without propensities."""
     weighted: bool
@@ -277,7 +276,6 @@ def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
 
 
 def _select_some(design: Design, seed: int) -> Design:
-    """At most `_WARM_ROWS` of the rows."""
     order = np.random.default_rng(seed).permutation(len(design.items))
     return design.select(torch.from_numpy(order < _WARM_ROWS))
 

@@ -40,7 +40,6 @@ class RewardRows:
     """M logged steps: what was shown to whom, after what, and the reward."""
 
     items: Tensor
-    """(M,) int64."""
     users: Tensor
     """(M,) int64 numbers in the store; −1 if the store does not name its users."""
     history: Shown
@@ -123,13 +122,11 @@ class EffectTried:
     """One effect, with the spread that predicts held-out rewards best."""
 
     effect: str
-    """Its name, one of `EFFECTS`."""
     spread: float
     """Standard deviation, a priori, of what it adds to the linear predictor."""
     gain: float
     """Decrease of the held-out loss by the effect."""
     gain_error: float
-    """Standard error of `gain`."""
     kept: bool
     """Whether it is part of the model: the gain is above its standard error."""
 
@@ -141,9 +138,7 @@ class Calibration:
     predicted: tuple[float, ...]
     """Mean predicted reward of each bin, in reward units."""
     observed: tuple[float, ...]
-    """Mean reward of each bin."""
     count: tuple[int, ...]
-    """Rows of each bin."""
     error: float
     """Expected calibration error: mean over rows of |predicted − observed| of their bins."""
 
@@ -153,9 +148,7 @@ class ItemRewardReport:
     """Quality of the reward model of items, on held-out rows."""
 
     train_rows: int
-    """Number of rows fitted to."""
     validation_rows: int
-    """Number of held-out rows."""
     binary: bool
     """Whether rewards have two values: the loss is the log loss in nats, otherwise half the squared
     error of standardised rewards."""
@@ -166,22 +159,16 @@ class ItemRewardReport:
     item_loss: float
     """Held-out loss of item effects alone."""
     loss: float
-    """Held-out loss of the model."""
     r2: _OrNaN
-    """R² of the expected reward on held-out rows."""
     calibration: Calibration
-    """Predicted and observed rewards."""
     gauc: _OrNaN
     """Probability that a liked step scores higher than another of the same user, by impressions;
     without what all items share at a step (user and state), which does not rank items."""
     gauc_error: _OrNaN
-    """Standard error of `gauc`, over users."""
     item_rate_gauc: _OrNaN
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""
     gauc_gain: _OrNaN
-    """`gauc` minus `item_rate_gauc`."""
     gauc_gain_error: _OrNaN
-    """Standard error of `gauc_gain`, over users."""
     seconds: float
     """Processor time of the fit."""
     new_users: bool = False
@@ -271,7 +258,6 @@ class UserCalibration:
     """Slope and intercept that turn scores into rewards, from validation rows."""
 
     line: Line
-    """Of all rows."""
     halves: tuple[Line, Line]
     """Of the rows of either half of the users; `line` where they are too few."""
     optimism: float
@@ -279,7 +265,6 @@ class UserCalibration:
     optimism_error: float
     """Its standard error over users."""
     weighted: bool
-    """Whether rows are weighted by propensities."""
 
     @classmethod
     def fit(

@@ -55,7 +55,6 @@ class LoggedEnds:
     inputs: Tensor
     """(N, F) of `describe_steps`."""
     ended: BoolArray
-    """(N,)."""
     followed: BoolArray
     """(N,) whether another session of the same user follows; true where users are not named."""
 
@@ -113,9 +112,7 @@ class SessionEndReport:
     """How well session ends are predicted."""
 
     rows: int
-    """Number of training steps fitted to."""
     validation_rows: int
-    """Number of held-out steps."""
     loss: Mapping[str, float]
     """Held-out log loss (nats) of each kind of model: `constant`, `logistic` and `boosted`."""
     gain: Mapping[str, tuple[float, float]]

@@ -159,7 +159,7 @@ class RuleSearch:
         self._many, self._few = (
             LoggedEvidence(problem.scorer, problem.validation, most, seed) for most in _LOGGED_STEPS
         )
-        self.least_users = float(self._config.evidence if self._many.has_propensities else 0)
+        self.least_users = 0.0 if self._many.propensities is None else float(self._config.evidence)
         """Effective users that a rule must leave; 0 without propensities."""
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
@@ -173,7 +173,7 @@ class RuleSearch:
         sessions = self._roll_out(rules, self._store, first, self.problem.seed)
         self._sessions |= sessions
         candidates = [self._summarise(rule, outcomes) for rule, outcomes in sessions.items()]
-        if 0 < self.least_users < self._many.users:
+        if 0 < self.least_users < self._many.n_users:
             candidates = self._add_evidence(candidates)
         return candidates if first == n else self._simulate_rest(candidates, n - first)
 
@@ -278,7 +278,6 @@ class RuleSearch:
         return self.is_supported(candidate) and enough
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates; all that the log supports if it can evaluate none."""
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
         return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
 
@@ -308,7 +307,6 @@ class RuleSearch:
         ]
 
     def _find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The rule that the choice starts from, if it is a candidate."""
         return [candidate for candidate in candidates if candidate.rule == self.problem.start]
 
     def _error(self, first: SimulatedRule, second: SimulatedRule) -> float:
@@ -350,7 +348,7 @@ class RuleSearch:
         returns = [values for values in returns if len(values) == n]
 
         def agrees(rows: Any) -> bool:
-            top = max((values[rows] for values in returns), key=_mean)
+            top = max((values[rows] for values in returns), key=np.sum)
             if len(top) < _FEWEST:
                 return True
             mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
@@ -369,7 +367,7 @@ class RuleSearch:
                 half.append(self._roll_half(rule, number, part=1))
                 for number, half in enumerate(halves)
             ]
-        values = _mean(halves[0].returns), _mean(halves[1].returns)
+        values = float(halves[0].returns.mean()), float(halves[1].returns.mean())
         value = sum(values) / 2
         first, second = (_standard_error(half.returns) for half in halves)
         error = max(math.hypot(first, second) / 2, abs(values[0] - values[1]) / 2)
@@ -595,10 +593,6 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
         *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
-
-
-def _mean(values: Float64Array) -> float:
-    return float(values.mean()) if len(values) else 0.0
 
 
 def _standard_error(values: Float64Array) -> float:

@@ -68,18 +68,15 @@ class RewardRows:
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
         earlier = steps[:, None] - np.arange(1, lags + 1)
         places = episodes[:, None], np.maximum(earlier, 0)
-        items = np.where(earlier >= 0, view.step_values(schema.ITEM, *places), -1)
-        rewards = np.where(earlier >= 0, view.step_values(schema.REWARD, *places), 0)
+        items = np.where(earlier < 0, -1, view.step_values(schema.ITEM, *places)).astype(np.int64)
+        rewards = np.where(earlier < 0, np.float32(0), view.step_values(schema.REWARD, *places))
         users = np.full(view.n_episodes, -1)
         if view.has_users:
             users = view.episode_values(schema.USER).astype(np.int64)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
-            Shown(
-                torch.from_numpy(items.astype(np.int64)),
-                torch.from_numpy(rewards.astype(np.float32)),
-            ),
+            Shown(torch.from_numpy(items), torch.from_numpy(rewards)),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,

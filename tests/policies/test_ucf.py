@@ -267,29 +267,6 @@ def test_lsdt_refuses_a_width_that_does_not_split() -> None:
         LSDTPolicy(LSDTConfig(dim=48), VECTORS)
 
 
-@pytest.mark.parametrize("name", ["dt", "dc", "lsdt"])
-@pytest.mark.parametrize(("field", "first"), [("actions", 11), ("states", 10)])
-def test_a_change_at_step_ten_shows_where_the_official_code_shows_it(
-    name: str, field: str, first: int
-) -> None:
-    torch.manual_seed(0)
-    policy_type = policy_class(name)
-    policy = policy_type(policy_type.Config(), VECTORS).eval()
-    windows = Windows(
-        states=torch.randn(1, 20, S),
-        actions=torch.rand(1, 20, A),
-        rewards=torch.zeros(1, 20),
-        returns_to_go=torch.rand(1, 20),
-        timesteps=torch.arange(20).unsqueeze(0),
-        mask=torch.ones(1, 20, dtype=torch.bool),
-    )
-    values = getattr(windows, field).clone()
-    values[:, 10] += 1.0
-    changed = predictions(policy, replace(windows, **{field: values}))
-    moved = (changed != predictions(policy, windows)).any(-1)[0].nonzero()
-    assert int(moved[0]) == first
-
-
 # The last step of a few windows, by stacked streams.
 
 

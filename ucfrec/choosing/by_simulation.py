@@ -460,7 +460,6 @@ def _describe_choice(users: UserModel) -> str:
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
-    """All candidates of the configuration that the best of the earlier ones leads to."""
     problem, config = search.problem, search.problem.config
     candidates = search.simulate([*_list_unweighted(problem)])
     first = search.best(candidates).rule
@@ -518,7 +517,6 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
 
 
 def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
-    """Rules of the policy alone, the highest temperature first."""
     config, targets, policy = problem.config, problem.targets, problem.scorer.policy
     for temperature in sorted(config.temperatures, reverse=True):
         for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
@@ -529,7 +527,6 @@ def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
 
 
 def _vary(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
-    """The rule with every combination of other values of its fields."""
     for combination in product(*values.values()):
         variant = replace(rule, **dict(zip(values, combination, strict=True)))
         if variant != rule:

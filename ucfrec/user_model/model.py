@@ -155,7 +155,6 @@ class LoggedRewards:
     session, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        """Read those of all steps of a store."""
         parts = [
             np.unique(rewards, return_counts=True)
             for (rewards,) in store.column_batches(schema.REWARD)
@@ -255,7 +254,6 @@ class UserSimulator:
         return rewards.astype(np.float32), going
 
     def _draw_uniform(self) -> Float64Array:
-        """(M,) from [0, 1)."""
         return self._rng.random(self._different)[self._numbers]
 
 

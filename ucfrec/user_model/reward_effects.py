@@ -389,7 +389,6 @@ class EffectSearch:
 
     @property
     def _spreads(self) -> dict[str, float]:
-        """Of the effects that are fitted."""
         return {
             name: _SPREADS[number]
             for name, number in self.kept.items()

@@ -269,7 +269,6 @@ def set_statistics(
 
 
 def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
-    """Load a fitted model; its report, or None if there is no file."""
     if not file.exists():
         return None
     tensors, metadata = load_tensors(file)

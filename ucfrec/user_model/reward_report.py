@@ -32,7 +32,6 @@ SAVED: Final = ConfigDict(extra="forbid")
 _OrNaN = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]
 """Undefined in a log that shows too little, and then null in JSON."""
 Line = tuple[float, float]
-"""Slope and intercept of scores."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,6 @@ class LoggedEnds:
         return cls(inputs, steps == store.lengths[episodes] - 1, followed[episodes])
 
     def select(self, rows: BoolArray) -> "LoggedEnds":
-        """Some of the steps."""
         inputs = self.inputs[torch.from_numpy(rows)]
         return LoggedEnds(inputs, self.ended[rows], self.followed[rows])
 
@@ -180,7 +179,6 @@ class SessionEnd:
     def _fit_best(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
-        """The best kind, fitted to all of `logged`."""
         inputs, ended = logged.inputs, logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
         if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
@@ -198,7 +196,6 @@ class SessionEnd:
         return models[best], report
 
     def _losses(self, rows: LoggedEnds) -> Tensor:
-        """Log losses (N,) of logged steps."""
         odds = self._log_odds(rows.inputs)
         signed = torch.where(torch.from_numpy(rows.ended), -odds, odds)
         return F.softplus(signed.clamp(max=_HIGHEST))
@@ -270,7 +267,6 @@ def _gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
 
 
 def _pad(items: Tensor) -> Tensor:
-    """The `_LAGS` latest of items (M, L)."""
     return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
 

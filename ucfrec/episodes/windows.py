@@ -172,14 +172,16 @@ class Exposed:
     """(M,) returns-to-go in units of the policy's return scale."""
 
     @classmethod
-    def before(cls, windows: Windows, lags: int) -> "Exposed":
-        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
+    def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
+        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window; or
+        for the `steps` where a mask (B, K) is true.
 
         Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
         """
         items = windows.actions.masked_fill(~windows.mask, -1)
         returns = windows.returns_to_go.flatten()
-        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+        exposed = cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+        return exposed if steps is None else exposed.select(steps.flatten())
 
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":

@@ -19,10 +19,14 @@ from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import TrainingUsers, fit_item_reward_model, fit_training_users
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport, whole_sessions
+from ucfrec.user_model.session_end import (
+    SESSIONS,
+    LoggedEnds,
+    SessionEnd,
+    SessionEndReport,
+    whole_sessions,
+)
 
-SESSIONS: Final = "sessions.safetensors"
-"""File of session ends, fatigue and calibration in the model's folder."""
 _MOST_STEPS: Final = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
 _GROUPS: Final = 32
@@ -137,16 +141,6 @@ class UserModel:
         low = float(self.rewarding.reward_low)
         tired = self.fatigue.is_tired(self.main_tags.runs(history)).numpy()
         return np.where(tired, low + self.fatigue.factor * (rewards - low), rewards)
-
-
-def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
-    """The model of session ends in the folder of a user model; None if there is none."""
-    path = folder / SESSIONS
-    if reward is None or not path.exists():
-        return None
-    tensors, _ = load_tensors(path)
-    with damage_explained(path, REMEDY):
-        return SessionEnd.of(reward.likeness, tensors)
 
 
 class LoggedRewards:

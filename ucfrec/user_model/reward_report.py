@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pydantic
 import torch
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import ConfigDict
 from torch import Tensor
 
 from ucfrec import schema
@@ -15,6 +15,7 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
+from ucfrec.files.record import Undefinable
 from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
@@ -29,8 +30,6 @@ _FEWEST: Final = 50
 """Rows of a half from which on a line is fitted to it."""
 SAVED: Final = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
-_OrNaN = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]
-"""Undefined in a log that shows too little, and then null in JSON."""
 Line = tuple[float, float]
 
 
@@ -155,16 +154,16 @@ class ItemRewardReport:
     item_loss: float
     """Held-out loss of item effects alone."""
     loss: float
-    r2: _OrNaN
+    r2: Undefinable
     calibration: Calibration
-    gauc: _OrNaN
+    gauc: Undefinable
     """Probability that a liked step scores higher than another of the same user, by impressions;
     without what all items share at a step (user and state), which does not rank items."""
-    gauc_error: _OrNaN
-    item_rate_gauc: _OrNaN
+    gauc_error: Undefinable
+    item_rate_gauc: Undefinable
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""
-    gauc_gain: _OrNaN
-    gauc_gain_error: _OrNaN
+    gauc_gain: Undefinable
+    gauc_gain_error: Undefinable
     seconds: float
     """Processor time of the fit."""
     new_users: bool = False

@@ -3,6 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,9 +17,13 @@ from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.reward import compare_to_history
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors
+from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
 from ucfrec.user_model.reward_report import SAVED
 
+SESSIONS: Final = "sessions.safetensors"
+"""File of session ends, fatigue and calibration in the model's folder."""
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
 _LAGS: Final = 10
@@ -235,6 +240,16 @@ class SessionEnd:
             return self._trees(inputs)
         standard = (inputs.minimum(tensors["highest"]) - tensors["mean"]) / tensors["scale"]
         return standard @ tensors["weights"] + tensors["bias"]
+
+
+def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
+    """The model of session ends in the folder of a user model; None if there is none."""
+    path = folder / SESSIONS
+    if reward is None or not path.exists():
+        return None
+    tensors, _ = load_tensors(path)
+    with damage_explained(path, REMEDY):
+        return SessionEnd.of(reward.likeness, tensors)
 
 
 def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[str, Tensor]:

@@ -35,7 +35,7 @@ BUILT_IN: Final = {
     "recent-clicks": "baselines:RecentClicksPolicy",
     "recent-rate": "baselines:RecentRatePolicy",
     "bpr": "baselines:BPRPolicy",
-    "boosted": "boosted:BoostedPolicy",
+    "boosted": "baselines:BoostedPolicy",
     "item-knn": "baselines:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }

@@ -120,11 +120,9 @@ class SimulatedRule:
     """Mean return of a session, in reward units."""
     error: float
     length: float
-    """Mean number of steps of a session."""
     support: float
     """Share of decisions on items that the log supports."""
     items: float
-    """Effective number of items shown."""
     evidence: Evidence | None = None
     """What validation sessions show of it; None if no one looked."""
 
@@ -142,7 +140,6 @@ class ValueEstimate:
     error: float
     """Its standard error, over the sessions or between the halves, whichever is larger."""
     halves: tuple[float, float]
-    """The value in the sessions of either half of the users."""
     optimism: tuple[float, float] | None
     """By what share the user model expects too much on validation rows of users that it is not
     calibrated on, and the standard error; None where validation users are new."""

@@ -120,7 +120,6 @@ class EffectTried:
     spread: float
     """Standard deviation, a priori, of what it adds to the linear predictor."""
     gain: float
-    """Decrease of the held-out loss by the effect."""
     gain_error: float
     kept: bool
     """Whether it is part of the model: the gain is above its standard error."""
@@ -150,9 +149,7 @@ class ItemRewardReport:
     effects: tuple[EffectTried, ...]
     """The effects in the order in which they were tried."""
     base_loss: float
-    """Held-out loss of the training mean."""
     item_loss: float
-    """Held-out loss of item effects alone."""
     loss: float
     r2: Undefinable
     calibration: Calibration

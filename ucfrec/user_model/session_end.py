@@ -234,7 +234,6 @@ class SessionEnd:
         return [torch.sigmoid(odds).view(batch, count) for odds in odds_of_each]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
-        """(M,) from inputs (M, F), float64."""
         tensors = self.tensors
         if self._trees is not None:
             return self._trees(inputs)
@@ -333,7 +332,6 @@ class BoostedTrees:
         self._sorted: list[int] = self._numbers.tolist()
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        """Log-odds (M,) float64 from inputs (M, F)."""
         return self._sums(self._bits @ self._compare(inputs))
 
     def replace_input(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:

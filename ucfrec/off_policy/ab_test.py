@@ -222,16 +222,13 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
             for table in tables
         )
         with explain_errors(connection, tables, folder):
-            connection.execute(
-                "CREATE TABLE groups AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
+            groups: dict[str, Any] = connection.execute(
+                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM ("
+                "SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
                 f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
                 "count(arm) OVER (PARTITION BY who) AS arms, "
                 "coalesce(arm = max(arm) OVER (PARTITION BY who), false) AS last "
-                f"FROM ({rows}) GROUP BY who, arm"
-            )
-            groups: dict[str, Any] = connection.sql(
-                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM groups "
-                "ORDER BY groups.arm, groups.who"
+                f"FROM ({rows}) GROUP BY who, arm) AS groups ORDER BY groups.arm, groups.who"
             ).fetchnumpy()
     return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}

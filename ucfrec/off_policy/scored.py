@@ -41,8 +41,7 @@ from ucfrec.off_policy.score import (
     training_options,
 )
 from ucfrec.off_policy.verdict import MOST_LEFT_OUT
-from ucfrec.runs.on_workers import RunOnWorkers
-from ucfrec.runs.trained_policy import ITEMS, TrainedPolicy
+from ucfrec.runs.trained_policy import ITEMS, RunOnWorkers, TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18
 _TESTED_ROWS: Final = 2**20

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,8 +24,6 @@ from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.loop import load_trained
-from ucfrec.logs.expressions import Expression
-from ucfrec.logs.mapping import Dataset, LogMapping
 from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
@@ -34,6 +32,10 @@ from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run,
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd
+
+if TYPE_CHECKING:
+    from ucfrec.logs.expressions import Expression
+    from ucfrec.logs.mapping import Dataset, LogMapping
 
 AUGMENTATION = "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -364,8 +366,8 @@ def _ids(path: Path, column: str) -> Array:
 
 
 def later_logs(
-    trained: TrainedPolicy, paths: Sequence[str | Path], given: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+    trained: TrainedPolicy, paths: Sequence[str | Path], given: "LogMapping"
+) -> "tuple[tuple[Path, ...], LogMapping]":
     """Log files of the dataset that a policy was trained on, whose columns may have plain names.
 
     Args:
@@ -375,6 +377,8 @@ def later_logs(
     Raises:
         InputError: a path is missing, or holds no log of the dataset.
     """
+    from ucfrec.logs.mapping import LogMapping
+
     source = trained.record.data
     # A record may also name a dataset that is not read by an adapter.
     has_adapter = source.dataset in plugin_names("datasets")
@@ -388,16 +392,20 @@ def later_logs(
     return files, replace(given, remembered=LogMapping(columns))
 
 
-def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+def columns_used(trained: TrainedPolicy, mapping: "LogMapping") -> "LogMapping":
     """The mapping with what the run remembers of its training log."""
+    from ucfrec.logs.mapping import LogMapping
+
     mapping = mapping.over(LogMapping.of_source(trained.record.data, str(trained.folder / RUN)))
     if trained.record.observation_size:
         return mapping
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
-def reward_of(trained: TrainedPolicy) -> Expression:
+def reward_of(trained: TrainedPolicy) -> "Expression":
     """The run's reward, an SQL expression over the columns of its logs."""
+    from ucfrec.logs.expressions import Expression
+
     return Expression(trained.record.reward, str(trained.folder / RUN))
 
 

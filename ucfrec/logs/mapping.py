@@ -2,8 +2,6 @@
 
 import glob
 import hashlib
-import tarfile
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -351,6 +349,9 @@ def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
 
 def _unpack(name: str, release: Release, folder: Path) -> Path:
     """The folder with the files of a release."""
+    import tarfile  # with zipfile, only for this
+    import zipfile
+
     target = folder / name
     if target.is_dir():
         return target

@@ -19,8 +19,7 @@ from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
-from ucfrec.files.locks import SCRATCH
+from ucfrec.files.atomic import SCRATCH, read_json
 from ucfrec.logs.engine import engine
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping

@@ -30,7 +30,7 @@ from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, rea
 from ucfrec.logs.sessions import ID_TABLES, write_ids, write_steps
 from ucfrec.logs.summary import note_unknown
 from ucfrec.logs.typed import TypedLog
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""

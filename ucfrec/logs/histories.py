@@ -14,7 +14,7 @@ import pyarrow as pa
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, warn_user
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors, settle_mapping, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows

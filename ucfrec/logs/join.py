@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
-from ucfrec.files.atomic import atomic_file, require_other_files
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import atomic_file, require_other_files, scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined

@@ -39,7 +39,7 @@ from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, read_json
-from ucfrec.logs import LogMapping
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run

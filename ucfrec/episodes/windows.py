@@ -172,14 +172,18 @@ class Exposed:
     """(M,) returns-to-go in units of the policy's return scale."""
 
     @classmethod
-    def before(cls, windows: Windows, lags: int) -> "Exposed":
-        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
+    def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
+        """For every step of B windows of K steps, or those in a mask (B, K), `lags` earlier steps
+        of the same window.
 
         Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
         """
         items = windows.actions.masked_fill(~windows.mask, -1)
-        returns = windows.returns_to_go.flatten()
-        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+        parts = [_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0)]
+        parts.append(windows.returns_to_go.flatten())
+        if steps is not None:
+            parts = [part[steps.flatten()] for part in parts]
+        return cls(*parts)
 
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
@@ -191,10 +195,6 @@ class Exposed:
             nn.functional.pad(recent.rewards, (0, missing)),
             windows.returns_to_go[:, -1],
         )
-
-    def select(self, rows: Tensor) -> "Exposed":
-        """The steps with the given indices, or where a bool mask of the M steps is true."""
-        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:

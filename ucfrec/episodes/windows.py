@@ -54,15 +54,8 @@ class Windows:
         rewards: Tensor,
         returns_to_go: Tensor | None = None,
     ) -> "Windows":
-        """Windows of the given steps; what they have at padding becomes 0.
-
-        Args:
-            numbers: (B, K) int64 number of each step in its episode; below 0 at padding.
-            states: (B, K, S).
-            actions: (B, K, A) vectors or (B, K) items.
-            rewards: (B, K).
-            returns_to_go: (B, K); None for zeros, where a decision sets them.
-        """
+        """Windows of steps with `numbers` (B, K) int64 in their episodes, below 0 at padding, where
+        all becomes 0. Without returns-to-go, a decision sets them."""
         mask = numbers >= 0
         padding = ~mask
 
@@ -243,15 +236,12 @@ class Sessions:
         length: int,
         observations: Tensor | None = None,
     ) -> "Sessions":
-        """The sessions with the given N rows.
+        """The sessions with N rows.
 
         Args:
             owner: (N,) session of each row, 0 to B − 1; sorted.
-            items: (N,) items shown, in order.
-            rewards: (N,) their rewards.
-            users: (B,) see above.
+            items, rewards: (N,) what was shown, in order.
             length: L, items of a session that are kept.
-            observations: (B, K, O) see above.
         """
         counts = np.bincount(owner, minlength=len(users))
         # Places from the end: the latest row is the last column.

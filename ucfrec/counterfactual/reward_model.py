@@ -284,18 +284,16 @@ def read_transitions(
     """Single steps of a view with the actions (M, A) that the reward model is fitted to.
 
     Args:
-        item_rewards: what `EffectsMean` is made of; actions are then (M, D + 1): the vectors of
-            the items, then what of their scores does not depend on the state.
+        item_rewards: what `EffectsMean` is made of, which then reads the actions (M, D + 1).
         actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
     """
     transitions = view.transitions(episodes, steps)
-    chosen = None if actions is None else torch.from_numpy(actions)
     if item_rewards is None:
-        if chosen is None:
+        if actions is None:
             return transitions
-        return replace(transitions, actions=view.action_vectors(chosen))
+        return replace(transitions, actions=view.action_vectors(torch.from_numpy(actions)))
     rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
-    items = rows.items if chosen is None else chosen
+    items = rows.items if actions is None else torch.from_numpy(actions)
     fixed = item_rewards.score_without_state(rows.history, rows.users, items)
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
 

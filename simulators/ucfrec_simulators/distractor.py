@@ -57,10 +57,6 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
     always on. A rate between, such as that of the training logs, distinguishes a policy that is
     misled by the distractor from one that fails when it never occurs.
 
-    Args:
-        env: the environment, with observations (N, O); those of this one are (N, 1 + O).
-        rate: probability that the distractor is on.
-
     Raises:
         InputError: `rate` is not in [0, 1].
     """

@@ -18,8 +18,8 @@ from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.refit import refit
+from ucfrec.runs.run import SharedStages
 from ucfrec.runs.screened import train_screened
-from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=4", "train.validate_every=2", "policy.dim=8", "policy.context=3"]

@@ -17,8 +17,8 @@ from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.files.record import Undefinable
-from ucfrec.fitting.checkpoint import load_trained, load_weights
-from ucfrec.fitting.loop import LoopConfig, fit
+from ucfrec.fitting.checkpoint import load_weights
+from ucfrec.fitting.loop import LoopConfig, fit, load_trained
 from ucfrec.processes import random_state_kept
 from ucfrec.settings import (
     BatchSize,

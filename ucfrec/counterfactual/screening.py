@@ -27,8 +27,7 @@ from torch import Tensor
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
+from ucfrec.processes import progress, random_state_kept
 
 CLIP: Final = 10.0
 """Standardised values beyond this many standard deviations are clipped."""

@@ -14,8 +14,7 @@ from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, Screening, read_record
-from ucfrec.runs.run import train_run
-from ucfrec.runs.shared_stages import OWN, SharedStages
+from ucfrec.runs.run import OWN, SharedStages, train_run
 from ucfrec.runs.start import training_views
 
 SCREENINGS: Final = ("drop", "copies")

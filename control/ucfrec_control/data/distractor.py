@@ -31,9 +31,7 @@ def add_distractor(
     """Write a copy of `store` with a reward-indicating bit appended to every observation.
 
     Args:
-        store: store with observed states; (N, S) observations become (N, S + 1).
-        flip: probability that the bit is flipped; see `ucfrec.episodes.writer.reward_bit`.
-        early: indicate the next reward, as `reward_bit` does.
+        flip, early: as of `ucfrec.episodes.writer.reward_bit`.
 
     Raises:
         InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
@@ -51,17 +49,11 @@ def add_distractor(
 
 
 def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:
-    """Return the store of a D4RL file with a distractor, writing the store if it does not exist.
-
-    Args:
-        data: folder with the HDF5 files.
-        file: name of the HDF5 file without its extension.
-        distractor: key of `DISTRACTORS`.
+    """The store of `FILE.hdf5` in `data` with one of `DISTRACTORS`, written if it does not exist.
 
     Raises:
         InputError: the HDF5 file is missing, invalid or not that of the store, or the distractor
             cannot be added.
-        KeyError: `distractor` is not a key of `DISTRACTORS`.
     """
     clean, path = stores / file, data / f"{file}.hdf5"
     if not clean.exists():
@@ -87,5 +79,4 @@ def _is_of(folder: Path, path: Path) -> bool:
         return True
     with TemporaryDirectory() as scratch:
         rewritten = read_d4rl(path).write_store(Path(scratch) / folder.name)
-    same: bool = rewritten.record.fingerprint == store.record.fingerprint
-    return same
+    return bool(rewritten.record.fingerprint == store.record.fingerprint)

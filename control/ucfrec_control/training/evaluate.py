@@ -14,7 +14,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
@@ -57,8 +57,7 @@ def evaluate_run(
     checkpoint; they and behaviour cloning take no target return.
 
     Args:
-        run: a run folder on a control store.
-        seed: seed of the environments and the bootstrap.
+        seed: of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
             for those of the preset, or that one if the policy was trained to know it.
@@ -133,14 +132,8 @@ def open_environment(
     distractor: float = 0.0,
     **settings: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments that show what was logged where the policy was trained.
-
-    Distractors are fixed to `distractor`.
-
-    Args:
-        wrappers: wrappers around each of them.
-        distractor: value that every distractor is fixed to.
-        settings: arguments of the environment, over those of the data.
+    """`count` environments that show what was logged where the policy was trained, distractors
+    fixed to `distractor`; `settings` are arguments over those of the data.
 
     Raises:
         InputError: `env_id` cannot be made, or its sizes are not those of the training.

@@ -34,8 +34,7 @@ from ucfrec.counterfactual.screening import (
     steps_with_successor,
 )
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
+from ucfrec.processes import progress, random_state_kept
 from ucfrec.runs.start import training_views
 
 _CHUNK = 1024

@@ -24,7 +24,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.shared_stages import SharedStages
+from ucfrec.runs.run import SharedStages
 from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS

@@ -49,8 +49,6 @@ from ucfrec.counterfactual.generators import (
 from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
-    CRMReport,
-    fit_crm,
     read_transitions,
 )
 from ucfrec.episodes.states import ItemStates
@@ -248,19 +246,9 @@ def test_constant_moves_are_collapsed_and_isotropic_ones_are_not() -> None:
 
 
 @functools.cache
-def small_model() -> tuple[CausalRewardModel, CRMReport]:
-    """A reward model that is fitted in seconds."""
-    torch.set_num_threads(1)
-    train, held_out = planted(8_000, 0).transitions, planted(2_000, 1).transitions
-    return fit_crm(
-        train, held_out, CRMConfig(hidden=64, epochs=6), Path(tempfile.mkdtemp()), seed=0
-    )
-
-
-@functools.cache
 def others() -> ActionGenerator:
     """Asks at the steps of the planted store, with the gate of the default settings."""
-    crm, report = small_model()
+    crm, report = fitted()
     steps = view().all_steps()
     training = view().transitions(*steps)
     clusters = state_clusters(training, crm, CSGConfig(), 0)
@@ -283,7 +271,7 @@ def sources(copies: AugmentedEpisodes) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def test_the_other_reward_is_the_models_with_the_disturbance_kept() -> None:
-    exact = deepcopy(small_model()[0]).double()
+    exact = deepcopy(fitted()[0]).double()
     copies, report = asked(others())
     assert report.copies == len(copies.action_source) > 1_000
     s, a, r = sources(copies)
@@ -306,7 +294,7 @@ def test_the_other_reward_is_the_models_with_the_disturbance_kept() -> None:
 
 def test_only_other_actions_of_the_same_cluster_are_asked_about() -> None:
     copies, _ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
-    crm, clusters = small_model()[0], others().clusters
+    crm, clusters = fitted()[0], others().clusters
     logged = view().transitions(*view().all_steps())
     near = clusters.nearest(crm.normalise_states(logged.states)).tolist()
     cluster_of = {
@@ -344,7 +332,7 @@ def test_draws_are_the_seeds() -> None:
 
 def test_no_reward_leaves_the_range_of_the_log() -> None:
     rewards = view().step_values(schema.REWARD, *view().all_steps())
-    exaggerating = deepcopy(small_model()[0])
+    exaggerating = deepcopy(fitted()[0])
     exaggerating.reward_std *= 3
     how = replace(others(), crm=exaggerating, epsilon_r=np.inf)
     made = asked(how)[0].action_reward
@@ -369,14 +357,13 @@ def test_from_views_to_copies(tmp_path: Path) -> None:
     assert len(copies.edit_step) > 0
 
 
-def made(config: AugmentConfig, folder: Path, kind: str = "tangent") -> AugmentedEpisodes:
-    views = planted_store().split("train"), planted_store().split("validation")
-    csg = CSGConfig(kind=kind, epochs=1, hidden=32)  # type: ignore[arg-type]
-    return augment_episodes(*views, QUICK, csg, config, folder, seed=0)[0]
-
-
 def test_asking_about_actions_leaves_the_edits_as_they_are(tmp_path: Path) -> None:
-    without, with_ = (made(replace(LOOSE, actions=n), tmp_path / str(n)) for n in (0, 2))
+    views = planted_store().split("train"), planted_store().split("validation")
+    tables = [(QUICK, CSGConfig(), replace(LOOSE, actions=n)) for n in (0, 2)]
+    without, with_ = (
+        augment_episodes(*views, *table, tmp_path / str(n), seed=0)[0]
+        for n, table in enumerate(tables)
+    )
     for name in ("copy_source", "edit_copy", "edit_step", "edit_state"):
         assert np.array_equal(getattr(without, name), getattr(with_, name))
     assert len(without.action_source) == 0

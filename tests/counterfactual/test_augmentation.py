@@ -63,11 +63,6 @@ QUICK = CRMConfig(epochs=2, hidden=32)
 LOOSE = AugmentConfig(copies=2, epsilon_r=3.0)
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 @functools.cache
 def view() -> EpisodeStore:
     return planted_store().split("train")

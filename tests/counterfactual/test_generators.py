@@ -31,11 +31,6 @@ TANGENT = CSGConfig()
 FAITHFUL = CSGConfig(kind="faithful", epochs=4)
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 def made(config: CSGConfig, folder: Path) -> Generator:
     return make_generator(planted(20_000, 0).transitions, fitted()[0], config, folder, seed=0)
 

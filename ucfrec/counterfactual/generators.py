@@ -26,8 +26,6 @@ from ucfrec.settings import (
 )
 
 _TINY = 1e-12
-
-
 Length = Annotated[float, Field(ge=0, le=1e6)]
 
 

@@ -298,9 +298,6 @@ def read_transitions(
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
 
 
-# The fit.
-
-
 @dataclass(frozen=True)
 class CRMReport:
     """Quality of the reward model, measured on held-out steps."""

@@ -248,8 +248,7 @@ class SequencePolicy(nn.Module, ABC):
         without `policy.exposure`."""
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
-        exposed = Exposed.before(windows, self.head.exposure.lags)
-        return exposed if steps is None else exposed.select(steps.flatten())
+        return Exposed.before(windows, self.head.exposure.lags, steps)
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:

@@ -14,8 +14,8 @@ from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
-from ucfrec.user_model.model import SESSIONS
 from ucfrec.user_model.reward_fit import refit_item_reward_model
+from ucfrec.user_model.session_end import SESSIONS
 
 SHARE: Final = 0.25
 """Steps of a refit, as a share of those that the best weights took."""

@@ -29,9 +29,8 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import config_hash, random_state_kept, versions
 from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
-from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
-from ucfrec.user_model.session_end import SessionEnd
+from ucfrec.user_model.session_end import SessionEnd, load_session_end
 
 if TYPE_CHECKING:
     from ucfrec.logs.expressions import Expression

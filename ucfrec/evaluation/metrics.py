@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from pandas.api.types import infer_dtype, is_list_like, is_numeric_dtype
 
-from ucfrec.arguments import require_whole
 from ucfrec.errors import InputError
 from ucfrec.results.statistics import group_auc
 from ucfrec.schema import ITEM_ID, USER_ID
+from ucfrec.settings import require_whole
 
 _RANK: Final = "rank"
 _PAIR: Final = [USER_ID, ITEM_ID]

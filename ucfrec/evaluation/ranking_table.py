@@ -42,7 +42,7 @@ from ucfrec.policies.baselines import (
     shrink_rates,
 )
 from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy

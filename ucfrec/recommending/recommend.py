@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.windows import Sessions
@@ -21,6 +20,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.histories import Histories
 from ucfrec.logs.rows import mix_bits
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.settings import require_ids, require_whole
 
 RANK: Final = "rank"
 SCORE: Final = "score"

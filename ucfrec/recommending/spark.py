@@ -9,7 +9,6 @@ from pathlib import Path
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arguments import require_whole
 from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
@@ -19,9 +18,8 @@ from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import session_by
 from ucfrec.recommending.recommend import recommend
-from ucfrec.runs.later_logs import columns_used, reward_of
-from ucfrec.runs.on_workers import RunOnWorkers
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy, columns_used, reward_of
+from ucfrec.settings import require_whole
 
 
 def recommend_with_spark(

@@ -16,11 +16,8 @@ from pydantic import Field
 from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json, write_json
-from ucfrec.files.locks import lock_path, remove_leftovers_within
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
-from ucfrec.provenance import provenance
+from ucfrec.files.atomic import lock_path, read_json, remove_leftovers, write_json
+from ucfrec.processes import progress, provenance, random_state_kept
 from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
@@ -74,9 +71,6 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
     `out/training`: repeating the call resumes an interrupted training from its last evaluation,
     with the same results. `out/MANIFEST.json` is written last.
 
-    Args:
-        env_id: Gymnasium environment with a `Box` action space and a step limit.
-
     Returns:
         One row per dataset: `file`, `dataset`, numbers of `trajectories` and `steps`, and
         undiscounted `mean_return`.
@@ -116,14 +110,13 @@ def collect_agent(
 
     Args:
         agent: file that Stable-Baselines3 or its contrib package saved.
-        env_id: Gymnasium environment with vector observations and actions.
-        out: output folder; gets `TASK_AGENT.hdf5` and `MANIFEST.json`.
+        out: gets `TASK_AGENT.hdf5` and `MANIFEST.json`.
         noise: standard deviation of Gaussian noise on the agent's deterministic actions, in halves
             of the action space's range.
         size: steps, rounded up to whole episodes.
 
     Returns:
-        One row: `file`, `dataset`, numbers of `trajectories` and `steps`, `mean_return`.
+        A row as of `collect`.
 
     Raises:
         InputError: the agent cannot be read as data or does not fit the environment, which cannot
@@ -150,14 +143,13 @@ def collect_agent(
 def _filled(out: Path) -> Iterator[None]:
     """Lock a folder that is not complete, without what an interrupted call left in it."""
     with lock_path(out, "filled"):
-        remove_leftovers_within(out)
+        remove_leftovers(out, within=True)
         if (out / "MANIFEST.json").exists():
             raise InputError(f"{out} is complete already; remove it or name another output folder")
         yield
 
 
 def _task(env_id: str) -> str:
-    """Name of an environment in names of datasets."""
     return env_id.split("/")[-1].rsplit("-v", 1)[0].lower()
 
 
@@ -228,7 +220,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
             due = sac.steps // config.every > steps_before // config.every
             if due or sac.steps >= config.steps:
                 _evaluate(training, evaluation_env, seed, config.episodes)
-                bar.update(0, mean_return=training.evaluations[-1]["return"])
+                bar.set_postfix(mean_return=training.evaluations[-1]["return"], refresh=False)
     env.close()
     evaluation_env.close()
     return training
@@ -301,9 +293,6 @@ def roll_out(
     """Roll out whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
-
-    Args:
-        env_id: Gymnasium environment.
 
     Raises:
         InputError: the environment cannot be made.

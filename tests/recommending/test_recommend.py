@@ -321,11 +321,24 @@ def test_times_mean_the_same_here_and_in_prepare(
     assert set(read[0][1]) == set(whole.timestamp)
 
 
+def test_seconds_need_a_mapping_here_and_in_prepare(
+    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
+) -> None:
+    policy, _ = fitted
+    seconds = log.assign(timestamp=log.timestamp / 1000)
+    seconds.to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="is the time in milliseconds"):
+        policy.recommend(seconds)
+    with pytest.raises(InputError, match="is the time in milliseconds"):
+        prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store")
+    mapping = LogMapping({"timestamp": "timestamp * 1000"})
+    pd.testing.assert_frame_equal(policy.recommend(seconds, mapping=mapping), policy.recommend(log))
+    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store")
+    store = EpisodeStore.open(tmp_path / "store")
+    assert set(store.step_values("timestamp", *store.all_steps())) == set(log.timestamp)
+
+
 WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
-    "seconds": (
-        lambda log: log.assign(timestamp=log.timestamp / 1000),
-        "is the time in milliseconds",
-    ),
     "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
     "no user": (lambda log: log.drop(columns="user_id"), "no column 'user_id'"),

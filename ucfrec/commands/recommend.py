@@ -23,7 +23,7 @@ from ucfrec.processes import progress
 
 if TYPE_CHECKING:
     from ucfrec.arrays import Array
-    from ucfrec.recommending.histories import Histories
+    from ucfrec.logs.histories import Histories
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 

@@ -9,7 +9,6 @@ process of one thread, so that a slower machine slows both. Appends a row for ea
 runs/acting_time/results.jsonl, or to --results, and prints a table.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -20,13 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from measured_rows import append_row, make_parser
 
-from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.rows import ResultRow, append_rows
 
 HERE = Path(__file__).resolve().parents[1]
-RESULTS = Path("runs/acting_time/results.jsonl")
+SUITE = "acting-time"
 HISTORY, WARM_UP, BEGIN = 20, 20, 1_700_000_000_000
 
 
@@ -76,11 +74,10 @@ def make_line(run: Path, rng: np.random.Generator, user: int) -> bytes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = make_parser(__doc__, SUITE)
     parser.add_argument("run", type=Path, help="run folder of a policy of items")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
     parser.add_argument("--rounds", type=int, default=300, help="timed requests (300)")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="file of result rows")
     parser.add_argument("options", nargs="*", help="options of `ucfrec recommend`, after --")
     options = parser.parse_args()
     checkouts = [HERE, *([options.against.resolve()] if options.against else [])]
@@ -98,19 +95,11 @@ def main() -> None:
             "p99_ms": float(np.quantile(cpu, 0.99)),
             "p99_wall_ms": float(np.quantile(wall, 0.99)),
         }
-        row = ResultRow(
-            suite="acting-time",
-            table="acting-time",
-            task="one user",
-            method=checkout.name,
-            policy="ucf",
-            conditions={"rounds": options.rounds, "options": " ".join(options.options)},
-            metric="ratio",
-            metrics=metrics,
-            wall_time_s=float(wall.sum() / 1e3),
-            **provenance(),
+        conditions = {"rounds": options.rounds, "options": " ".join(options.options)}
+        about = {"conditions": conditions, "wall_time_s": float(wall.sum() / 1e3)}
+        append_row(
+            options.results, SUITE, "one user", checkout.name, metrics, policy="ucf", **about
         )
-        append_rows(options.results, [row])
         table.append((checkout.name, *(f"{value:.3g}" for value in metrics.values())))
     head = ("checkout", "this one's CPU time / its", "median, ms", "99%, ms", "99%, clock, ms")
     print(markdown_table(head, table))

@@ -12,7 +12,6 @@ Appends a row a command to runs/memory_limits/results.jsonl, or to --results; FO
 logs and stores that it has are not made again.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -23,14 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from measured_rows import append_row, make_parser
 from prepare_time import make_log
 
 from ucfrec.logs.engine import anonymous_bytes, bytes_of
-from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.rows import ResultRow, append_rows
 
-RESULTS = Path("runs/memory_limits/results.jsonl")
+SUITE = "memory-limits"
 OBSERVATION = 1024
 """Numbers of an observation in the wide log."""
 ITEMS, ROWS_PER_USER, BATCH = 500, 20, 20_000
@@ -153,8 +151,8 @@ def commands(folder: Path, kind: str, limit: int) -> dict[str, list[str]]:
     return found
 
 
-def given() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+def main() -> None:
+    parser = make_parser(__doc__, SUITE)
     parser.add_argument("--folder", type=Path, required=True, help="for logs, stores and runs")
     parser.add_argument("--limit", default="1GB", help="of a command's memory (default: 1GB)")
     parser.add_argument(
@@ -169,14 +167,7 @@ def given() -> argparse.Namespace:
         "the limit, beyond which the system kills them (default: none, memory is only watched)",
     )
     parser.add_argument("--commands", nargs="+", default=[], help="no others (default: all)")
-    parser.add_argument(
-        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
-    )
-    return parser.parse_args()
-
-
-def main() -> None:
-    options = given()
+    options = parser.parse_args()
     folder, limit = options.folder, bytes_of(options.limit)
     assert limit is not None
     folder.mkdir(parents=True, exist_ok=True)
@@ -198,27 +189,20 @@ def main() -> None:
                 one = measured(arguments, group)
             store = size_of(folder / f"{kind}-store") / 2**20
             metrics = {
-                "within": float(one.anonymous_mib * 2**20 <= limit),
                 "anonymous_mib": one.anonymous_mib,
+                "within": float(one.anonymous_mib * 2**20 <= limit),
                 "resident_mib": one.resident_mib,
                 "store_mib": store,
                 "log_mib": size_of(folder / f"{kind}-log") / 2**20,
                 "limit_mib": limit / 2**20,
             }
-            row = ResultRow(
-                suite="memory-limits",
-                table="memory-limits",
-                task=f"{kind} log, {rows:,} rows",
-                method=command,
-                policy="ucf",
-                conditions={"rows": rows, "limit": options.limit, "threads": 1, **grouped},
-                metric="anonymous_mib",
-                metrics=metrics,
-                wall_time_s=one.wall_s,
-                peak_memory_mib=one.resident_mib,
-                **provenance(),
-            )
-            append_rows(options.results, [row])
+            about = {
+                "conditions": {"rows": rows, "limit": options.limit, "threads": 1, **grouped},
+                "wall_time_s": one.wall_s,
+                "peak_memory_mib": one.resident_mib,
+            }
+            task = f"{kind} log, {rows:,} rows"
+            append_row(options.results, SUITE, task, command, metrics, policy="ucf", **about)
             cells = (f"{store:,.0f}", f"{one.anonymous_mib:,.0f}", f"{one.resident_mib:,.0f}")
             lines.append((kind, f"{rows:,}", command, *cells, f"{one.wall_s:.0f}"))
     head = ("log", "rows", "command", "store MiB", "anonymous MiB", "resident MiB")

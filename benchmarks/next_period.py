@@ -19,7 +19,7 @@ from ucfrec.commands.cli import main as ucfrec
 from ucfrec.logs.mapping import log_files
 from ucfrec.results.rows import append_rows, read_results
 from ucfrec.runs.record import read_record
-from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import data_folder
 
 SETTINGS = ("train.steps=2000", "policy.dim=64")
 _CHINA = "2022-04-{:02d}T00:00+08:00"

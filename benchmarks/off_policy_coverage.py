@@ -31,13 +31,12 @@ In the last two 19 and 5 verdicts stand. Of 39 more that stood with eight steps 
 replications (seeds from 5000 on), DR held the truth in 35, SNIPS in 37, logged in 37.
 """
 
-import argparse
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured_rows import make_parser
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.off_policy.estimators import Estimate, estimate
@@ -51,7 +50,7 @@ SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")
 LOW, HIGH = 0.90, 0.98
 MOST_WRONG = 0.05
 """Share of verdicts that may stand where intervals do not hold."""
-RESULTS = Path("runs/off_policy/results.jsonl")
+SUITE = "off-policy"
 
 
 @dataclass(frozen=True)
@@ -216,7 +215,7 @@ class Coverage:
     def rows(self, first_seed: int, began: float) -> list[ResultRow]:
         """A result row an estimator, of the replications whose verdict stands."""
         common: dict[str, Any] = {
-            "suite": "off-policy",
+            "suite": SUITE,
             "table": "coverage",
             "task": self.environment,
             "policy": "table",
@@ -250,33 +249,25 @@ def share_interval(share: float, n: int) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def coverage(name: str, replications: int, first_seed: int) -> Coverage:
-    found = []
-    with progress(replications, name, "replications") as bar:
-        for seed in range(first_seed, first_seed + replications):
-            found.append(replication(ENVIRONMENTS[name], seed))
-            bar.update()
-    return Coverage(name, found)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = make_parser(__doc__, SUITE)
     parser.add_argument("--replications", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument(
         "--environments", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS)
     )
-    parser.add_argument(
-        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
-    )
     options = parser.parse_args()
     names = " ".join(f"{name:>7}" for name in SHOWN)
     print(f"{'environment':<24} {'stands':>6} {names}   all")
     for name in options.environments:
-        began = time.perf_counter()
-        found = coverage(name, options.replications, options.first_seed)
-        print(found, flush=True)
-        append_rows(options.results, found.rows(options.first_seed, began))
+        began, found = time.perf_counter(), list[Replication]()
+        with progress(options.replications, name, "replications") as bar:
+            for seed in range(options.first_seed, options.first_seed + options.replications):
+                found.append(replication(ENVIRONMENTS[name], seed))
+                bar.update()
+        coverage = Coverage(name, found)
+        print(coverage, flush=True)
+        append_rows(options.results, coverage.rows(options.first_seed, began))
 
 
 if __name__ == "__main__":

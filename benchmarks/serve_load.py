@@ -26,13 +26,12 @@ from typing import Any
 
 import httpx
 import numpy as np
+from measured_rows import append_row, make_parser
 
-from ucfrec.processes import provenance
 from ucfrec.reporting.tables import markdown_table
-from ucfrec.results.rows import ResultRow, append_rows
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-RESULTS = Path("runs/serve_load/results.jsonl")
+SUITE = "serve-load"
 _SCRIPT = """
 wrk.method, wrk.body = "POST", {body}
 wrk.headers["Content-Type"] = "application/json"
@@ -148,16 +147,13 @@ def measurements(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__, SUITE)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 8, 64])
     parser.add_argument("--workers", type=int, nargs="+", default=[1], help="(default: 1)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each (default: 10)")
     parser.add_argument("--history", type=int, default=20, help="rows of a request (default: 20)")
     parser.add_argument("--threads", type=int, default=1, help="of a forward pass (default: 1)")
-    parser.add_argument(
-        "--results", type=Path, default=RESULTS, help=f"file of result rows (default: {RESULTS})"
-    )
     options, rule = parser.parse_known_args()
     trained = TrainedPolicy.load(options.run)
     tool = "wrk" if shutil.which("wrk") else "httpx"
@@ -166,27 +162,18 @@ def main() -> None:
     for workers in options.workers:
         for clients, found, wall_time_s in measurements(options.run, options, workers, rule):
             lines.append((workers, clients, *(f"{value:,.4g}" for value in found.values())))
-            row = ResultRow(
-                suite="serve-load",
-                table="serve-load",
-                task=f"{len(trained.item_ids):,} items",
-                method=tool,
-                policy=trained.name,
-                conditions={
-                    "clients": clients,
-                    "workers": workers,
-                    "history": options.history,
-                    "threads": options.threads,
-                    "seconds": options.seconds,
+            given = {name: getattr(options, name) for name in ("history", "threads", "seconds")}
+            about = {
+                "conditions": {
+                    **{"clients": clients, "workers": workers, **given},
                     "options": " ".join(rule),
                 },
-                data_fingerprint=trained.record.fingerprint,
-                metric="rate",
-                metrics=found,
-                wall_time_s=wall_time_s,
-                **provenance(),
-            )
-            append_rows(options.results, [row])
+                "policy": trained.name,
+                "data_fingerprint": trained.record.fingerprint,
+                "wall_time_s": wall_time_s,
+            }
+            task = f"{len(trained.item_ids):,} items"
+            append_row(options.results, SUITE, task, tool, found, **about)
     heads = ("workers", "clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
     print(markdown_table((*heads, "CPU of the server, ms", "of the client, ms"), lines))
 

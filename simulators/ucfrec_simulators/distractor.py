@@ -18,8 +18,8 @@ from gymnasium.vector.utils import batch_space
 
 from ucfrec.acting.rollout import Actor, Informed
 from ucfrec.arrays import Array, BoolArray, Float32Array
-from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec_simulators.kuai import kuairand
@@ -41,7 +41,7 @@ def plant_distractor(
         flip: probability that the distractor is the opposite of the reward bit.
 
     Raises:
-        InputError: as `ucfrec.episodes.distractor.reward_bit`, or `out` exists.
+        InputError: as `ucfrec.episodes.writer.reward_bit`, or `out` exists.
     """
     distractor = reward_bit(store, flip, seed)
     planted = np.column_stack([distractor, logged_observations(store)])
@@ -79,10 +79,7 @@ class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):
         self._rate, self._distractors = rate, np.random.default_rng()
 
     def reset(
-        self,
-        *,
-        seed: int | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Start all sessions; `seed` seeds the environment and, independently, the distractors."""
         observations, info = super().reset(seed=seed, options=options)
@@ -125,24 +122,24 @@ class WithoutDistractor:
             self._actor.inform(info)
 
 
-def _hide_distractor(
-    behavior: Callable[[VectorEnv[Any, Any, Any], int], Actor],
-    env: VectorEnv[Any, Any, Any],
-    seed: int,
-) -> WithoutDistractor:
-    assert isinstance(env, DistractorEnv)
-    return WithoutDistractor(behavior(env.env, seed))
-
-
 def with_distractor(simulator: Simulator, rate: float) -> Simulator:
     """The simulator with a distractor that is on with probability `rate` in its environment."""
+
+    def hide_distractor(
+        behavior: Callable[[VectorEnv[Any, Any, Any], int], Actor],
+        env: VectorEnv[Any, Any, Any],
+        seed: int,
+    ) -> WithoutDistractor:
+        assert isinstance(env, DistractorEnv)
+        return WithoutDistractor(behavior(env.env, seed))
+
     state = {OFF: "off", ON: "always on"}.get(rate, f"drawn with probability {rate:g}")
     return replace(
         simulator,
         summary=f"{simulator.summary}; with a distractor, {state}",
         make=lambda num_envs, folder: DistractorEnv(simulator.make(num_envs, folder), rate),
         behaviors={
-            name: partial(_hide_distractor, behavior)
+            name: partial(hide_distractor, behavior)
             for name, behavior in simulator.behaviors.items()
         },
     )

@@ -10,7 +10,6 @@ clicked 5 items with the same main topic within 5 steps likes nothing for 5 step
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
@@ -67,13 +66,10 @@ def _sardine(env: gymnasium.Env[Any, Any]) -> Any:
 
 def _items(env: gymnasium.Env[Any, Any], n_items: int) -> pa.Table:
     """The item table: `item_id`, the vector `topics`, and `tags`, the topics that are not zero."""
-    topics = _sardine(env).item_embedd
-    columns = {
-        ITEM_ID: np.arange(n_items),
-        "topics": list(topics.astype(np.float32)),
-        "tags": [np.flatnonzero(row) for row in topics],
-    }
-    return pa.table({name: pa.array(values) for name, values in columns.items()})
+    topics, ids = _sardine(env).item_embedd, pa.array(np.arange(n_items))
+    tags = pa.array([np.flatnonzero(row) for row in topics])
+    vectors = pa.array(list(topics.astype(np.float32)))
+    return pa.table({ITEM_ID: ids, "topics": vectors, "tags": tags})
 
 
 class GreedyOracle:
@@ -109,10 +105,8 @@ class GreedyOracle:
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[IntArray, Float32Array]:
         """Draw items (N,); returns them and their propensities (N,)."""
         n_items, count = len(self._environment.vectors), len(self._epsilon)
-        greedy, uniform = (
-            self._environment.favourites(),
-            self._generator.integers(n_items, size=count),
-        )
+        greedy = self._environment.favourites()
+        uniform = self._generator.integers(n_items, size=count)
         chosen = np.where(self._generator.random(count) < self._epsilon, uniform, greedy)
         propensities = self._epsilon / n_items + (1 - self._epsilon) * (chosen == greedy)
         return chosen, propensities.astype(np.float32)
@@ -122,12 +116,9 @@ class GreedyOracle:
 
 
 def _simulator(variant: str, summary: str) -> Simulator:
-    def make(num_envs: int, folder: Path | None) -> SardineEnvironment:
-        return SardineEnvironment(variant, num_envs)
-
     return Simulator(
         summary=f"SARDINE: 1,000 items, 100 steps, clicks; {summary} (extra: sardine)",
-        make=make,
+        make=lambda num_envs, folder: SardineEnvironment(variant, num_envs),
         behaviors={
             "random": Uniform,
             "mixture": partial(GreedyOracle, epsilons=EPSILONS),

@@ -1,7 +1,9 @@
 """Base classes of the environments: parallel sessions, each replaced in the step in which it
 ends."""
 
+import os
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,17 +17,19 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
 
+def data_folder(name: str) -> Path:
+    """The folder `name` in `UCFREC_DATA`, by default in `data`."""
+    return Path(os.environ.get("UCFREC_DATA", "data")) / name
+
+
 def draw_categories(
     probabilities: npt.NDArray[np.floating[Any]], uniforms: Float64Array
 ) -> IntArray:
-    """Sample one category per row by inverting the cumulative distribution.
+    """One category per row, (M,) from 0 to K − 1, by inverting the cumulative distribution.
 
     Args:
-        probabilities: (M, K) weights; each row is proportional to its probabilities.
+        probabilities: (M, K); each row is proportional to its probabilities.
         uniforms: (M,) uniform draws from [0, 1).
-
-    Returns:
-        (M,) categories, 0 to K − 1.
     """
     cumulative = np.cumsum(probabilities, axis=1, dtype=np.float64)
     chosen: IntArray = np.argmax(cumulative > uniforms[:, None] * cumulative[:, -1:], axis=1)
@@ -88,10 +92,7 @@ class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):
     def step(
         self, actions: Array
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Take one action in each session.
-
-        Args:
-            actions: (N, A) vectors or (N,) items.
+        """Take one action in each session: vectors (N, A) or items (N,).
 
         Returns:
             Observations (N, O), rewards, terminated and truncated (N,), and info.

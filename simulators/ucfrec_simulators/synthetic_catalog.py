@@ -1,7 +1,5 @@
 """A synthetic catalogue of tagged items with an exit rule and an exactly known optimal policy."""
 
-from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -296,16 +294,12 @@ def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
     return SoftmaxGuess(_catalog(env), seed, **knobs)
 
 
-def _make(num_envs: int, folder: Path | None, mood: float) -> SyntheticCatalog:
-    return SyntheticCatalog(num_envs, mood=mood)
-
-
 def simulator(mood: float = 0.0) -> Simulator:
     """The catalogue as a simulator; with `mood` above 0 its logs are confounded."""
     return Simulator(
         summary="built-in users and 200 tagged items with a known best policy: one item a step, "
         "clicks",
-        make=partial(_make, mood=mood),
+        make=lambda num_envs, folder: SyntheticCatalog(num_envs, mood=mood),
         behaviors={
             "random": Uniform,
             "popular": popular,

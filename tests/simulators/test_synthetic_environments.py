@@ -1,6 +1,8 @@
 """The environments whose best policy is known: that it is, and that it is the best."""
 
+from collections.abc import Callable
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,15 +58,13 @@ def test_an_ended_session_is_replaced_within_the_step(environment: SessionsEnv) 
     assert ends > 10
 
 
-def taobao_pages(count: int) -> tuple[SyntheticTaobao, np.ndarray, np.ndarray]:
+def test_no_action_beats_the_optimal_one_which_depends_on_user_and_page() -> None:
     env = SyntheticTaobao()
-    users, lengths = env.sample_users(count, np.random.default_rng(8))
-    return env, users, np.random.default_rng(9).integers(0, lengths)
-
-
-def test_no_action_beats_the_optimal_one() -> None:
-    env, users, pages = taobao_pages(300)
+    users, lengths = env.sample_users(300, np.random.default_rng(8))
+    pages = np.random.default_rng(9).integers(0, lengths)
     best = env.best_actions(users, pages)
+    assert np.abs(best - env.best_actions(np.roll(users, 1, axis=0), pages)).mean() > 0.1
+    assert np.abs(best - env.best_actions(users, pages + 10)).mean() > 0.03
     top = env.expected_clicks(users, pages, best)
     np.testing.assert_allclose(top, 9.0)
     assert np.abs(best).max() < 1
@@ -75,13 +75,6 @@ def test_no_action_beats_the_optimal_one() -> None:
     observations = np.column_stack([users, np.zeros((300, 2)), pages]).astype(np.float32)
     np.testing.assert_array_equal(env.optimal_actions(observations), best)
     np.testing.assert_array_equal(split_observations(observations)[1], pages)
-
-
-def test_the_optimum_depends_on_user_and_page() -> None:
-    env, users, pages = taobao_pages(300)
-    here = env.best_actions(users, pages)
-    assert np.abs(here - env.best_actions(np.roll(users, 1, axis=0), pages)).mean() > 0.1
-    assert np.abs(here - env.best_actions(users, pages + 10)).mean() > 0.03
 
 
 def test_taobao_behaviors_are_ordered_and_expectations_are_those_played() -> None:
@@ -171,38 +164,24 @@ def test_boredom_against_a_plain_reading_of_the_rule() -> None:
     assert min(bored_ends, capped_ends) > 20
 
 
-def test_clicks_have_the_stated_probability() -> None:
-    env = SyntheticCatalog(4000, n_users=3)
-    env.reset(seed=0)
-    users = env.users.copy()
-    _, clicks, *_ = env.step(np.full(4000, 17))
-    for user in range(3):
-        chance = env.click_probabilities[user, 17]
-        group = clicks[users == user]
-        assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
-
-
-def test_moods_move_all_items_alike_and_are_not_told() -> None:
-    env, calm = (SyntheticCatalog(6000, n_users=3, mood=mood) for mood in (1.5, 0.0))
-    observations, info = env.reset(seed=0)
-    assert observations.shape == calm.reset(seed=0)[0].shape
-    assert info.keys() == calm.reset(seed=0)[1].keys()
-    users, good = env.users.copy(), env.good_mood.copy()
-    assert abs(good.mean() - 0.5) < 4 * np.sqrt(0.25 / 6000)
-    _, clicks, *_ = env.step(np.full(6000, 17))
-    for user in range(3):
-        log_odds = env.logits[user, 17] + np.array([-1.5, 1.5])
-        chances = 1 / (1 + np.exp(-log_odds))
-        assert env.click_probabilities[user, 17] == pytest.approx(chances.mean())
-        for mood, chance in enumerate(chances):
-            group = clicks[(users == user) & (good == mood)]
-            assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
-    best = env.favourites(env.click_probabilities)
-    np.testing.assert_array_equal(best, calm.favourites(calm.click_probabilities))
-    np.testing.assert_array_equal(calm.click_probabilities, 1 / (1 + np.exp(-calm.logits)))
+def test_clicks_have_the_stated_probability_and_moods_are_not_told() -> None:
+    moody, calm = (SyntheticCatalog(6000, n_users=3, mood=mood) for mood in (1.5, 0.0))
+    told = [env.reset(seed=0) for env in (moody, calm)]
+    assert told[0][0].shape == told[1][0].shape
+    assert told[0][1].keys() == told[1][1].keys()
+    assert abs(moody.good_mood.mean() - 0.5) < 4 * np.sqrt(0.25 / 6000)
     assert not calm.good_mood.any()
-    with pytest.raises(InputError, match="mood is -1"):
-        SyntheticCatalog(1, mood=-1.0)
+    for env, moods in ((moody, [-1.5, 1.5]), (calm, [0.0])):
+        users, good = env.users.copy(), env.good_mood.copy()
+        _, clicks, *_ = env.step(np.full(6000, 17))
+        for user in range(3):
+            chances = 1 / (1 + np.exp(-(env.logits[user, 17] + np.array(moods))))
+            assert env.click_probabilities[user, 17] == pytest.approx(chances.mean())
+            for mood, chance in enumerate(chances):
+                group = clicks[(users == user) & (good == mood)]
+                assert abs(group.mean() - chance) < 4 * np.sqrt(chance * (1 - chance) / len(group))
+    best = moody.favourites(moody.click_probabilities)
+    np.testing.assert_array_equal(best, calm.favourites(calm.click_probabilities))
 
 
 def even_tags_and_clicks(mood: float, behavior: str) -> np.ndarray:
@@ -258,33 +237,35 @@ def test_the_mixture_reports_the_propensity_of_the_actor_in_charge() -> None:
     assert np.bincount(actor.component).min() > 50
 
 
-def test_catalog_behaviors_are_ordered() -> None:
+def test_catalog_behaviors_are_ordered_and_items_described() -> None:
     means = {name: played(CATALOG, name, 3000).returns.mean() for name in CATALOG.behaviors}
     assert means["random"] * 2 < means["mixture"] < means["popular"] < means["optimal"] - 2
-
-
-def test_items_are_described() -> None:
     env = SyntheticCatalog(1)
     table = env.item_features().to_pandas()
     assert table["item_id"].tolist() == list(range(200))
     np.testing.assert_array_equal(table.filter(like="tag_").to_numpy().argmax(axis=1), env.tags)
 
 
-def test_bad_input_is_refused() -> None:
-    with pytest.raises(InputError, match="boredom_window"):
-        SyntheticCatalog(1, n_tags=3)
-    with pytest.raises(InputError, match="num_envs"):
-        SyntheticTaobao(0)
-    env = SyntheticCatalog(2)
+@pytest.mark.parametrize(
+    ("use", "says"),
+    [
+        (lambda: SyntheticCatalog(1, n_tags=3), "boredom_window"),
+        (lambda: SyntheticCatalog(1, mood=-1.0), "mood is -1"),
+        (lambda: SyntheticTaobao(0), "num_envs"),
+        (lambda: CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0), "not SyntheticTaobao"),
+        *(
+            (lambda items=items: stepped(SyntheticCatalog(2), items), "from 0 to 199")
+            for items in ([0, 200], [-1, 0], [0.5, 1.0])
+        ),
+        (lambda: stepped(SyntheticTaobao(2), np.zeros((2, 26), np.float32)), "shape"),
+        (lambda: stepped(SyntheticTaobao(2), np.full((2, 27), np.nan, np.float32)), "finite"),
+    ],
+)
+def test_bad_input_is_refused(use: Callable[[], object], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        use()
+
+
+def stepped(env: SessionsEnv, actions: Any) -> object:
     env.reset(seed=0)
-    for wrong in ([0, 200], [-1, 0], [0.5, 1.0]):
-        with pytest.raises(InputError, match="whole numbers from 0 to 199"):
-            env.step(np.array(wrong))
-    pages = SyntheticTaobao(2)
-    pages.reset(seed=0)
-    with pytest.raises(InputError, match="shape"):
-        pages.step(np.zeros((2, 26), dtype=np.float32))
-    with pytest.raises(InputError, match="finite"):
-        pages.step(np.full((2, 27), np.nan, dtype=np.float32))
-    with pytest.raises(InputError, match="not SyntheticTaobao"):
-        CATALOG.behaviors["optimal"](SyntheticTaobao(1), 0)
+    return env.step(np.asarray(actions))

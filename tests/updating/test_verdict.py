@@ -13,8 +13,7 @@ from tests.support.served import trained_run
 from tests.support.tagged import ITEMS
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.logs.append import append_logs
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy

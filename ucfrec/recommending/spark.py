@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories

@@ -18,9 +18,8 @@ from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem
 from ucfrec.counterfactual.augmentation import MODELS, AugmentationReport, augment_episodes
-from ucfrec.episodes.augmented import AUGMENTED, AugmentedEpisodes
-from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import (
     atomic_file,
     atomic_folder,
@@ -303,7 +302,7 @@ def _augment(
 
 def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
-    train, validation = of_people(run.logged), of_people(run.held_out)
+    train, validation = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     simulated, folder = run.record.return_to_go.per_session, run.out / REWARD_MODEL
     inputs = _dependencies(train, validation, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated
@@ -322,8 +321,8 @@ def _choose_rule(
         Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
         users,
         {quantile: trained.target_return(quantile) for quantile in config.quantiles},
-        of_people(run.logged),
-        of_people(run.held_out),
+        run.logged.without_long_sessions(),
+        run.held_out.without_long_sessions(),
         config,
         run.config.seed,
         None if initial is None else rule_to_start_from(initial, trained),

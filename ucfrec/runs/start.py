@@ -17,12 +17,10 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model_fit import INITIAL
-from ucfrec.episodes.augmented import AugmentedEpisodes, TrainingEpisodes
-from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder, write_json
 from ucfrec.fitting import distributed
@@ -177,7 +175,7 @@ def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array
     spaced order statistics are kept, the lowest and highest too.
     """
     if train.has_items:
-        train = of_people(train)
+        train = train.without_long_sessions()
     returns = train.returns
     if not definition.per_session:
         returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)

@@ -6,7 +6,7 @@ policy with the distractor fixed to 1 instead isolates the effect of the distrac
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 from ucfrec.counterfactual.screening import DimensionReport
 from ucfrec.episodes.store import EpisodeStore
@@ -18,6 +18,10 @@ from ucfrec_control.data.distractor import CLEAN
 SHOWN = ("clean", "score", "drop", "score_at_one", "drop_at_one")
 SHOWN_LARGEST = ("method", "at 0", "at 1")
 SHOWN_LOSSES = ("loss", "loss_at_zero", "rise")
+SHOWN_SCREENING = (
+    *("task", "distractor", "flagged", "effect", "reward_effect"),
+    *("true_flagged", "weakest_true"),
+)
 
 
 def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
@@ -31,7 +35,10 @@ def drops(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     Returns:
         One mapping per dataset, method, seed and distractor, with these and the values of `SHOWN`.
     """
-    last = {(_pair(row), row.conditions["distractor"]): row.metrics for row in rows}
+    last = {
+        ((row.task, row.method, row.training_seed), row.conditions["distractor"]): row.metrics
+        for row in rows
+    }
     lines = []
     for (pair, distractor), metrics in last.items():
         clean_metrics = last.get((pair, CLEAN))
@@ -73,36 +80,17 @@ def loss_rises(rows: Sequence[ResultRow]) -> list[Mapping[str, Any]]:
     ]
 
 
-def _pair(row: ResultRow) -> tuple[str, str, int | None]:
-    """Dataset, method and seed, which are equal for a row with and one without a distractor."""
-    return row.task, row.method, row.training_seed
-
-
-SHOWN_SCREENING: Final = (
-    *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
-    *("true_flagged", "weakest_true"),
-)
-SCREENING: Final = (
-    *("task", "distractor", "training_seed", "flagged", "effect", "reward_effect"),
-    *("true_flagged", "weakest_true"),
-)
-SEED: Final = 0
-
-
 def verdicts(dimensions: Sequence[DimensionReport], store: EpisodeStore) -> list[dict[str, Any]]:
     """The verdict of a screening report on each state dimension of `store`."""
     distractors = {
         distractor["dimension"] for distractor in store.record.source.others.get("distractors", [])
     }
+    values = ("dimension", "effect", "p_value", "reward_effect", "reward_p_value")
     return [
         {
-            "dimension": d.dimension,
             "distractor": d.dimension in distractors,
             "flagged": not d.causes,
-            "effect": d.effect,
-            "p_value": d.p_value,
-            "reward_effect": d.reward_effect,
-            "reward_p_value": d.reward_p_value,
+            **{name: getattr(d, name) for name in values},
         }
         for d in dimensions
     ]

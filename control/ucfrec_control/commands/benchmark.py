@@ -18,6 +18,13 @@ from ucfrec_control.benchmark.plan import chosen_rates, score_cells
 from ucfrec_control.commands.options import SuiteOptions
 from ucfrec_control.training.evaluate import CHECKPOINTS
 
+UCF = "ucf"
+"""The method of the main table that the others are compared with."""
+_SHOWN = (
+    *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
+    *("episodes", "validation_loss"),
+)
+
 
 class Benchmark(SuiteOptions):
     """`ucfrec-control benchmark`."""
@@ -55,7 +62,7 @@ def print_scores(rows: Sequence[ResultRow], table: str) -> None:
 
 
 def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
-    print(format_rows([_line(row) for row in rows], _SHOWN))
+    print(format_rows([dict.fromkeys(_SHOWN) | row.as_line() for row in rows], _SHOWN))
     if len(rows) > len(rows := select_best_target(rows)):
         print("\nbelow: of several target returns the best in the mean over seeds, as papers do")
     for checkpoint in CHECKPOINTS:
@@ -75,16 +82,3 @@ def _print_tables(rows: Sequence[ResultRow], table: str) -> None:
         if lines := difference_table(last, reference, name):
             print(f"\n{name} less that of {reference} of the same seed, mean ± standard error")
             print(format_rows(lines, list(lines[0])))
-
-
-UCF = "ucf"
-"""The method of the main table that the others are compared with."""
-_SHOWN = (
-    *("task", "method", "training_seed", "checkpoint", "target_return", "score", "return"),
-    *("episodes", "validation_loss"),
-)
-
-
-def _line(row: ResultRow) -> dict[str, object]:
-    """A row as it is printed; missing values are None, printed as a dash."""
-    return dict.fromkeys(_SHOWN) | row.as_line()

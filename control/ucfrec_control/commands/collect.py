@@ -1,13 +1,12 @@
 """`ucfrec-control collect`: datasets from SAC, which resumes, or from a saved agent."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from ucfrec.commands.options import SEED, Table
 from ucfrec.errors import InputError
 from ucfrec.reporting.tables import format_rows
-from ucfrec_control.data.collect import SHOWN as COLLECTED
-from ucfrec_control.data.collect import CollectConfig, collect, collect_agent
+from ucfrec_control.data.collect import SHOWN, CollectConfig, collect, collect_agent
 
 
 class Collect(Table):
@@ -36,16 +35,8 @@ class Collect(Table):
     def execute(self) -> None:
         """Run `ucfrec-control collect`."""
         if self.agent is not None:
-            rows = [
-                collect_agent(
-                    self.agent,
-                    self.env,
-                    self.out,
-                    noise=self.noise,
-                    size=self.size,
-                    seed=self.seed,
-                )
-            ]
+            acting: dict[str, Any] = {"noise": self.noise, "size": self.size, "seed": self.seed}
+            rows = [collect_agent(self.agent, self.env, self.out, **acting)]
         elif self.noise:
             raise InputError("--noise is for the actions of an --agent")
         else:
@@ -53,5 +44,5 @@ class Collect(Table):
                 steps=self.steps, every=self.every, fraction=self.fraction, size=self.size
             )
             rows = collect(self.env, self.out, self.seed, config)
-        print(format_rows(rows, COLLECTED))
+        print(format_rows(rows, SHOWN))
         print(f"\nfiles: {self.out}")

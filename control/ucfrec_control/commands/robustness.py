@@ -41,5 +41,4 @@ def print_robustness(rows: Sequence[ResultRow]) -> None:
     print(f"{format_rows(largest_drops(rows), SHOWN_LARGEST)}\n")
     # A store is screened once, whatever method and seed it is for.
     screened = {(line["task"], line["distractor"]): line for line in screening_rows(rows)}
-    columns = [name for name in SHOWN_SCREENING if name != "training_seed"]
-    print(format_rows(list(screened.values()), columns))
+    print(format_rows(list(screened.values()), SHOWN_SCREENING))

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import BoolArray, Float32Array
 from ucfrec.errors import InputError
+from ucfrec_control.data.d4rl import first_line
 
 _MOST_BYTES: Final = {"policy.pth": 2**30, "data": 2**26}
 """Sizes beyond which a file is refused before it is unpacked."""
@@ -104,31 +105,32 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)
     expected = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
-    if unexpected := sorted(
-        n for n in tensors.keys() - expected if n.startswith(("actor.", "features"))
-    ):
-        raise _refusal(
-            file, f"its network has {unexpected[0]}, which is not a layer of a perceptron"
-        )
+    others = [n for n in tensors if n not in expected and n.startswith(("actor.", "features"))]
+    if others:
+        found = min(others)
+        raise _refusal(file, f"its network has {found}, which is not a layer of a perceptron")
     for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
         if not _is_plain(tensors[name]):
             raise _refusal(file, f"{name} is not of finite numbers stored one by one")
     layers = [tensors[f"{name}.weight"] for name in names]
     for (name, first), (next_name, second) in pairwise(zip(names, layers, strict=True)):
         if first.shape[0] != second.shape[1]:
-            raise _refusal(
-                file,
-                f"{name} has {first.shape[0]} outputs, {next_name} {second.shape[1]} inputs",
-            )
-    sizes = (layers[0].shape[1], layers[-1].shape[0])
-    if sizes != (observations, space.shape[0]):
+            sizes = f"{name} has {first.shape[0]} outputs, {next_name} {second.shape[1]} inputs"
+            raise _refusal(file, sizes)
+    taken, given = layers[0].shape[1], layers[-1].shape[0]
+    if (taken, given) != (observations, space.shape[0]):
         raise InputError(
-            f"{file}: the agent maps observations of size {sizes[0]} to actions of size {sizes[1]};"
-            f" the environment's are {observations} and {space.shape[0]}"
+            f"{file}: the agent maps observations of size {taken} to actions of size {given}; the "
+            f"environment's are {observations} and {space.shape[0]}"
         )
     kwargs = settings.get("policy_kwargs")
     kwargs = kwargs if isinstance(kwargs, dict) else {}
-    activation = _activation(file, kwargs, kind)
+    activation = kind.activation
+    if "activation_fn" in kwargs:  # of which JSON keeps the class's name
+        title = str(kwargs["activation_fn"]).removesuffix("'>").rpartition(".")[2]
+        if title not in _ACTIVATIONS:
+            raise _refusal(file, f"its activation is {kwargs['activation_fn']!r}")
+        activation = _ACTIVATIONS[title]
     parts: list[nn.Module] = []
     for name, weight in zip(names, layers, strict=True):
         layer = nn.Linear(weight.shape[1], weight.shape[0])
@@ -151,7 +153,9 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
         raise InputError(f"{file} does not exist; name an agent that Stable-Baselines3 saved")
     try:
         with zipfile.ZipFile(file) as archive:
-            parts = {name: _unpack(archive, name) for name in _MOST_BYTES}
+            for name in _MOST_BYTES:
+                _require_unpackable(name, archive.getinfo(name).file_size)
+            parts = {name: archive.read(name) for name in _MOST_BYTES}
         network = io.BytesIO(parts["policy.pth"])
         if zipfile.is_zipfile(network):
             with zipfile.ZipFile(network) as archive:
@@ -166,14 +170,8 @@ def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
         ):
             raise ValueError("its parts are not those of an agent")
     except Exception as error:  # zipfile, json and PyTorch's unpickler raise many types
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise _refusal(file, f"it cannot be read as data ({reason})") from None
+        raise _refusal(file, f"it cannot be read as data ({first_line(error)})") from None
     return tensors, settings
-
-
-def _unpack(archive: zipfile.ZipFile, name: str) -> bytes:
-    _require_unpackable(name, archive.getinfo(name).file_size)
-    return archive.read(name)
 
 
 def _require_unpackable(name: str, size: int) -> None:
@@ -190,16 +188,14 @@ def _kind_of(file: Path, tensors: Mapping[str, Tensor]) -> tuple[_Kind, list[str
         names = [*(f"{kind.hidden}.{number}" for number in numbers), *last[:1]]
         if not numbers or (kind.last and not last):
             continue
-        if all(_is_layer(tensors, name) for name in names):
+        weights = [tensors[f"{name}.weight"] for name in names]
+        biases = [tensors.get(f"{name}.bias") for name in names]
+        if all(
+            weight.ndim == 2 and bias is not None and bias.shape == weight.shape[:1]
+            for weight, bias in zip(weights, biases, strict=True)
+        ):
             return kind, names
     raise _refusal(file, "its tensors are not those of a perceptron with vector actions")
-
-
-def _is_layer(tensors: Mapping[str, Tensor], name: str) -> bool:
-    weight, bias = (tensors.get(f"{name}.{part}") for part in ("weight", "bias"))
-    if weight is None or bias is None:
-        return False
-    return weight.ndim == 2 and bias.shape == weight.shape[:1]
 
 
 def _is_plain(tensor: Tensor) -> bool:
@@ -209,17 +205,6 @@ def _is_plain(tensor: Tensor) -> bool:
     if not (tensor.is_floating_point() and tensor.is_contiguous() and tensor.numel()):
         return False
     return bool(tensor.isfinite().all())
-
-
-def _activation(file: Path, kwargs: Mapping[str, Any], kind: _Kind) -> type[nn.Module]:
-    """What `policy_kwargs` calls the activation, of which JSON keeps the class's name."""
-    activation = kwargs.get("activation_fn")
-    if activation is None and "activation_fn" not in kwargs:
-        return kind.activation
-    title = str(activation).removesuffix("'>").rpartition(".")[2]
-    if title not in _ACTIVATIONS:
-        raise _refusal(file, f"its activation is {activation!r}")
-    return _ACTIVATIONS[title]
 
 
 def _refusal(file: Path, reason: str) -> InputError:

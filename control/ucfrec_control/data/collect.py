@@ -1,7 +1,8 @@
 """Collect datasets with SAC by D4RL's protocol (Fu et al., 2020, section 5) or a saved agent."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -25,6 +26,7 @@ from ucfrec_control.data.trajectories import PACKAGES, Trajectories
 from ucfrec_control.environments.environments import SIDE_BY_SIDE, make_env
 
 SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
+_COLUMNS: Final = ("observations", "actions", "rewards")
 
 
 @settings_table("")
@@ -42,7 +44,7 @@ class CollectConfig:
     size: Count = 1_000_000
     """Steps rolled out of `medium` and of `expert`, rounded up to whole episodes."""
     sac: SacConfig = field(default_factory=SacConfig)
-    """The sac."""
+    """Of the training."""
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
@@ -81,9 +83,27 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             process, the environment cannot be created or has no step limit, its action space is not
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
-    with lock_path(out, "filled"):
-        _require_incomplete(out)
-        return _collect(env_id, out, seed, config)
+    with _filled(out):
+        training = _train(env_id, out / "training", seed, config)
+        medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
+        parts = {
+            "medium": _roll_out(training, medium, env_id, seed, config.size),
+            "medium-replay": _replay(training, medium, env_id),
+            "expert": _roll_out(training, expert, env_id, seed, config.size),
+        }
+        parts["medium-expert"] = _join(parts["medium"], parts["expert"])
+        recorded = {
+            "env_id": env_id,
+            "algorithm": "SAC",
+            "seed": seed,
+            "fraction": config.fraction,
+            "random_return": training.random_return,
+        }
+        for name, index in (("medium", medium), ("expert", expert)):
+            for key, value in training.evaluations[index].items():
+                recorded[f"{name}_{key}"] = value
+        names = {f"{_task(env_id)}_{kind}-sac": part for kind, part in parts.items()}
+        return _write(out, names, recorded, (*PACKAGES, "stable-baselines3"))
 
 
 def collect_agent(
@@ -109,8 +129,7 @@ def collect_agent(
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
-    with lock_path(out, "filled"):
-        _require_incomplete(out)
+    with _filled(out):
         env = make_env(env_id, 1)
         shape, space = env.single_observation_space.shape or (), env.single_action_space
         env.close()
@@ -124,36 +143,14 @@ def collect_agent(
         return row
 
 
-def _require_incomplete(out: Path) -> None:
-    """Check that a folder is not complete, and remove what an interrupted call left in it."""
-    remove_leftovers(out, within=True)
-    if (out / "MANIFEST.json").exists():
-        raise InputError(f"{out} is complete already; remove it or name another output folder")
-
-
-def _collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[dict[str, Any]]:
-    """`collect` into a folder that no other process fills."""
-    training = _train(env_id, out / "training", seed, config)
-    medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
-    parts = {
-        "medium": _roll_out(training, medium, env_id, seed, config.size),
-        "medium-replay": _replay(training, medium, env_id),
-        "expert": _roll_out(training, expert, env_id, seed, config.size),
-    }
-    parts["medium-expert"] = _join(parts["medium"], parts["expert"])
-    recorded = {
-        "env_id": env_id,
-        "algorithm": "SAC",
-        "seed": seed,
-        "fraction": config.fraction,
-        "random_return": training.random_return,
-        "medium_return": training.evaluations[medium]["return"],
-        "medium_steps": training.evaluations[medium]["steps"],
-        "expert_return": training.evaluations[expert]["return"],
-        "expert_steps": training.evaluations[expert]["steps"],
-    }
-    names = {f"{_task(env_id)}_{kind}-sac": part for kind, part in parts.items()}
-    return _write(out, names, recorded, (*PACKAGES, "stable-baselines3"))
+@contextmanager
+def _filled(out: Path) -> Iterator[None]:
+    """Lock a folder that is not complete, without what an interrupted call left in it."""
+    with lock_path(out, "filled"):
+        remove_leftovers(out, within=True)
+        if (out / "MANIFEST.json").exists():
+            raise InputError(f"{out} is complete already; remove it or name another output folder")
+        yield
 
 
 def _task(env_id: str) -> str:
@@ -185,17 +182,6 @@ def _write(
     return rows
 
 
-def _claim(file: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings to `file`, or check that an existing file has the same settings."""
-    if not file.exists():
-        write_json(file, settings)
-    elif read_json(file) != settings:
-        raise InputError(
-            f"{file.parent} was started with other settings; repeat those of {file.name}, or name "
-            "another output folder"
-        )
-
-
 @dataclass(frozen=True)
 class _Training:
     sac: SacTraining
@@ -209,7 +195,7 @@ class _Training:
 
     @property
     def checkpoint(self) -> Path:
-        return self.folder / "checkpoint.safetensors"
+        return self.folder / "checkpoint.pt"
 
 
 def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Training:
@@ -218,14 +204,20 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     if limit is None:
         raise InputError(f"{env_id} has no step limit, so its episodes may never end")
     sac = SacTraining(env, seed, config.steps + limit, config.sac)
-    _claim(folder / "config.json", {"env": env_id, "seed": seed, **asdict(config)})
+    claimed, settings = folder / "config.json", {"env": env_id, "seed": seed, **asdict(config)}
+    if not claimed.exists():
+        write_json(claimed, settings)
+    elif read_json(claimed) != settings:
+        raise InputError(
+            f"{folder} was started with other settings; repeat those of {claimed.name}, or name "
+            "another output folder"
+        )
     evaluation_env = make_env(env_id, min(config.episodes, SIDE_BY_SIDE))
-    random_return = _mean_return(
-        evaluation_env, _Uniform(evaluation_env, seed), config.episodes, (seed, 2)
-    )
+    uniform = _Uniform(evaluation_env, seed)
+    random_return = _mean_return(evaluation_env, uniform, config.episodes, (seed, 2))
     training = _Training(sac, folder, random_return, [])
     if training.checkpoint.exists():
-        training.evaluations.extend(sac.load(training.checkpoint)["evaluations"])
+        training.evaluations.extend(sac.load(training.checkpoint))
     with progress(config.steps, "train SAC", "steps", done=sac.steps) as bar:
         while sac.steps < config.steps:
             steps_before = sac.steps
@@ -245,14 +237,11 @@ def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, epi
     mean_return = _mean_return(env, sac, episodes, (seed, 3, index))
     training.evaluations.append({"steps": sac.steps, "return": mean_return})
     sac.save_policy(training.policy(index), training.evaluations[-1])
-    sac.save(training.checkpoint, {"evaluations": training.evaluations})
+    sac.save(training.checkpoint, training.evaluations)
 
 
 def _mean_return(
-    env: VectorEnv[Any, Any, Any],
-    actor: Actor,
-    episodes: int,
-    key: tuple[int, ...],
+    env: VectorEnv[Any, Any, Any], actor: Actor, episodes: int, key: tuple[int, ...]
 ) -> float:
     result = rollout(env, actor, episodes, seed_all(*key), describe="evaluate")
     return float(result.returns.mean())
@@ -289,9 +278,7 @@ def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
     replay = training.sac.replay(training.evaluations[medium]["steps"])
     ends = np.flatnonzero(replay["terminals"] | replay["timeouts"])
     return Trajectories(
-        observations=replay["observations"],
-        actions=replay["actions"],
-        rewards=replay["rewards"],
+        **{name: replay[name] for name in _COLUMNS},
         lengths=np.diff(ends, prepend=-1),
         terminated=replay["terminals"][ends],
         final_observations=replay["next_observations"][ends],
@@ -334,20 +321,20 @@ def roll_out(
 
 def _sort_by_episode(steps: list[Step], env_id: str) -> Trajectories:
     """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
+    order = np.argsort(np.concatenate([step.episodes for step in steps]), kind="stable")
 
     def column(name: str) -> Array:
-        return np.concatenate([getattr(step, name) for step in steps])
+        return np.concatenate([getattr(step, name) for step in steps])[order]
 
-    order = np.argsort(column("episodes"), kind="stable")
-    terminated, truncated = column("terminated")[order], column("truncated")[order]
-    ends = np.flatnonzero(terminated | truncated)
+    terminated = column("terminated")
+    ends = np.flatnonzero(terminated | column("truncated"))
     return Trajectories(
-        observations=column("observations")[order].astype(np.float32),
-        actions=column("actions")[order].astype(np.float32),
-        rewards=column("rewards")[order].astype(np.float32),
+        **{
+            name: column(name).astype(np.float32) for name in ("observations", "actions", "rewards")
+        },
         lengths=np.diff(ends, prepend=-1),
         terminated=terminated[ends],
-        final_observations=column("next_observations")[order][ends].astype(np.float32),
+        final_observations=column("next_observations")[ends].astype(np.float32),
         source=_source(env_id),
     )
 
@@ -358,7 +345,7 @@ def _join(*parts: Trajectories) -> Trajectories:
     def column(name: str) -> Any:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    names = ("observations", "actions", "rewards", "lengths", "terminated", "final_observations")
+    names = (*_COLUMNS, "lengths", "terminated", "final_observations")
     return Trajectories(**{name: column(name) for name in names}, source=parts[0].source)
 
 

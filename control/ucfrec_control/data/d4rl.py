@@ -1,24 +1,30 @@
-"""D4RL's HDF5 layout: read in all its variants, written in one.
+"""D4RL's HDF5 layout: read in all its variants, written in one; and untrusted HDF5 files.
 
 Source: https://github.com/Farama-Foundation/D4RL, `offline_env.py`; the files of this project's
-data folder have the same layout.
+data folder have the same layout. Of a file that is read, nothing outside it is opened, and nothing
+is taken that is larger than it can hold.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Final
 
 import h5py
 import numpy as np
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.errors import InputError, damage_explained
+from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.files.atomic import atomic_file, read_json
-from ucfrec_control.data.hdf5 import open_hdf5, read_numbers
-from ucfrec_control.data.trajectories import Trajectories
+from ucfrec_control.data.trajectories import Trajectories, count_of
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
 _REQUIRED = ("observations", "actions", "rewards", "terminals")
 _FINAL = "infos/final_observations"
+_DEFLATE: Final = 1032
+"""Largest factor by which deflate shrinks; more than that cannot be in a file."""
+_FAULTS: Final = (OSError, ValueError, TypeError, RuntimeError, KeyError, AttributeError)
+"""What h5py raises for damaged files; `OSError` and `RuntimeError` carry the library's messages."""
 
 
 def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
@@ -52,7 +58,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     _require_aligned(steps, path)
     environment = env_id or (recorded if isinstance(recorded, str) else None)
     task = find_task(environment or dataset_name(path))
-    check_sizes(task, _sizes(steps), str(path))
+    sizes = (*steps["observations"].shape[1:], *steps["actions"].shape[1:])
+    check_sizes(task, sizes, str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
     ends = np.flatnonzero(terminals | _timeouts(steps, path))
     finals = _final_observations(steps, ends, path)
@@ -103,28 +110,17 @@ def write_d4rl(
         "rewards": trajectories.rewards,
         "terminals": terminals,
         "timeouts": timeouts,
-        "next_observations": _next_observations(trajectories, ends),
     }
+    if trajectories.final_observations is not None:
+        columns["next_observations"] = np.roll(trajectories.observations, -1, axis=0)
+        columns["next_observations"][ends] = trajectories.final_observations
     with atomic_file(path) as scratch, h5py.File(scratch, "w") as file:
         for name, values in columns.items():
-            if values is not None:
-                file.create_dataset(name, data=values, compression="gzip")
+            file.create_dataset(name, data=values, compression="gzip")
         if trajectories.source["env_id"]:
             file.attrs["env_id"] = trajectories.source["env_id"]
         for name, value in (metadata or {}).items():
             file[f"metadata/{name}"] = value
-
-
-def _next_observations(trajectories: Trajectories, ends: IntArray) -> Float32Array | None:
-    if trajectories.final_observations is None:
-        return None
-    next_observations = np.roll(trajectories.observations, -1, axis=0)
-    next_observations[ends] = trajectories.final_observations
-    return next_observations
-
-
-def _sizes(steps: Mapping[str, Array]) -> tuple[int, ...]:
-    return (*steps["observations"].shape[1:], *steps["actions"].shape[1:])
 
 
 def _require_aligned(steps: Mapping[str, Array], path: Path) -> None:
@@ -185,3 +181,124 @@ def _made_with(path: Path) -> dict[str, str]:
     with damage_explained(manifest, "fetch it again, or remove it"):
         files = [entry.get("file") for entry in stated.get("files", [])]
         return dict(stated.get("versions", {})) if path.name in files else {}
+
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[Any]:
+    """Yield the file, opened for reading, in which no link leads out of it.
+
+    Raises:
+        InputError: the file is missing, damaged or not HDF5, links to another file or stores values
+            in one, or reading it in the block fails.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
+    try:
+        # HDF5's own lock needs a writable file system and would only keep out other HDF5 writers.
+        with h5py.File(path, "r", locking=False) as file:
+            for name in file:
+                _require_inside(file, name, path)
+            yield file
+    except InputError:
+        raise
+    except (*_FAULTS, MemoryError) as error:
+        raise InputError(
+            f"{path} is damaged or not HDF5 ({first_line(error)}); fetch it again"
+        ) from None
+
+
+def read_numbers(file: Any, path: Path, name: str) -> Array:
+    """A data set of numbers in memory, of at most two dimensions; floats become float32.
+
+    Args:
+        name: of the data set, which may lie in groups: `infos/final_observations`.
+
+    Raises:
+        InputError: it is not a data set of numbers, claims more values than the file can hold,
+            has numbers beyond single precision, or cannot be read.
+    """
+    dataset = file
+    for part in name.split("/"):
+        _require_inside(dataset, part, path)
+        dataset = dataset[part]
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{path}: {name} is a group, not a data set")
+    _require_own_values(dataset, path, name)
+    if dataset.dtype.kind not in "fiub" or dataset.dtype.subdtype is not None:
+        raise InputError(f"{path}: {name} holds {dataset.dtype}, not numbers")
+    shape = dataset.shape or ()
+    if len(shape) > 2:
+        raise InputError(f"{path}: {name} have shape {shape}, not 1 or 2 dimensions")
+    try:
+        values = np.asarray(dataset)
+    except (*_FAULTS, MemoryError) as error:
+        raise InputError(
+            f"{path}: {name} cannot be read ({first_line(error)}); fetch the file again"
+        ) from None
+    return convert_singles(values, str(path), name) if values.dtype.kind == "f" else values
+
+
+def convert_singles(values: Array, where: str, name: str) -> Float32Array:
+    """Numbers from the source `where`, called `name` in the plural, in single precision.
+
+    Raises:
+        InputError: a finite number is beyond single precision.
+    """
+    with np.errstate(over="ignore"):
+        singles = values.astype(np.float32)
+    beyond = int(np.count_nonzero(np.isinf(singles) & np.isfinite(values)))
+    if beyond:
+        raise InputError(
+            f"{where}: {count_of(beyond, name)} beyond single precision "
+            f"(±{np.finfo(np.float32).max:.2g}); scale the {name}, or remove their trajectories"
+        )
+    return singles
+
+
+def require_inside(path: Path) -> None:
+    """Check that no data set or group of a file leads out of it.
+
+    Raises:
+        InputError: one does, or the file is damaged.
+    """
+    with open_hdf5(path) as file:
+        waiting, seen = [file], 0
+        while waiting:
+            group = waiting.pop()
+            for name in group:
+                _require_inside(group, name, path)
+                child = group[name]
+                seen += 1
+                if seen > 10_000_000:  # groups may lie in one another
+                    raise InputError(f"{path} has more than 10 million entries")
+                if isinstance(child, h5py.Group):
+                    waiting.append(child)
+                else:
+                    _require_own_values(child, path, str(child.name))
+
+
+def _require_inside(group: Any, name: str, path: Path) -> None:
+    """Check that an entry of a group is neither an external nor a soft link."""
+    link = group.get(name, getlink=True)
+    if not isinstance(link, h5py.HardLink):
+        kind = "another file" if isinstance(link, h5py.ExternalLink) else "another name"
+        raise InputError(f"{path}: {name} is a link to {kind}, which is not followed; copy it")
+
+
+def _require_own_values(dataset: Any, path: Path, name: str) -> None:
+    """Check that the values are in the file, before memory is allocated for them."""
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{path}: the values of {name} lie in another file; copy them into this")
+    stored = min(int(dataset.id.get_storage_size()), path.stat().st_size)
+    factor = _DEFLATE if dataset.id.get_create_plist().get_nfilters() else 1
+    numbers = dataset.dtype.kind in "fiub"
+    if numbers and dataset.size * dataset.dtype.itemsize > stored * factor:
+        raise InputError(
+            f"{path}: {name} claims the shape {dataset.shape}, but only {stored:,} bytes are "
+            "stored; fetch the file again"
+        )
+
+
+def first_line(error: BaseException) -> str:
+    """The message of an error on one line; its type if it has none."""
+    return one_line((str(error).splitlines() or [""])[0]) or type(error).__name__

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
 from ucfrec.errors import InputError
 from ucfrec_control.data.d4rl import read_d4rl
 
@@ -32,7 +32,7 @@ def add_distractor(
 
     Args:
         store: store with observed states; (N, S) observations become (N, S + 1).
-        flip: probability that the bit is flipped; see `ucfrec.episodes.distractor.reward_bit`.
+        flip: probability that the bit is flipped; see `ucfrec.episodes.writer.reward_bit`.
         early: indicate the next reward, as `reward_bit` does.
 
     Raises:

@@ -20,7 +20,7 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 from ucfrec.arrays import Array, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec_control.data.hdf5 import convert_singles, require_inside
+from ucfrec_control.data.d4rl import convert_singles, first_line, require_inside
 from ucfrec_control.data.trajectories import Trajectories
 from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
@@ -31,15 +31,8 @@ _IDENTIFIER = re.compile(r"([\w./-]+/)?[\w-]+-v\d+")
 
 
 def is_minari(source: str) -> bool:
-    """Return whether `source` names a Minari dataset.
-
-    Args:
-        source: Minari identifier such as `mujoco/hopper/medium-v0`, or a path.
-
-    Returns:
-        True for a folder of a Minari dataset, and for a valid identifier that is not an existing
-        path.
-    """
+    """Whether `source` is a folder of a Minari dataset, or an identifier such as
+    `mujoco/hopper/medium-v0` and no existing path."""
     folder = Path(source)
     return (folder / "data").is_dir() or (
         not folder.exists() and _IDENTIFIER.fullmatch(source) is not None
@@ -96,7 +89,10 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
             "format": "minari",
             "dataset": dataset_name(dataset.id),
             "env_id": env_id or (spec.id if spec is not None else None),
-            "env_settings": {} if env_id or spec is None else _settings(spec),
+            # What configures the environment, such as the maze of AntMaze.
+            "env_settings": {}
+            if env_id or spec is None
+            else {name: value for name, value in spec.kwargs.items() if name != "render_mode"},
             "versions": _made_with(dataset.storage.metadata),
             "dropped": {
                 "unfinished_steps": sum(map(len, episodes)) - sum(map(len, complete)),
@@ -106,7 +102,7 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
     )
 
 
-def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None = None) -> Path:
+def write_minari(trajectories: Trajectories, identifier: str) -> Path:
     """Write a local Minari dataset, atomically.
 
     Minari stores the observation after an episode's last action. If `trajectories` does not contain
@@ -114,7 +110,6 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
 
     Args:
         identifier: Minari identifier of the new dataset, such as `mujoco/hopper/medium-v0`.
-        env_id: environment to record; None for the one recorded in `trajectories`.
 
     Raises:
         InputError: `identifier` is invalid or already exists, or the environment is not registered.
@@ -126,12 +121,9 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
     folder = _root() / identifier
     if folder.exists():
         raise InputError(f"{folder} exists already; remove it or name another dataset")
-    env = env_id or trajectories.source["env_id"]
-    requirements = [
-        f"{name}=={version}" for name, version in trajectories.source["versions"].items()
-    ]
-    has_final = trajectories.final_observations is not None
-    spec = _spec(env)
+    spec = _spec(trajectories.source["env_id"])
+    versions = trajectories.source["versions"].items()
+    unknown = trajectories.final_observations is None
     with atomic_folder(folder) as scratch, warnings.catch_warnings():
         # Minari warns about missing authors and evaluation environments, which are unknown.
         warnings.filterwarnings("ignore", category=UserWarning, module="minari")
@@ -144,8 +136,8 @@ def write_minari(trajectories: Trajectories, identifier: str, env_id: str | None
                 observation_space=_box(trajectories.observations.shape[1]),
                 action_space=_box(trajectories.actions.shape[1]),
                 description=f"Converted by ucfrec from {trajectories.source['where']}."
-                + ("" if has_final else " Final observations are unknown and repeat the last one."),
-                requirements=requirements,
+                + (" Final observations are unknown and repeat the last one." if unknown else ""),
+                requirements=[f"{name}=={version}" for name, version in versions],
             )
         for metadata in sorted(datasets.rglob(NAMESPACE_METADATA_FILENAME)):
             place = _root() / metadata.relative_to(datasets)
@@ -206,12 +198,11 @@ def _load(source: str, download: bool) -> minari.MinariDataset:
     except InputError:
         raise
     except Exception as error:  # Minari and its downloads raise arbitrary types
-        message = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"the Minari dataset {source} cannot be opened ({message})") from None
+        reason = first_line(error)
+        raise InputError(f"the Minari dataset {source} cannot be opened ({reason})") from None
 
 
 def _root() -> Path:
-    """Return the folder in which Minari stores its datasets."""
     return Path(os.environ.get(_ROOT) or Path.home() / ".minari" / "datasets")
 
 
@@ -238,11 +229,6 @@ def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:
         return gymnasium.spec(env_id)
     except gymnasium.error.Error as error:
         raise InputError(f"the environment {env_id} is not known here ({error})") from None
-
-
-def _settings(spec: gymnasium.envs.registration.EnvSpec) -> dict[str, Any]:
-    """Return the arguments that configure the environment, such as the maze of AntMaze."""
-    return {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
 
 
 def _box(size: int) -> gymnasium.spaces.Box:

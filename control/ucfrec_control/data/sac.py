@@ -18,6 +18,7 @@ from pydantic import Field
 from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 from ucfrec.processes import Progress
 from ucfrec.settings import BatchSize, LearningRate, Share, Width, settings_table
@@ -78,9 +79,6 @@ class SacTraining(Memoryless):
         """Run one complete episode, with one update per step.
 
         Before `learning_starts`, actions are uniformly random and there are no updates.
-
-        Args:
-            bar: progress bar, advanced by one per step.
         """
         reset_seed = seed_all(self._seed, 1, self.episode)
         generator = np.random.default_rng(reset_seed)
@@ -109,99 +107,59 @@ class SacTraining(Memoryless):
         return np.asarray(self._model.policy.scale_action(action), dtype=np.float32)
 
     def replay(self, steps: int) -> dict[str, Array]:
-        """Return the first steps taken, with D4RL's column names.
-
-        Args:
-            steps: number N of steps.
-
-        Returns:
-            `observations` and `next_observations` (N, S), `actions` (N, A) in the units of the
-            environment, `rewards`, `terminals` and `timeouts` (N,).
-        """
+        """The first N = `steps` steps with D4RL's column names: (N, S), (N, A) in the units of the
+        environment, or (N,)."""
         columns = {name: getattr(self._buffer, name)[:steps, 0] for name in _COLUMNS}
-        actions = self._model.policy.unscale_action(columns["actions"])
-        timeouts = columns["timeouts"] > 0
-        return {
-            "observations": columns["observations"],
-            "next_observations": columns["next_observations"],
-            "actions": actions,
-            "rewards": columns["rewards"],
-            "terminals": (columns["dones"] > 0) & ~timeouts,
-            "timeouts": timeouts,
-        }
+        columns["actions"] = self._model.policy.unscale_action(columns["actions"])
+        columns["timeouts"] = columns["timeouts"] > 0
+        columns["terminals"] = (columns.pop("dones") > 0) & ~columns["timeouts"]
+        return columns
 
     def save_policy(self, path: Path, metadata: dict[str, Any]) -> None:
         """Write the policy's weights."""
         save_tensors(path, dict(self._model.actor.state_dict()), metadata)
 
     def load_policy(self, path: Path) -> dict[str, Any]:
-        """Replace the policy's weights by those that `save_policy` wrote.
-
-        Returns:
-            The metadata given to `save_policy`.
-        """
+        """Replace the policy's weights by those that `save_policy` wrote; returns its metadata."""
         tensors, metadata = load_tensors(path)
         self._model.actor.load_state_dict(tensors)
         return metadata
 
-    def save(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Write a checkpoint from which training can resume, atomically."""
-        tensors = {"log_ent_coef": self._model.log_ent_coef}
-        for name, state in self._model.get_parameters().items():
-            moments = state.get("state")
-            groups = {"": state} if moments is None else {f"{i}/": m for i, m in moments.items()}
-            for prefix, group in groups.items():
-                tensors |= {f"{name}/{prefix}{key}": value for key, value in group.items()}
-        for name in _COLUMNS:
-            tensors[f"replay/{name}"] = torch.from_numpy(getattr(self._buffer, name)[: self.steps])
-        save_tensors(path, tensors, metadata | {"episode": self.episode})
+    def save(self, path: Path, evaluations: list[dict[str, Any]]) -> None:
+        """Write a checkpoint from which training can resume, atomically, and `evaluations`."""
+        state = {
+            "parameters": self._model.get_parameters(),
+            "log_ent_coef": self._model.log_ent_coef.detach(),
+            "replay": {
+                name: torch.from_numpy(getattr(self._buffer, name)[: self.steps])
+                for name in _COLUMNS
+            },
+            "episode": self.episode,
+            "evaluations": evaluations,
+        }
+        with atomic_file(path) as scratch:
+            torch.save(state, scratch)
 
-    def load(self, path: Path) -> dict[str, Any]:
-        """Restore, in place, a checkpoint that `save` wrote.
-
-        Returns:
-            The metadata given to `save`.
-        """
-        tensors, metadata = load_tensors(path)
-        for name in _COLUMNS:
-            rows = tensors.pop(f"replay/{name}").numpy()
-            getattr(self._buffer, name)[: len(rows)] = rows
+    def load(self, path: Path) -> list[dict[str, Any]]:
+        """Restore a checkpoint that `save` wrote, in place; returns the evaluations in it."""
+        state = torch.load(path, weights_only=True)
+        for name, rows in state["replay"].items():
+            getattr(self._buffer, name)[: len(rows)] = rows.numpy()
             self._buffer.pos = len(rows)
-        self._model.log_ent_coef.data.copy_(tensors.pop("log_ent_coef"))
-        parameters = self._model.get_parameters()
-        for key, value in tensors.items():
-            name, key = key.split("/", 1)
-            if "param_groups" in parameters[name]:
-                index, key = key.split("/")
-                parameters[name]["state"].setdefault(int(index), {})[key] = value
-            else:
-                parameters[name][key] = value
-        self._model.set_parameters(parameters)
-        self.episode = metadata.pop("episode")
-        return metadata
+        self._model.log_ent_coef.data.copy_(state["log_ent_coef"])
+        self._model.set_parameters(state["parameters"])
+        self.episode = state["episode"]
+        evaluations: list[dict[str, Any]] = state["evaluations"]
+        return evaluations
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
-        """Sample actions from the policy, as in training.
-
-        Args:
-            observations: (N, S) current observations.
-            live: (N,) running episodes; ignored, every row gets an action.
-
-        Returns:
-            (N, A) actions in the units of the environment, and None.
-        """
+        """Actions (N, A) in the units of the environment, sampled as in training, and None."""
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
 
 
 def seed_all(*key: int) -> int:
-    """Seed the global random generators of numpy and torch, which Stable-Baselines3 uses.
-
-    Args:
-        key: non-negative integers from which the seed is derived.
-
-    Returns:
-        The derived seed, for components with their own random generator.
-    """
+    """Seed the global random generators of numpy and torch, which Stable-Baselines3 uses, by a seed
+    derived from `key`; returns it for components with their own generator."""
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])
     np.random.seed(seed)  # noqa: NPY002
     torch.manual_seed(seed)

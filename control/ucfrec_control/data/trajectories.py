@@ -66,6 +66,13 @@ def control_source(source: Source, where: Path) -> dict[str, Any]:
         ) from None
 
 
+def count_of(count: int, name: str) -> str:
+    """`count` numbers, as the beginning of a sentence."""
+    return (
+        f"{count} number{'' if count == 1 else 's'} of its {name} {'is' if count == 1 else 'are'}"
+    )
+
+
 @dataclass(frozen=True)
 class Trajectories:
     """Complete trajectories, concatenated along the first axis.
@@ -110,10 +117,8 @@ class Trajectories:
                 raise InputError(f"{where}: {name} have shape {values.shape} instead of {shape}")
             non_finite = int(np.count_nonzero(~np.isfinite(values)))
             if non_finite:
-                numbers = "1 number" if non_finite == 1 else f"{non_finite} numbers"
                 raise InputError(
-                    f"{where}: {numbers} of its {name} {'is' if non_finite == 1 else 'are'} not "
-                    "finite; remove their trajectories"
+                    f"{where}: {count_of(non_finite, name)} not finite; remove their trajectories"
                 )
 
     @property

@@ -30,7 +30,7 @@ from ucfrec_control.environments.environments import (
     mismatches,
 )
 from ucfrec_control.environments.scores import find_kind, require_task
-from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, is_rl, read_run
+from ucfrec_control.training.rl_baselines import RLPolicy, RLRecord, read_run
 from ucfrec_control.training.train import find_preset
 
 Trained = TrainedPolicy | RLPolicy
@@ -72,7 +72,9 @@ def evaluate_run(
     if episodes < 1:
         raise InputError(f"--episodes is {episodes}; at least one is needed")
     rows: list[ResultRow] = []
-    for checkpoint in _kept(run, checkpoints):
+    if isinstance(read_run(run), RLRecord) and "last" in checkpoints:
+        checkpoints = ("last",)
+    for checkpoint in checkpoints:
         trained = load_run(run, checkpoint)
         training = trained.record.finished
         if rows and training.best_step == training.steps:
@@ -80,17 +82,12 @@ def evaluate_run(
             rows += [replace(row, checkpoint=checkpoint) for row in rows]
             continue
         environment = environment_of(trained, env_id)
-        rows += [
-            replace(
-                _row(trained, environment, rule, episodes, seed, distractor), checkpoint=checkpoint
-            )
+        played = [
+            _row(trained, environment, rule, episodes, seed, distractor)
             for rule in rules_of(trained, environment, targets)
         ]
+        rows += [replace(row, checkpoint=checkpoint) for row in played]
     return rows
-
-
-def _kept(run: Path, checkpoints: Sequence[str]) -> Sequence[str]:
-    return ("last",) if is_rl(read_run(run)) and "last" in checkpoints else checkpoints
 
 
 def load_run(run: Path, checkpoint: str) -> Trained:
@@ -101,7 +98,7 @@ def load_run(run: Path, checkpoint: str) -> Trained:
             checkpoint.
     """
     record = read_run(run)
-    rl = is_rl(record)
+    rl = isinstance(record, RLRecord)
     if record.policy is None:
         raise InputError(f"the training in {run} has not ended; train with the same command first")
     if rl and checkpoint != "last":
@@ -174,7 +171,7 @@ def method_of(record: RunRecord | RLRecord) -> str:
 
 def takes_target(record: RunRecord | RLRecord) -> bool:
     """Whether the policy of a run acts by a target return."""
-    return not is_rl(record) and record.config.policy_name != "bc"
+    return isinstance(record, RunRecord) and record.config.policy_name != "bc"
 
 
 def rules_of(

@@ -153,11 +153,6 @@ class RLPolicy(Memoryless):
         return self._algorithm.predict(_normalise(observations, self._mean, self._std)), None
 
 
-def is_rl(record: RunRecord | RLRecord) -> bool:
-    """Whether `record` is of a run of `train_rl`."""
-    return isinstance(record, RLRecord)
-
-
 def rl_config(dataset: Mapping[str, Any], algorithm: Any, **settings: Any) -> RLConfig:
     """The settings for the data that `ucfrec_control.training.train.dataset_of` describes.
 
@@ -190,22 +185,20 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLR
     """
     with lock_path(out, "trained"):
         remove_leftovers(out, within=True)
-        return _train(store, out, config, seed)
-
-
-def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
-    """`train_rl` of a run that no other process trains."""
-    d3rlpy = _d3rlpy()
-    if (out / RUN).exists():
+        if not (out / RUN).exists():
+            return _train(store, out, config, seed)
         existing = RLRecord.read(out)
         expected = (plain_config(config, seed), store.record.fingerprint)
         if (existing.settings, existing.fingerprint) != expected:
             raise InputError(
                 f"{out} has a run with other settings or data; remove it or name another folder"
             )
-        if existing.policy is not None:
-            return existing
-    started = perf_counter()
+        return _train(store, out, config, seed) if existing.policy is None else existing
+
+
+def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRecord:
+    """`train_rl` of a run that no other process trains and that has not ended."""
+    d3rlpy, started = _d3rlpy(), perf_counter()
     d3rlpy.seed(seed)
     train = store.split("train")
     if not train.n_episodes:
@@ -217,8 +210,8 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     algorithm = _algorithm(config, "cuda:0" if torch.cuda.is_available() else "cpu:0")
     if not (out / RUN).exists():
         _begin(store, out, config, seed)
-    record = RLRecord.read(out)
-    step, seconds = _resume(out / _CHECKPOINT, algorithm, dataset)
+    record, checkpoint = RLRecord.read(out), out / _CHECKPOINT
+    step, seconds = _resume(checkpoint, algorithm, dataset)
     log = MetricsLog(out, step)
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
@@ -235,16 +228,19 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
             )
             step += steps
             log.add(step, losses)
-            _save(out / _CHECKPOINT, algorithm, step, seconds + perf_counter() - started)
+            state: dict[str, Any] = {"step": step, "seconds": seconds + perf_counter() - started}
+            state["parts"] = {name: part.state_dict() for name, part in _parts(algorithm).items()}
+            with atomic_file(checkpoint) as scratch:
+                torch.save(state, scratch)
     log.close()
     actor = algorithm.impl.modules.policy.state_dict()
     save_tensors(out / _ACTOR, {**actor, "state.mean": mean, "state.std": std}, {})
     record = record.copy_with(
         policy=RLFit(steps=config.steps), wall_time_s=seconds + perf_counter() - started
     )
-    if (out / _CHECKPOINT).exists():
+    if checkpoint.exists():
         record.write(out)
-        (out / _CHECKPOINT).unlink()
+        checkpoint.unlink()
     return record.seal(out)
 
 
@@ -256,9 +252,8 @@ def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
         "config": plain_config(config, seed),
         "seed": seed,
         "sizes": {
-            "state": store.state_size,
+            **{"state": store.state_size, "items": 0},
             "action": store.record.columns[schema.ACTION][0],
-            "items": 0,
         },
         "fingerprint": store.record.fingerprint,
         "data": store.record.source,
@@ -282,14 +277,8 @@ def _resume(path: Path, algorithm: Any, dataset: Any) -> tuple[int, float]:
     return checkpoint["step"], checkpoint["seconds"]
 
 
-def _save(path: Path, algorithm: Any, step: int, seconds: float) -> None:
-    parts = {name: part.state_dict() for name, part in _parts(algorithm).items()}
-    with atomic_file(path) as scratch:
-        torch.save({"step": step, "seconds": seconds, "parts": parts}, scratch)
-
-
 def _parts(algorithm: Any) -> Mapping[str, Any]:
-    """Every network and optimizer of a algorithm, by name."""
+    """Every network and optimizer, by name."""
     parts: Mapping[str, Any] = algorithm.impl.modules.create_checkpointer("cpu:0").modules
     return parts
 
@@ -357,22 +346,14 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
 
 
 def _cql(d3rlpy: Any, config: RLConfig) -> Any:
-    layers = [d3rlpy.models.VectorEncoderFactory([256] * count) for count in (3, 5)]
+    encoder, rate = d3rlpy.models.VectorEncoderFactory, config.learning_rate
     antmaze = config.task == "antmaze"
-    rate = config.learning_rate
-    settings: dict[str, Any] = {
-        "actor_learning_rate": rate / 10,
-        "temp_learning_rate": rate / 10,
-        "conservative_weight": 10.0,
-        "alpha_learning_rate": 0.0,
-    }
+    slower = rate / (3 if antmaze else 10)
+    settings: dict[str, Any] = {"conservative_weight": 10.0, "alpha_learning_rate": 0.0}
     if config.task == "hopper" and config.kind == "medium":
-        scaler = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
-        settings |= {"reward_scaler": scaler}
+        settings["reward_scaler"] = d3rlpy.preprocessing.ReturnBasedRewardScaler(multiplier=1000.0)
     if antmaze:
         settings = {
-            "actor_learning_rate": rate / 3,
-            "temp_learning_rate": rate / 3,
             "alpha_learning_rate": rate,
             # CORL starts the logarithm of its multiplier at 1.
             "initial_alpha": math.e,
@@ -384,9 +365,11 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
     return d3rlpy.algos.CQLConfig(
         batch_size=config.batch_size,
         critic_learning_rate=rate,
+        actor_learning_rate=slower,
+        temp_learning_rate=slower,
         n_action_samples=10,
-        actor_encoder_factory=layers[0],
-        critic_encoder_factory=layers[antmaze],
+        actor_encoder_factory=encoder([256] * 3),
+        critic_encoder_factory=encoder([256] * (5 if antmaze else 3)),
         **settings,
     )
 

@@ -11,9 +11,8 @@ from ucfrec.benchmark.tables import (
     plot_methods,
     sweep_table,
 )
-from ucfrec_simulators.benchmark.budgets import BUDGETS
 from ucfrec_simulators.benchmark.measure import MEASUREMENT
-from ucfrec_simulators.benchmark.methods import COMPONENTS, METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, COMPONENTS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import TASKS
 

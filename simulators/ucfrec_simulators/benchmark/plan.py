@@ -13,11 +13,18 @@ from ucfrec.benchmark.suite import BenchmarkRequest
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec_simulators import sardine
 from ucfrec_simulators.benchmark import tasks
-from ucfrec_simulators.benchmark.budgets import DISTRACTED, SHARED_TASKS, SWEPT
-from ucfrec_simulators.benchmark.methods import COMPONENTS, METHODS, PAPER, SCREENED
+from ucfrec_simulators.benchmark.methods import (
+    COMPONENTS,
+    DISTRACTED,
+    METHODS,
+    PAPER,
+    SCREENED,
+    SHARED_TASKS,
+    SWEPT,
+)
 from ucfrec_simulators.benchmark.tasks import TASKS, Log
 from ucfrec_simulators.distractor import OFF, ON, DistractorEnvironment, plant_distractor
-from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import data_folder
 
 SUITE: Final = "recommendation"
 LAMBDAS: Final = (0.0, 0.1, 0.5, 1.0)
@@ -60,7 +67,10 @@ class RecommendationCells:
             "sweeps": self._sweeps,
             "distractor": self._distractor,
         }
-        for name in self._names(table):
+        names = [name for name in self._select_tasks(table) if _available(name)]
+        if self._request.environment is not None:
+            names = [self._request.environment.title]
+        for name in names:
             for log in range(self._budget.logs):
                 yield from made_by[table](self._task(name, log), log)
 
@@ -70,16 +80,11 @@ class RecommendationCells:
             return []
         return [name for name in self._select_tasks("main") if not _available(name)]
 
-    def _names(self, table: str) -> list[str]:
-        if self._request.environment is not None:
-            return [self._request.environment.title]
-        return [name for name in self._select_tasks(table) if _available(name)]
-
     def _select_tasks(self, table: str) -> Sequence[str]:
         if not self._request.tasks:
             return self._budget.tasks_in(table)
-        available = _TASKS_OF.get(table, tuple(TASKS))
-        return [name for name in self._request.tasks if name in available]
+        known = _TASKS_OF.get(table, tuple(TASKS))
+        return [name for name in self._request.tasks if name in known]
 
     def _main(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
@@ -89,7 +94,8 @@ class RecommendationCells:
 
     def _sweeps(self, task: Task, log: int) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
-        spread = _reward_spread(EpisodeStore.open(task.store))
+        store = EpisodeStore.open(task.store)
+        spread = float(store.step_values(schema.REWARD, *store.all_steps()).std())
         sweeps = {
             **{f"λ = {x:g}": f"policy.lambda_mask={x}" for x in LAMBDAS},
             **{f"band {low:g}–{top:g}": f"csg.band=[{low}, {top}]" for low, top in BANDS},
@@ -157,8 +163,3 @@ def _settings(budget: Budget, name: str, method: Method) -> tuple[str, ...]:
     memory = () if method.policy in _MEMORYLESS else (f"policy.context={_CONTEXT}",)
     own = budget.of_policies.get(method.policy, ())
     return (*budget.settings, *memory, *own, *method.settings, *budget.of_methods.get(name, ()))
-
-
-def _reward_spread(store: EpisodeStore) -> float:
-    """Standard deviation of the rewards of a store."""
-    return float(store.step_values(schema.REWARD, *store.all_steps()).std())

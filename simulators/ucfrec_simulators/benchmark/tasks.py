@@ -7,22 +7,24 @@ from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from ucfrec.benchmark.cells import Task
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
+from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.mapping import Dataset, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
 from ucfrec.schema import SESSION_ID
-from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.behaviors import BEHAVIORS
 from ucfrec_simulators.kuai.completion import complete
 from ucfrec_simulators.kuai.environment import EXITS
 from ucfrec_simulators.kuai.kuairand import read_tags
 from ucfrec_simulators.kuai.kuairec import read_categories
-from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window, write_log
+from ucfrec_simulators.kuai.logs import cut_by_exit, part_of, window
+from ucfrec_simulators.session_env import data_folder
 
 EXIT_PRESETS: Final = ("", "-nx0", "-nx10", "-n4", "-n4-nx0", "-n1", "-n1-nx0")
 """What follows the name of a Kuaishou environment: repeats allowed or not, ten steps without an
@@ -151,7 +153,8 @@ def kuairec(folder: Path, log: Log) -> Task:
 
 def _prepare(dataset: str, rows: pa.Table, log: Path, features: list[Path], store: Path) -> None:
     """Write `rows` to `log` and as a store; an episode is a session, or a user without sessions."""
-    write_log(rows, log)
+    with atomic_file(log) as scratch:
+        pq.write_table(rows, scratch)
     adapter: Dataset = load_plugin("datasets", dataset)
     by = SESSION_ID if SESSION_ID in rows.column_names else "user"
     files, mapping = adapter.resolve([log, *features], LogMapping(session_by=by))

@@ -14,20 +14,13 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arrays import Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.behaviors import simulators
 from ucfrec_simulators.kuai.completion import ITEMS_FILE, USERS_FILE, Completed, complete
-from ucfrec_simulators.kuai.environment import (
-    EXITS,
-    REGIMES,
-    ExitRule,
-    KuaiEnv,
-    Regime,
-)
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime
 from ucfrec_simulators.kuai.kuairec import parse_tags, read_columns
+from ucfrec_simulators.session_env import data_folder
 
 SOURCE: Final = "https://kuairand.com (data/video_features_basic_*)"
 MAKE_IT: Final = "make them with `python -m ucfrec_simulators.kuai.kuairand`, or name their folder"
@@ -54,21 +47,10 @@ def kuairand(
         if not (folder / name).is_file():
             raise InputError(f"{folder / name} is missing; {MAKE_IT}")
     users, items = pq.read_table(folder / USERS_FILE), pq.read_table(folder / ITEMS_FILE)
-    user_vectors, item_vectors = (_matrix(table) for table in (users, items))
-    return KuaiEnv(
-        num_envs,
-        Completed(user_vectors, item_vectors),
-        items["tags"].to_pylist(),
-        exit_rule,
-        regime,
-        np.asarray(users[schema.USER_ID]),
-        np.asarray(items[schema.ITEM_ID]),
-    )
-
-
-def _matrix(table: "pq.Table") -> Float32Array:
-    vectors = table["vector"].combine_chunks()
-    return np.asarray(vectors.flatten()).reshape(len(vectors), -1)
+    vectors = [table["vector"].combine_chunks() for table in (users, items)]
+    completed = Completed(*(np.asarray(v.flatten()).reshape(len(v), -1) for v in vectors))
+    ids = np.asarray(users[schema.USER_ID]), np.asarray(items[schema.ITEM_ID])
+    return KuaiEnv(num_envs, completed, items["tags"].to_pylist(), exit_rule, regime, *ids)
 
 
 def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
@@ -82,17 +64,10 @@ def read_tags(path: Path) -> dict[int, tuple[int, ...]]:
     return {video: parse_tags(text) for video, text in zip(table["video_id"], tags, strict=True)}
 
 
-(
-    SIMULATOR,
-    SIMULATOR_NX_0,
-    SIMULATOR_NX_10,
-    SIMULATOR_N4,
-    SIMULATOR_N4_NX_0,
-    SIMULATOR_N1,
-    SIMULATOR_N1_NX_0,
-) = simulators(
+SIMULATOR, SIMULATOR_NX_0, SIMULATOR_NX_10, *_SHORTER = simulators(
     kuairand, EXITS["easyrl4rec-kuairand"], "KuaiRand's videos, completed click rates", "is_click"
 )
+SIMULATOR_N4, SIMULATOR_N4_NX_0, SIMULATOR_N1, SIMULATOR_N1_NX_0 = _SHORTER
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

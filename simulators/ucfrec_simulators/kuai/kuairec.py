@@ -8,15 +8,9 @@ import numpy as np
 import pandas as pd
 
 from ucfrec.errors import InputError
-from ucfrec_simulators.folders import data_folder
 from ucfrec_simulators.kuai.behaviors import simulators
-from ucfrec_simulators.kuai.environment import (
-    EXITS,
-    REGIMES,
-    ExitRule,
-    KuaiEnv,
-    Regime,
-)
+from ucfrec_simulators.kuai.environment import EXITS, REGIMES, ExitRule, KuaiEnv, Regime
+from ucfrec_simulators.session_env import data_folder
 
 REWARD_CAP: Final = 5.0
 CATEGORIES: Final = "item_categories.csv"
@@ -92,17 +86,10 @@ def parse_tags(text: str) -> tuple[int, ...]:
     return tuple(int(tag) for tag in text.split(",") if tag.strip())
 
 
-(
-    SIMULATOR,
-    SIMULATOR_NX_0,
-    SIMULATOR_NX_10,
-    SIMULATOR_N4,
-    SIMULATOR_N4_NX_0,
-    SIMULATOR_N1,
-    SIMULATOR_N1_NX_0,
-) = simulators(
+SIMULATOR, SIMULATOR_NX_0, SIMULATOR_NX_10, *_SHORTER = simulators(
     kuairec,
     EXITS["easyrl4rec-kuairec"],
     "KuaiRec's fully observed videos, watch ratio",
     "watch_ratio",
 )
+SIMULATOR_N4, SIMULATOR_N4_NX_0, SIMULATOR_N1, SIMULATOR_N1_NX_0 = _SHORTER

@@ -6,11 +6,9 @@ from tempfile import gettempdir
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file
 from ucfrec.logs.engine import engine
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.schema import SESSION_ID
@@ -66,12 +64,6 @@ def part_of(rows: pa.Table, part: int, parts: int) -> pa.Table:
     sessions = np.asarray(rows[SESSION_ID])
     dealt = np.random.default_rng(0).integers(parts, size=sessions.max() + 1)
     return rows.filter(pa.array(dealt[sessions] == part))
-
-
-def write_log(rows: pa.Table, path: Path) -> None:
-    """Write rows as Parquet, atomically."""
-    with atomic_file(path) as scratch:
-        pq.write_table(rows, scratch)
 
 
 def sessions_by_exit(

@@ -9,7 +9,7 @@ from gymnasium.vector.utils import batch_space
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
-from ucfrec_simulators.folders import data_folder
+from ucfrec_simulators.session_env import data_folder
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,

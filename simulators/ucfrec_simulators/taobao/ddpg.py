@@ -80,9 +80,10 @@ class Noisy(Memoryless):
 class Training:
     """DDPG (Lillicrap et al., 2016) as an actor that learns from every step taken.
 
-    After a uniform warm-up, it serves all N sessions with its current network and noise; the
-    propensity is the density of the action. It learns from the live rows only, which are those that
-    are logged. The value after the end of a session is 0, whether it terminated or was truncated.
+    The logged sessions are its training sessions. After a uniform warm-up, it serves all N sessions
+    with its current network and noise; the propensity is the density of the action. It learns from
+    the live rows only, which are those that are logged. The value after the end of a session is 0,
+    whether it terminated or was truncated.
 
     Args:
         env: the Taobao environment.
@@ -93,7 +94,9 @@ class Training:
         InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> None:
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
+    ) -> None:
         taobao(env)
         self._high = _high(env)
         self._config = config
@@ -203,14 +206,9 @@ def _sb3_model(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> 
 
 def _network(observation_size: int, hidden: int) -> nn.Sequential:
     """The network of Stable-Baselines3's DDPG actor, with the same layers and parameter names."""
-    return nn.Sequential(
-        nn.Linear(observation_size, hidden),
-        nn.ReLU(),
-        nn.Linear(hidden, hidden),
-        nn.ReLU(),
-        nn.Linear(hidden, ACTION_DIM),
-        nn.Tanh(),
-    )
+    first, second = nn.Linear(observation_size, hidden), nn.Linear(hidden, hidden)
+    last = nn.Linear(hidden, ACTION_DIM)
+    return nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last, nn.Tanh())
 
 
 def _forward(network: nn.Module, scaled: Float32Array) -> Float32Array:
@@ -246,11 +244,9 @@ def snapshots(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig) -> l
     tensors, _ = load_tensors(file)
     networks: list[nn.Module] = []
     for index in range(config.snapshots):
-        prefix = f"{index}."
-        weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-        network = _network(_high(env).size, config.hidden)
-        load_weights(file, network, weights)
-        networks.append(network)
+        own = {k.partition(".")[2]: v for k, v in tensors.items() if k.startswith(f"{index}.")}
+        networks.append(_network(_high(env).size, config.hidden))
+        load_weights(file, networks[-1], own)
     return networks
 
 
@@ -287,11 +283,6 @@ def _fingerprint(environment: TaobaoEnv, seed: int, config: DdpgConfig) -> str:
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
-def training(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT) -> Training:
-    """A training from its first step on: the logged sessions are its training sessions."""
-    return Training(env, seed, config)
-
-
 def snapshot_mixture(
     env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAULT
 ) -> SessionMixture:
@@ -307,7 +298,7 @@ def expert(env: VectorEnv[Any, Any, Any], seed: int, config: DdpgConfig = DEFAUL
 
 
 BEHAVIORS: Final[Mapping[str, Callable[[VectorEnv[Any, Any, Any], int], Actor]]] = {
-    "ddpg-training": training,
+    "ddpg-training": Training,
     "ddpg-snapshots": snapshot_mixture,
     "ddpg-expert": expert,
 }

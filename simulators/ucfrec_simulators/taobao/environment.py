@@ -55,16 +55,8 @@ class TaobaoEnv(SessionsEnv):
     def expected_clicks(
         self, users: Float32Array, pages: Array, actions: Float32Array
     ) -> Float64Array:
-        """Exact expected clicks on a page.
-
-        Args:
-            users: (M, 88) one-hot bits.
-            pages: (M,) pages turned before this one.
-            actions: (M, 27) weight vectors.
-
-        Returns:
-            (M,) expected clicks, 0 to 10.
-        """
+        """Exact expected clicks (M,) on a page, 0 to 10, of users (M, 88) after pages (M,) turned,
+        by weight vectors (M, 27)."""
 
     @abstractmethod
     def _respond(

@@ -13,8 +13,7 @@ from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.folders import data_folder
-from ucfrec_simulators.session_env import draw_categories
+from ucfrec_simulators.session_env import data_folder, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -59,16 +58,10 @@ class VirtualTaobao(TaobaoEnv):
         super().__init__(num_envs)
         folder = Path(folder)
         self._generator_model = _load(folder / "generator_model.pt", NOISE_DIM, 128, USER_BITS)
-        self._leave_model = _load(
-            folder / "leave_model.pt", USER_BITS, 128, 256, LONGEST_SESSION + 1
-        )
-        self._action_model = _load(
-            folder / "action_model.pt",
-            USER_BITS + 1 + ACTION_DIM,
-            128,
-            256,
-            CLICK_LEVELS + PAGE_INDICES,
-        )
+        sizes = (USER_BITS, 128, 256, LONGEST_SESSION + 1)
+        self._leave_model = _load(folder / "leave_model.pt", *sizes)
+        sizes = (USER_BITS + 1 + ACTION_DIM, 128, 256, CLICK_LEVELS + PAGE_INDICES)
+        self._action_model = _load(folder / "action_model.pt", *sizes)
 
     def sample_users(
         self, count: int, generator: np.random.Generator
@@ -95,10 +88,7 @@ class VirtualTaobao(TaobaoEnv):
         """Exact expected clicks (M,): users (M, 88), pages turned (M,), actions (M, 27)."""
         with torch.inference_mode():
             clicks = self._logits(users, pages, actions)[:, :CLICK_LEVELS].softmax(1).numpy()
-        expected: Float64Array = clicks.astype(np.float64) @ np.arange(
-            CLICK_LEVELS, dtype=np.float64
-        )
-        return expected
+        return np.asarray(clicks.astype(np.float64) @ np.arange(CLICK_LEVELS, dtype=np.float64))
 
     def _respond(
         self, users: Float32Array, pages: IntArray, actions: Float32Array

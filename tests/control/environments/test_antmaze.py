@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
-from ucfrec.acting.uniform import Memoryless
 
 from tests.support.control_files import (
     TINY,
@@ -22,7 +21,7 @@ from tests.support.control_files import (
     set_options,
     write_hdf5,
 )
-from ucfrec.acting.rollout import rollout
+from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError

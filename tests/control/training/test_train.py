@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ucfrec.acting.uniform import Memoryless
 
 from tests.support.control_files import MADE, TINY, control, refused, set_options, write_made
 from tests.support.real_data import data_folder
 from ucfrec import schema
-from ucfrec.acting.rollout import rollout
+from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore

@@ -26,9 +26,8 @@ from ucfrec.results.rows import ResultRow, append_rows, read_rows
 from ucfrec.runs.record import RUN, read_record
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_simulators.benchmark import plan
-from ucfrec_simulators.benchmark.budgets import BUDGETS
 from ucfrec_simulators.benchmark.measure import measure
-from ucfrec_simulators.benchmark.methods import METHODS, SCREENED
+from ucfrec_simulators.benchmark.methods import BUDGETS, METHODS, SCREENED
 from ucfrec_simulators.benchmark.plan import RecommendationCells
 from ucfrec_simulators.benchmark.tasks import Log, kuairand
 from ucfrec_simulators.kuai.environment import EXITS

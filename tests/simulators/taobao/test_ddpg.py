@@ -78,7 +78,7 @@ def test_draws_follow_the_density(mean: float) -> None:
 def test_what_it_learns_from_is_what_is_logged() -> None:
     need_sb3()
     env = SyntheticTaobao(16)
-    agent = ddpg.training(env, 0, SMALL)
+    agent = ddpg.Training(env, 0, SMALL)
     steps: list[Step] = []
     rollout(env, agent, 200, 0, steps.append)
     buffer, high = agent._model.replay_buffer, env.single_observation_space.high
@@ -114,7 +114,7 @@ def test_it_learns() -> None:
     config = DdpgConfig(warm_up=3000, updates=1 / 16, batch_size=128, hidden=64)
     rewards: list[Float32Array] = []
     env = Slope(128)
-    rollout(env, ddpg.training(env, 0, config), 1500, 0, lambda s: rewards.append(s.rewards))
+    rollout(env, ddpg.Training(env, 0, config), 1500, 0, lambda s: rewards.append(s.rewards))
     clicks = np.concatenate(rewards)
     assert clicks[:3000].mean() == pytest.approx(5, abs=0.2)
     assert clicks[-2000:].mean() > 7
@@ -123,7 +123,7 @@ def test_it_learns() -> None:
 def test_a_log_of_the_training_holds_its_densities(tmp_path: Path) -> None:
     need_sb3()
     env = SyntheticTaobao(16)
-    actor = ddpg.training(env, 0, SMALL)
+    actor = ddpg.Training(env, 0, SMALL)
     simulator = synthetic_taobao.SIMULATOR
     collect(simulator, env, actor, 200, 0, tmp_path / "logs", env_name="e", behavior="b")
     log = pq.read_table(tmp_path / "logs" / "sessions.parquet").to_pandas()

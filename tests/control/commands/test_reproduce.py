@@ -10,7 +10,7 @@ from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.results.rows import append_rows, read_rows
 from ucfrec_control.benchmark.budgets import BUDGETS, budget_of
 from ucfrec_control.benchmark.methods import MAIN, ROBUST, ROBUSTNESS, SCORES, TABLES
-from ucfrec_control.benchmark.reproduce import PARTS, budget_of_part
+from ucfrec_control.commands.reproduce import PARTS
 from ucfrec_control.data.distractor import DISTRACTORS
 from ucfrec_control.figures.figures import make_row_figures
 
@@ -22,7 +22,7 @@ def test_a_part_has_rows_and_files_of_its_tables(name: str) -> None:
     part = PARTS[name]
     assert set(part.methods) <= set(ROBUST if part.table == ROBUSTNESS else TABLES[part.table])
     for size in BUDGETS:
-        own = budget_of_part(part, size)
+        own = part.budget(size)
         assert own.tasks == (part.files or budget_of(part.table, size).tasks)
     assert set(part.distractors) <= set(DISTRACTORS)
     assert part.of_runs == (name in ("figure-5", "figure-6"))

@@ -109,14 +109,8 @@ class SyntheticCatalog(SessionsEnv):
         return pa.table({"item_id": pa.array(np.arange(len(self.tags))), **columns})
 
     def favourites(self, probabilities: Float64Array) -> IntArray:
-        """The best item of each of the `boredom_window` best tags, the best first.
-
-        Args:
-            probabilities: (M, n_items) click probabilities.
-
-        Returns:
-            (M, boredom_window) items, all of different tags.
-        """
+        """The best items (M, boredom_window) of different tags, the best first, by click
+        probabilities (M, n_items)."""
         by_tag = np.stack(
             [
                 np.flatnonzero(self.tags == tag)[probabilities[:, self.tags == tag].argmax(1)]

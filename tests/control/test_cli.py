@@ -52,6 +52,8 @@ def test_seeds_that_are_none_are_refused(command: list[str], seed: str) -> None:
         ("benchmark --method bc --seeds 1 --workers -3", "--workers is -3; at least one"),
         ("figures --out out --results no.jsonl", "check the path"),
         ("figures --out out --runs no", "check the path"),
+        ("figures --out out --results {}.json", "{}.json holds no list of result rows"),
+        ("figures --out out --results [1].json", "[1].json, row 1 is not a result row"),
     ],
 )
 def test_what_cannot_be_used_is_refused(
@@ -59,7 +61,10 @@ def test_what_cannot_be_used_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    given = command.format(run=folder / "store-run", store=folder / "store").split()
+    paths = {"{run}": folder / "store-run", "{store}": folder / "store"}
+    given = [str(paths.get(word, word)) for word in command.split()]
+    for content in ("{}", "[1]"):
+        Path(f"{content}.json").write_text(content)
     if given[0] == "benchmark":
         Path("data").mkdir()
         Path("rows.jsonl").write_text("no row\n")

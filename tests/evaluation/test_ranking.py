@@ -34,7 +34,7 @@ from ucfrec.evaluation.ranking import (
     measure,
     rank_steps,
 )
-from ucfrec.evaluation.ranking_baselines import ItemNeighbours, PolicyRanker, baselines
+from ucfrec.evaluation.ranking_table import ItemNeighbours, PolicyRanker, baselines
 from ucfrec.files.atomic import write_json
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from tests.support.played import play
 from tests.support.single_session import SingleSession
-from ucfrec.acting.rollout import Episodes, Step, rollout
+from ucfrec.acting.rollout import Episodes, rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators import synthetic_catalog
@@ -122,18 +123,10 @@ def test_rotation_is_optimal_by_brute_force(max_turn: int) -> None:
 def test_rotation_earns_its_expected_return() -> None:
     env = SyntheticCatalog(200)
     actor = CATALOG.behaviors["optimal"](env, 0)
-    served: list[np.ndarray] = []
-    first_steps: set[int] = set()
-
-    def record(step: Step) -> None:
-        assert step.user_ids is not None
-        fresh = [e not in first_steps for e in step.episodes.tolist()]
-        first_steps.update(step.episodes.tolist())
-        served.append(step.user_ids[fresh])
-
-    episodes = rollout(env, actor, 1000, 3, record)
+    episodes, steps = play(env, actor, 1000, 3)
     assert (episodes.lengths == env.max_turn).all()
-    luck = episodes.returns.sum() - optimal_returns(env)[np.concatenate(served)].sum()
+    served = steps["user_ids"][np.unique(steps["episodes"], return_index=True)[1]]
+    luck = episodes.returns.sum() - optimal_returns(env)[served].sum()
     assert abs(luck) < 4 * np.sqrt(0.25 * episodes.lengths.sum())
 
 
@@ -189,16 +182,10 @@ def even_tags_and_clicks(mood: float, behavior: str) -> np.ndarray:
     catalogue = synthetic_catalog.simulator(mood)
     env = catalogue.make(256, None)
     assert isinstance(env, SyntheticCatalog)
-    lift: list[list[float]] = [[], []]
-
-    def record(step: Step) -> None:
-        assert step.user_ids is not None
-        luck = step.rewards - env.click_probabilities[step.user_ids, step.actions]
-        for odd, values in enumerate((lift[1], lift[0])):
-            values += luck[env.tags[step.actions] % 2 == odd].tolist()
-
-    rollout(env, catalogue.behaviors[behavior](env, 0), 3000, 0, record)
-    return np.array([np.mean(each) for each in lift])
+    _, steps = play(env, catalogue.behaviors[behavior](env, 0), 3000, 0)
+    items = steps["actions"]
+    luck = steps["rewards"] - env.click_probabilities[steps["user_ids"], items]
+    return np.array([luck[env.tags[items] % 2 == odd].mean() for odd in (1, 0)])
 
 
 def test_moods_confound_what_was_shown_with_what_was_clicked() -> None:

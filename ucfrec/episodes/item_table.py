@@ -33,14 +33,8 @@ def write_item_table(
     reward_high: float,
     tags: IntArray | None,
 ) -> None:
-    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically.
-
-    Args:
-        embeddings: (n_items, D).
-        user_features: (n_users, F).
-        reward_low: see `ItemStates`.
-        reward_high: see `ItemStates`.
-        tags: (n_items, T); None for none.
+    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically; arguments
+    are its fields, with None for no tags.
 
     Raises:
         InputError: the disk is full, or the folder is not writable.

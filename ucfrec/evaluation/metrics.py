@@ -106,11 +106,8 @@ def gauc(scored: pd.DataFrame) -> float:
 
 
 def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10) -> float:
-    """Share of the catalogue's items, each counted once, that are among the `k` best of a user.
-
-    Raises:
-        InputError: the catalogue is empty or lacks a recommended item.
-    """
+    """Share of the catalogue's items, each counted once, that are among the `k` best of a user;
+    InputError if it is empty or lacks a recommended item."""
     top = _top(recommended, k)
     return float(top[ITEM_ID].nunique() / _count_items(catalogue, top))
 

@@ -175,7 +175,7 @@ def _add_history(
     rows = UserRows.of(store, users, earlier)
     if trained.record.session_by == schema.SESSION_ID:
         return store, rows
-    return rows.continued(trained.record.session_gap_ms), rows
+    return rows.continue_sessions(trained.record.session_gap_ms), rows
 
 
 def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:

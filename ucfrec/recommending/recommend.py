@@ -212,14 +212,8 @@ class Chooser:
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
-    """Numbers (N,) of the items that may be recommended.
-
-    Args:
-        skip_unknown: leave out those that the policy does not know.
-
-    Raises:
-        InputError: the policy does not know some of them, or with `skip_unknown`, any.
-    """
+    """Numbers (N,) of the items that may be recommended; InputError if the policy does not know
+    some of them, or any with `skip_unknown`, which leaves those out."""
     numbers = index.numbers(ids)
     in_catalogue = numbers >= 0
     if not (in_catalogue.any() if skip_unknown else in_catalogue.all()):
@@ -305,13 +299,8 @@ class ItemIndex:
     """
 
     def __init__(self, scorer: Scorer, kind: str) -> None:
-        """
-        Args:
-            scorer: of a policy of items; its weights must not change afterwards.
-
-        Raises:
-            InputError: faiss is not installed, or the rule or the policy need scores of all items.
-        """
+        """Index the items of a policy, whose weights must not change afterwards; InputError if
+        faiss is not installed, or the rule or the policy need scores of all items."""
         try:
             import faiss
         except ModuleNotFoundError:

@@ -39,19 +39,17 @@ def recommend_with_spark(
     seed: int = 0,
     memory_limit: str = "2GB",
 ) -> int:
-    """Write the `k` best next items of every user of logs, as `recommend` finds them.
+    """Write the `k` best next items of every user of logs, as `recommend` finds them; returns their
+    number.
 
     Args:
         files: logs, which every worker sees, as the run folder and `out`.
         mapping: of the logs' columns; what it leaves open is as in the training logs.
         out: folder for the recommendations, Parquet parts with users in sorted order.
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
-        exposures: folder for what was shown, see `ucfrec.recommending.exposures`; None for none.
+        exposures: folder for what was shown; None for none.
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
-
-    Returns:
-        The number of recommended items.
 
     Raises:
         InputError: an argument or the logs cannot be used, or Spark is missing or fails.
@@ -85,11 +83,8 @@ class _RecommendPart:
 
     run: RunOnWorkers
     out: Path
-    """Folder for the parts of the recommendations, as of `recommend`."""
     exposures: Path | None
-    """Folder for the parts of the exposures; None for none."""
     memory_limit: str
-    """Of a worker while it reads its rows."""
     rule: str
     """Hash of the decision rule."""
     recommend: Callable[[TrainedPolicy, Iterable[Histories]], Iterator[pd.DataFrame]]

@@ -8,8 +8,7 @@ from pathlib import Path
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.ranking import Later, LikedExpression
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.evaluation.ranking_table import ranking_rows
+from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.expressions import Expression
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy

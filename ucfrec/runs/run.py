@@ -17,7 +17,11 @@ from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem
-from ucfrec.counterfactual.augmentation import MODELS, AugmentationReport, augment_episodes
+from ucfrec.counterfactual.augmentation import (
+    MODELS,
+    AugmentationReport,
+    augment_episodes,
+)
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import (

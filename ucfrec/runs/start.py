@@ -16,7 +16,7 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, IntArray
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
-from ucfrec.counterfactual.reward_model_fit import INITIAL
+from ucfrec.counterfactual.reward_model import INITIAL
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore

@@ -19,7 +19,7 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
 from ucfrec.processes import block_ctrl_c, config_hash, label_progress, pool_of_processes

@@ -19,7 +19,7 @@ from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import SHARE, warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import compare_runs, measure_drift
@@ -96,7 +96,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
-    opened = without_columns(EpisodeStore.open(grown), trained.dropped)
+    opened = drop_columns(EpisodeStore.open(grown), trained.dropped)
     full = _initial_settings(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:

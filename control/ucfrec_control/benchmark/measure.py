@@ -34,7 +34,8 @@ RATE: Final = "learning_rate"
 def config(cell: Cell) -> dict[str, Any] | None:
     """The configuration of the cell's training, as a run's record has it."""
     if cell.policy in ALGORITHMS:
-        return plain_config(rl_config_of(cell), seed_of(cell))
+        assert cell.training_seed is not None
+        return plain_config(rl_config_of(cell), cell.training_seed)
     return training_config(cell)
 
 
@@ -45,18 +46,17 @@ def rl_config_of(cell: Cell) -> RLConfig:
     return rl_config(dataset_of(open_store(cell)), cell.policy, **settings)
 
 
-def seed_of(cell: Cell) -> int:
-    """The training seed, which every control cell has."""
-    assert cell.training_seed is not None
-    return cell.training_seed
-
-
-def targets_of(cell: Cell) -> Sequence[float]:
-    """The target returns of the preset, or the first; empty if the policy knows its own."""
-    if cell.policy not in ALGORITHMS and cell.config.policy.max_return:
-        return ()
-    targets = preset_of(dataset_of(open_store(cell)), cell.policy).targets
-    return targets if cell.evaluation.all_targets else targets[:1]
+def evaluate(cell: Cell, **how: Any) -> list[ResultRow]:
+    """Evaluate the run of the cell at the target returns of the preset, or the first; at the
+    policy's own if it knows it."""
+    assert cell.run is not None
+    targets: Sequence[float] = ()
+    if cell.policy in ALGORITHMS or not cell.config.policy.max_return:
+        targets = preset_of(dataset_of(open_store(cell)), cell.policy).targets
+    if not cell.evaluation.all_targets:
+        targets = targets[:1]
+    episodes, seed = cell.evaluation.episodes, cell.evaluation.seed
+    return evaluate_run(cell.run, episodes=episodes, seed=seed, targets=targets, **how)
 
 
 def train(cell: Cell) -> RunRecord | RLRecord:
@@ -64,21 +64,15 @@ def train(cell: Cell) -> RunRecord | RLRecord:
     assert cell.run is not None
     store = open_store(cell)
     if cell.policy in ALGORITHMS:
-        return train_rl(store, cell.run, rl_config_of(cell), seed_of(cell))
+        assert cell.training_seed is not None
+        return train_rl(store, cell.run, rl_config_of(cell), cell.training_seed)
     return train_control(store, cell.run, cell.config, screening=cell.screening, shared=cell.shared)
 
 
 def measure_scores(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     """Train, and evaluate every kept checkpoint; returns one row for each, and for each target."""
-    assert cell.run is not None
     train(cell)
-    evaluations = evaluate_run(
-        cell.run,
-        episodes=cell.evaluation.episodes,
-        seed=cell.evaluation.seed,
-        targets=targets_of(cell),
-    )
-    rows = [row.of(row_key) for row in evaluations]
+    rows = [row.of(row_key) for row in evaluate(cell)]
     if not cell.evaluation.all_targets:
         return rows
     # Rows of one seed that differ in their target are measurements of their own.
@@ -91,17 +85,8 @@ def measure_robustness(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     record, store = train(cell), open_store(cell)
     # The last checkpoint: the best one is chosen on data in which the distractor varies.
     # All evaluations have the same initial states, with and without distractor.
-    evaluations = [
-        evaluate_run(
-            cell.run,
-            episodes=cell.evaluation.episodes,
-            seed=cell.evaluation.seed,
-            targets=targets_of(cell),
-            checkpoints=("last",),
-            distractor=value,
-        )[0]
-        for value in ((0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0))
-    ]
+    values = (0.0,) if cell.conditions[DISTRACTOR] == CLEAN else (0.0, 1.0)
+    evaluations = [evaluate(cell, checkpoints=("last",), distractor=v)[0] for v in values]
     losses = held_out_losses(TrainedPolicy.load(cell.run, "last"), store)
     more: dict[str, Any] = {"score_at_one": evaluations[-1].value, **losses}
     if record.screening is not None:

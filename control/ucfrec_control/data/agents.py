@@ -88,14 +88,8 @@ class Agent(Memoryless):
 
 
 def read_agent(file: Path, observations: int, space: Box, noise: float, seed: int) -> Agent:
-    """Read a saved agent.
-
-    Args:
-        file: zip file that Stable-Baselines3 wrote.
-        observations: size of the environment's observations.
-        space: the environment's actions, a bounded box of vectors.
-        noise: as of `Agent`.
-        seed: as of `Agent`.
+    """Read an agent of Stable-Baselines3, for an environment with observations of this size;
+    further arguments as of `Agent`.
 
     Raises:
         InputError: the file is missing or damaged, or its network is not one of layers that its

@@ -71,9 +71,6 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
     `out/training`: repeating the call resumes an interrupted training from its last evaluation,
     with the same results. `out/MANIFEST.json` is written last.
 
-    Args:
-        env_id: Gymnasium environment with a `Box` action space and a step limit.
-
     Returns:
         One row per dataset: `file`, `dataset`, numbers of `trajectories` and `steps`, and
         undiscounted `mean_return`.
@@ -113,14 +110,13 @@ def collect_agent(
 
     Args:
         agent: file that Stable-Baselines3 or its contrib package saved.
-        env_id: Gymnasium environment with vector observations and actions.
-        out: output folder; gets `TASK_AGENT.hdf5` and `MANIFEST.json`.
+        out: gets `TASK_AGENT.hdf5` and `MANIFEST.json`.
         noise: standard deviation of Gaussian noise on the agent's deterministic actions, in halves
             of the action space's range.
         size: steps, rounded up to whole episodes.
 
     Returns:
-        One row: `file`, `dataset`, numbers of `trajectories` and `steps`, `mean_return`.
+        A row as of `collect`.
 
     Raises:
         InputError: the agent cannot be read as data or does not fit the environment, which cannot
@@ -154,7 +150,6 @@ def _filled(out: Path) -> Iterator[None]:
 
 
 def _task(env_id: str) -> str:
-    """Name of an environment in names of datasets."""
     return env_id.split("/")[-1].rsplit("-v", 1)[0].lower()
 
 
@@ -298,9 +293,6 @@ def roll_out(
     """Roll out whole episodes, with at least `size` steps in total.
 
     Every round has a fixed number of episodes, so that short episodes are not overrepresented.
-
-    Args:
-        env_id: Gymnasium environment.
 
     Raises:
         InputError: the environment cannot be made.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
+from ucfrec.episodes.writer import read_observations, reward_bit, write_observations
 from ucfrec.errors import InputError
 from ucfrec_control.data.d4rl import read_d4rl
 
@@ -31,9 +31,7 @@ def add_distractor(
     """Write a copy of `store` with a reward-indicating bit appended to every observation.
 
     Args:
-        store: store with observed states; (N, S) observations become (N, S + 1).
-        flip: probability that the bit is flipped; see `ucfrec.episodes.writer.reward_bit`.
-        early: indicate the next reward, as `reward_bit` does.
+        flip, early: as of `ucfrec.episodes.writer.reward_bit`.
 
     Raises:
         InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.
@@ -42,26 +40,20 @@ def add_distractor(
         raise InputError(f"{store.path} is of item logs; distractors are for observed states")
     bit = reward_bit(store, flip, seed, early)
     added = {"dimension": store.observation_size, "flip": flip, "seed": seed, "early": early}
-    return with_observations(
+    return write_observations(
         store,
         out,
-        np.column_stack([logged_observations(store), bit]),
+        np.column_stack([read_observations(store), bit]),
         {"distractors": [*store.record.source.others.get("distractors", []), added]},
     )
 
 
 def zoo_store(data: Path, stores: Path, file: str, distractor: str = CLEAN) -> Path:
-    """Return the store of a D4RL file with a distractor, writing the store if it does not exist.
-
-    Args:
-        data: folder with the HDF5 files.
-        file: name of the HDF5 file without its extension.
-        distractor: key of `DISTRACTORS`.
+    """The store of `FILE.hdf5` in `data` with one of `DISTRACTORS`, written if it does not exist.
 
     Raises:
         InputError: the HDF5 file is missing, invalid or not that of the store, or the distractor
             cannot be added.
-        KeyError: `distractor` is not a key of `DISTRACTORS`.
     """
     clean, path = stores / file, data / f"{file}.hdf5"
     if not clean.exists():
@@ -87,5 +79,4 @@ def _is_of(folder: Path, path: Path) -> bool:
         return True
     with TemporaryDirectory() as scratch:
         rewritten = read_d4rl(path).write_store(Path(scratch) / folder.name)
-    same: bool = rewritten.record.fingerprint == store.record.fingerprint
-    return same
+    return bool(rewritten.record.fingerprint == store.record.fingerprint)

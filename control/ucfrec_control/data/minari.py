@@ -50,9 +50,6 @@ def read_minari(source: str, env_id: str | None = None, download: bool = False) 
         env_id: environment that the data comes from; None for the one recorded in the dataset.
         download: download the dataset with Minari if it is not available locally.
 
-    Returns:
-        The complete trajectories, with float32 observations, actions and rewards.
-
     Raises:
         InputError: the dataset is missing or damaged, its observations or actions are not vectors,
             or they have other sizes than those of `env_id`.

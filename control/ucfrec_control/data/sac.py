@@ -46,16 +46,13 @@ class SacConfig:
 
 
 class SacTraining(Memoryless):
-    """SAC that runs whole episodes in one environment and learns at every step.
-
-    It implements `ucfrec.acting.rollout.Actor`, so its policy can be evaluated with `rollout`.
+    """SAC that runs whole episodes in one environment and learns at every step; an
+    `ucfrec.acting.rollout.Actor`, so that `rollout` can evaluate its policy.
 
     Args:
-        env: vector environment of size one, with `AutoresetMode.SAME_STEP` and a `Box` action
-            space.
-        seed: seed of the networks, the exploration and the environment.
-        capacity: size of the replay buffer in steps; every step taken must fit.
-        config: hyperparameters.
+        env: vector environment of size one, with `AutoresetMode.SAME_STEP`.
+        seed: of the networks, the exploration and the environment.
+        capacity: steps of the replay buffer; every step taken must fit.
 
     Raises:
         InputError: the action space is not a `Box`, or Stable-Baselines3 is not installed.

@@ -43,13 +43,8 @@ class ControlSource(Entry):
 
 
 def control_source(source: Source, where: Path) -> dict[str, Any]:
-    """Check what a store or a run says of its data: it may be an untrusted one.
-
-    Args:
-        where: file or folder that holds it, for the message.
-
-    Returns:
-        The entries of `ControlSource`, and all others.
+    """What a store or a run, maybe an untrusted one at `where`, says of its data: the entries of
+    `ControlSource`, and all others.
 
     Raises:
         InputError: an entry is missing or has another type.
@@ -130,10 +125,8 @@ class Trajectories:
     def write_store(self, out: Path) -> EpisodeStore:
         """Write the trajectories as an episode store, atomically.
 
-        One trajectory in 20, evenly spaced, belongs to the validation split. Trajectories of
-        control data are independent, so holding out the last ones has no advantage. Files are also
-        often ordered by behaviour policy, from weakest to best, so the last trajectories would
-        represent a single policy.
+        One in 20, evenly spaced, belongs to the validation split: files are often ordered by
+        behaviour policy, from weakest to best, so the last ones would be of a single policy.
 
         Raises:
             InputError: `out` already exists.

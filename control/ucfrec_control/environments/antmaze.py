@@ -38,13 +38,8 @@ def is_rebuilt(env_id: str) -> bool:
 
 
 def antmaze_settings(env_id: str) -> Mapping[str, Any]:
-    """Prepare an AntMaze for `gymnasium.make` and return the arguments that it needs.
-
-    Also registers the environments of gymnasium-robotics.
-
-    Returns:
-        Keyword arguments with which the return of an episode is 1 for success and 0 otherwise;
-        empty for D4RL's rebuilt mazes, which always work this way.
+    """Register the environments of gymnasium-robotics; returns arguments of `gymnasium.make` with
+    which an episode of an AntMaze returns 1 for success and 0 otherwise.
 
     Raises:
         InputError: gymnasium-robotics is not installed.
@@ -78,15 +73,7 @@ class GoalObservations(gymnasium.ObservationWrapper[Any, Any, Any]):
         Path(getattr(env.unwrapped, "tmp_xml_file_path", "")).unlink(missing_ok=True)
 
     def observation(self, observation: Mapping[str, Any]) -> Float32Array:
-        """Flatten one observation.
-
-        Args:
-            observation: the dictionary with `achieved_goal` (2,), which is the ant's position, and
-                `observation` (O − 2,).
-
-        Returns:
-            Vector (O,); its position is relative to the start of D4RL's mazes if the environment
-            has an `origin`.
-        """
+        """Flatten `achieved_goal` (2,), the ant's position, and `observation` (O − 2,) to (O,); the
+        position is relative to the environment's `origin`, the start, if it has one."""
         position = observation["achieved_goal"] - self._origin
         return np.concatenate([position, observation["observation"]]).astype(np.float32)

@@ -67,12 +67,8 @@ class D4RLAntMaze(AntMazeEnv):
         return center
 
     def generate_target_goal(self) -> Float64Array:
-        """Draw the goal near the center of its cell.
-
-        Returns:
-            Position (2,), in the maze's units of length; each coordinate is at or above the
-            center's, by less than 3/8 of a cell's side.
-        """
+        """Draw the goal (2,): each coordinate is that of its cell's center or above, by less than
+        3/8 of the cell's side."""
         quarter = self.maze.maze_size_scaling / 4
         offset = self.np_random.uniform(0, quarter, 2) + self.np_random.uniform(0, quarter / 2, 2)
         goal: Float64Array = self._center(self._goal_cell) + offset
@@ -89,16 +85,7 @@ class D4RLAntMaze(AntMazeEnv):
     def compute_reward(
         self, achieved_goal: Float64Array, desired_goal: Float64Array, info: Any
     ) -> Any:
-        """Compute the sparse reward.
-
-        Args:
-            achieved_goal: positions (..., 2) of the ant.
-            desired_goal: positions (..., 2) of the goal.
-            info: not used.
-
-        Returns:
-            Rewards (...): 1 within `_GOAL_RADIUS` of the goal, otherwise 0.
-        """
+        """The sparse reward (...) of positions (..., 2): 1 within `_GOAL_RADIUS` of the goal."""
         distance = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
         return (distance <= _GOAL_RADIUS).astype(np.float64)
 

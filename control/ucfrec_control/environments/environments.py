@@ -43,12 +43,8 @@ def make_env(
     return 1 for success and 0 otherwise.
 
     Args:
-        env_id: Gymnasium's identifier.
         appended: constants that stand in for distractors at the end of every observation.
         wrappers: wrappers around each environment, the innermost first.
-
-    Returns:
-        The vectorised environment, with `AutoresetMode.SAME_STEP`.
 
     Raises:
         InputError: the environment is not registered or cannot be made.
@@ -107,10 +103,7 @@ def note_unknown(env_id: str) -> None:
 
 
 def environment_of_data(dataset: Mapping[str, Any]) -> str:
-    """The environment that a dataset names.
-
-    Args:
-        dataset: the entry `source` of a control store.
+    """The environment that a dataset names, of which `dataset` is the `source` of its store.
 
     Raises:
         InputError: it names none, or one with a Python module, which Gymnasium would import: data
@@ -145,12 +138,7 @@ class AppendedConstants(gymnasium.ObservationWrapper[Any, Any, Any]):
 
 
 def mismatches(dataset: Mapping[str, Any], env_id: str) -> list[str]:
-    """Describe how the evaluation's environment differs from the one that the data was made in.
-
-    Args:
-        dataset: the entry `source` of a control store.
-        env_id: Gymnasium's identifier of the evaluation's environment.
-    """
+    """How the evaluation's environment differs from the one that the data was made in."""
     warnings_ = []
     if dataset["env_id"] not in (None, env_id):
         warnings_.append(f"the data is of {dataset['env_id']}, the evaluation is in {env_id}")

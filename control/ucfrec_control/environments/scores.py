@@ -32,22 +32,12 @@ class Task:
     available. A key is text that the dataset's name contains (`""` matches every name)."""
 
     def score(self, returns: npt.ArrayLike) -> Float64Array:
-        """Convert returns to D4RL's normalised scores.
-
-        Args:
-            returns: undiscounted returns of episodes, of any shape.
-
-        Returns:
-            Scores of the same shape: 0 for the random reference policy, 100 for the expert.
-        """
+        """D4RL's normalised scores of undiscounted returns of any shape: 0 for the random reference
+        policy, 100 for the expert."""
         return 100 * (np.asarray(returns, dtype=np.float64) - self.low) / (self.high - self.low)
 
     def d4rl_env(self, dataset: str) -> str | None:
-        """Find the environment of a D4RL dataset from the dataset's name.
-
-        Returns:
-            Gymnasium's identifier of the environment, or None if no key of `d4rl_envs` matches.
-        """
+        """Gymnasium's environment of a D4RL dataset of this name, or None if there is none."""
         plain = _plain(dataset)
         return next((env for name, env in self.d4rl_envs.items() if name in plain), None)
 
@@ -75,14 +65,8 @@ TASKS = (
 
 
 def find_task(*names: str | None) -> Task | None:
-    """Find the task that a name belongs to.
-
-    Args:
-        names: names of environments, files or datasets, tried in this order; None is skipped.
-
-    Returns:
-        The task of the first name that matches one, or None if no name does.
-    """
+    """The task of the first of some names of environments, files or datasets that belongs to one;
+    None if no name does."""
     for name in names:
         for task in TASKS:
             if task.pattern in _plain(name or ""):
@@ -91,13 +75,7 @@ def find_task(*names: str | None) -> Task | None:
 
 
 def require_task(*names: str | None) -> Task:
-    """Find the task that a name belongs to, as `find_task` does, or fail.
-
-    Args:
-        names: names of environments, files or datasets, tried in this order; None is skipped.
-
-    Returns:
-        The task of the first name that matches one.
+    """As `find_task`.
 
     Raises:
         InputError: no name matches a task.
@@ -118,36 +96,23 @@ _KINDS = ("diverse", "medium-replay", "medium-expert", "medium", "mixed", "exper
 
 
 def find_kind(name: str) -> str:
-    """From a dataset's name, how the data was collected.
-
-    Returns:
-        The kind, such as `medium` or `mixed`, or "" if the name contains none.
-    """
+    """How a dataset was collected, such as `medium` or `mixed`; "" if its name does not say."""
     plain = name.lower().replace("_", "-")
     return next((kind for kind in _KINDS if kind in plain), "")
 
 
 def dataset_name(source: Path | str) -> str:
-    """Shorten the file path or identifier of a dataset to a name such as `hopper_medium-zoo`.
-
-    Returns:
-        The file's name without folder and ending for an HDF5 file; otherwise the identifier without
-        trailing slashes.
-    """
+    """The name of an HDF5 file without folder and ending, such as `hopper_medium-zoo`; of another
+    dataset its identifier without trailing slashes."""
     text = str(source)
     return Path(text).stem if text.endswith((".hdf5", ".h5")) else text.rstrip("/")
 
 
 def check_sizes(task: Task | None, sizes: Sequence[Any], where: str) -> None:
-    """Check that states and actions have the sizes that D4RL has for a task.
-
-    Args:
-        task: the task; None skips the check.
-        sizes: number of state dimensions and of action dimensions, (S, A).
-        where: source of the data, which the error message starts with.
+    """Check the numbers (S, A) of dimensions of states and actions of the data `where`.
 
     Raises:
-        InputError: the sizes differ from those of `task`.
+        InputError: they differ from those of D4RL for `task`.
     """
     if task is not None and tuple(sizes) != task.sizes:
         raise InputError(

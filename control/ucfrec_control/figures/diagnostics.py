@@ -15,17 +15,15 @@ from ucfrec.counterfactual.generators import (
     TangentGenerator,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel
-from ucfrec.counterfactual.reward_model_fit import sample_transitions
+from ucfrec.counterfactual.reward_model import CausalRewardModel, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
-from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord, read_augmentation
 from ucfrec.runs.record import store_of as trained_store
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -50,7 +48,7 @@ def store_of(run: Path) -> EpisodeStore:
             f"{run} was trained on {record.store}, which is gone or has changed; move the run "
             "together with its store, or train again"
         )
-    return without_columns(store, record.dropped_observations)
+    return drop_columns(store, record.dropped_observations)
 
 
 def is_augmented(run: Path) -> bool:
@@ -110,9 +108,22 @@ class Editing:
             train, max(config.crm.max_transitions, config.csg.max_transitions), config.seed
         )
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
-        rows = np.random.default_rng(seed).permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS]
-        factual = _select(fitted, torch.from_numpy(rows))
-        return cls(crm, _generator(run, fitted, crm, config), factual, report.epsilon_r)
+        rng = np.random.default_rng(seed)
+        rows = torch.from_numpy(rng.permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS])
+        fields = fitted.__dataclass_fields__
+        factual = Transitions(*(getattr(fitted, name)[rows] for name in fields))
+        generator: TangentGenerator | CounterfactualStateGenerator
+        if config.csg.kind == "faithful":
+            generator = CounterfactualStateGenerator(crm, config.csg)
+            weights = run / "csg" / "best.safetensors"
+            load_weights(weights, generator, load_tensors(weights)[0])
+            generator.eval()
+        else:
+            # Nothing of it is learned but covariances, the same for the same seed.
+            made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+            assert isinstance(made, TangentGenerator)
+            generator = made
+        return cls(crm, generator, factual, report.epsilon_r)
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
         """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move
@@ -188,21 +199,3 @@ def _augmentation(run: Path) -> AugmentationReport:
             f"{run} has no augmented episodes; train it with augment.copies of 1 or more"
         )
     return read_augmentation(run / _REPORT)
-
-
-def _generator(
-    run: Path, fitted: Transitions, crm: CausalRewardModel, config: Config
-) -> TangentGenerator | CounterfactualStateGenerator:
-    if config.csg.kind == "faithful":
-        network = CounterfactualStateGenerator(crm, config.csg)
-        weights = run / "csg" / "best.safetensors"
-        load_weights(weights, network, load_tensors(weights)[0])
-        return network.eval()
-    # Nothing of the tangent generator is learned but covariances, the same for the same seed.
-    generator = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
-    assert isinstance(generator, TangentGenerator)
-    return generator
-
-
-def _select(steps: Transitions, rows: torch.Tensor) -> Transitions:
-    return Transitions(*(getattr(steps, f)[rows] for f in steps.__dataclass_fields__))

@@ -1,11 +1,10 @@
 """`ucfrec-control figures`: every figure that stored runs and result rows have the data for."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -16,13 +15,13 @@ from ucfrec.processes import config_hash
 from ucfrec.reporting.charts import save
 from ucfrec.results.rows import ResultRow, read_results
 from ucfrec.results.statistics import grouped
-from ucfrec.runs.record import RUN, RunRecord
+from ucfrec.runs.record import RUN
 from ucfrec_control.benchmark.methods import ROBUSTNESS, SCORES
 from ucfrec_control.benchmark.robustness import drops, loss_rises
 from ucfrec_control.data.trajectories import control_source
 from ucfrec_control.figures import diagnostics, plots
 from ucfrec_control.training.evaluate import EVALUATE, method_of
-from ucfrec_control.training.rl_baselines import RLRecord, read_run
+from ucfrec_control.training.rl_baselines import read_run
 
 LOWS = (0.0, 0.1, 0.2, 0.3, 0.4)
 HIGHS = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
@@ -131,30 +130,26 @@ def _runs(folder: Path) -> Iterator[_Run]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of runs; check the path")
     for file in sorted(folder.rglob(RUN)):
-        record = read_run(file.parent)
-        if "env_id" in record.data.others:
-            yield _run_of(record, file, file.parent.relative_to(folder))
-
-
-def _run_of(record: RunRecord | RLRecord, file: Path, below: Path) -> _Run:
-    dataset, path = control_source(record.data, file), file.parent
-    distracted = " with a distractor" if dataset.get("distractors") else ""
-    return _Run(
-        path=path,
-        name="-".join(below.parts) or path.resolve().name,
-        group="-".join(below.parent.parts) or dataset["dataset"],
-        method=method_of(record),
-        policy=record.config.policy_name,
-        settings=config_hash({**record.settings, "seed": None, "data": record.fingerprint}),
-        task=f"{dataset['dataset']}{distracted}",
-    )
+        path, record = file.parent, read_run(file.parent)
+        if "env_id" not in record.data.others:
+            continue
+        dataset, below = control_source(record.data, file), path.relative_to(folder)
+        distracted = " with a distractor" if dataset.get("distractors") else ""
+        yield _Run(
+            path=path,
+            name="-".join(below.parts) or path.resolve().name,
+            group="-".join(below.parent.parts) or dataset["dataset"],
+            method=method_of(record),
+            policy=record.config.policy_name,
+            settings=config_hash({**record.settings, "seed": None, "data": record.fingerprint}),
+            task=f"{dataset['dataset']}{distracted}",
+        )
 
 
 def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
     """The runs, of which those with other settings go by their folder's name, less the seed."""
-    settings: dict[tuple[str, str], set[str]] = {}
-    for run in runs:
-        settings.setdefault((run.group, run.method), set()).add(run.settings)
+    of = grouped(runs, lambda run: (run.group, run.method))
+    settings = {named: {run.settings for run in same} for named, same in of.items()}
     return [
         replace(run, method=re.sub(r"(-[0-9a-f]{12})?-\d+$", "", run.path.resolve().name))
         if len(settings[run.group, run.method]) > 1
@@ -164,26 +159,18 @@ def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
 
 
 def _plan_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:
-    for run in _first(runs, lambda run: (run.group, run.method)):
-        if diagnostics.is_augmented(run.path):
-            for kind in ("moves", "states", "acceptance"):
-                yield _Plan(kind, run.name, partial(_draw_copies, run, kind))
-        if run.policy == "ucf":
-            yield _Plan("attention", run.name, partial(_attention, run))
-    for run in _first(runs, lambda run: run.group):
-        same = [sibling for sibling in runs if sibling.group == run.group]
-        yield _Plan("training", run.group, partial(_training, same))
+    for run, *_ in grouped(runs, lambda run: (run.group, run.method)).values():
+        kinds = ("moves", "states", "acceptance") if diagnostics.is_augmented(run.path) else ()
+        for kind in (*kinds, *(("attention",) if run.policy == "ucf" else ())):
+            yield _Plan(kind, run.name, partial(_draw_run, run, kind))
+    for group, same in grouped(runs, lambda run: run.group).items():
+        yield _Plan("training", group, partial(_training, same))
 
 
-def _first(runs: Iterable[_Run], key: Callable[[_Run], Any]) -> Iterable[_Run]:
-    first: dict[Any, _Run] = {}
-    for run in runs:
-        first.setdefault(key(run), run)
-    return first.values()
-
-
-def _draw_copies(run: _Run, kind: str) -> Figure:
-    """A figure of the augmented episodes of a run."""
+def _draw_run(run: _Run, kind: str) -> Figure:
+    """A figure of the augmented episodes or of the attention of a run."""
+    if kind == "attention":
+        return plots.attention_map(diagnostics.attention(run.path), run.title)
     if kind == "states":
         return plots.state_overlay(*diagnostics.edit_states(run.path), run.title)
     if kind == "moves":
@@ -193,15 +180,10 @@ def _draw_copies(run: _Run, kind: str) -> Figure:
     return plots.acceptance_heatmap(LOWS, HIGHS, shares, band, run.title)
 
 
-def _attention(run: _Run) -> Figure:
-    return plots.attention_map(diagnostics.attention(run.path), run.title)
-
-
 def _training(runs: Sequence[_Run]) -> Figure:
     curves: dict[str, list[Mapping[int, float]]] = {}
     for run in runs:
-        logged = read_metrics(run.path / "policy").get("validation_loss", {})
-        if logged:
+        if logged := read_metrics(run.path / "policy").get("validation_loss"):
             curves.setdefault(run.method, []).append(logged)
     if not curves:
         raise InputError(f"{runs[0].path.parent}: no run has logged a validation loss yet")
@@ -210,23 +192,29 @@ def _training(runs: Sequence[_Run]) -> Figure:
 
 def _plan_rows(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     yield from _plan_robustness([row for row in rows if row.suite == ROBUSTNESS])
-    yield from _plan_tables(
-        [row for row in rows if row.suite == SCORES and row.checkpoint == "last"]
+    last = [row for row in rows if row.checkpoint == "last"]
+    # Of several target returns the best, as the printed tables.
+    tables = grouped(
+        [row for row in last if row.suite == SCORES],
+        lambda row: (row.conditions["budget"], row.table),
     )
-    yield from _plan_targets([row for row in rows if _has_target(row)])
-    swept = [row.as_line() for row in rows if _is_of_lambda(row)]
-    for budget, budget_rows in grouped(swept, lambda line: line.get("budget", "rows")).items():
-        if len({line["lambda_mask"] for line in budget_rows}) > 1:
-            yield _Plan("lambda", budget, partial(plots.lambda_curves, budget_rows))
-
-
-def _plan_tables(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
-    """Of several target returns the best, as the printed tables."""
-    tables = grouped(rows, lambda row: (row.conditions["budget"], row.table))
     for (budget, table), table_rows in tables.items():
         lines = [row.as_line() for row in select_best_target(table_rows)]
         draw = partial(plots.score_panels, lines, f"{table}, budget {budget}")
         yield _Plan("scores", f"{budget}-{table}", draw)
+    clean = [row for row in last if not row.details.get("distractors")]
+    targets = [row for row in clean if row.suite == EVALUATE and row.target_return is not None]
+    yield from _plan_targets(targets)
+    swept = [
+        row.as_line()
+        for row in clean
+        if (row.method == "ucf" or row.method.startswith("ucf-lambda"))
+        and row.table in ("lambda", EVALUATE)
+        and row.conditions.get("lambda_mask") is not None
+    ]
+    for budget, budget_rows in grouped(swept, lambda line: line.get("budget", "rows")).items():
+        if len({line["lambda_mask"] for line in budget_rows}) > 1:
+            yield _Plan("lambda", budget, partial(plots.lambda_curves, budget_rows))
 
 
 def _plan_robustness(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
@@ -256,17 +244,3 @@ def _plan_targets(rows: Sequence[ResultRow]) -> Iterator[_Plan]:
     for task, task_rows in grouped(rows_with_targets, lambda row: row.task).items():
         lines = [row.as_line() for row in task_rows]
         yield _Plan("returns", task, partial(plots.return_curves, lines, task))
-
-
-def _has_target(row: ResultRow) -> bool:
-    """Whether `row` is of no table, and of a policy with a target return."""
-    whole = row.suite == EVALUATE and row.checkpoint == "last"
-    return whole and not row.details.get("distractors") and row.target_return is not None
-
-
-def _is_of_lambda(row: ResultRow) -> bool:
-    """Whether `row` is UCF's, complete but for its λ."""
-    whole = row.method == "ucf" or row.method.startswith("ucf-lambda")
-    of_table = row.table in ("lambda", EVALUATE) and row.checkpoint == "last"
-    clean = not row.details.get("distractors")
-    return whole and of_table and clean and row.conditions.get("lambda_mask") is not None

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ucfrec.arrays import Float64Array
-from ucfrec.reporting.charts import COLUMN, OURS, PAGE, PLAIN, styled
+from ucfrec.reporting.charts import COLUMN, OURS, PAGE, PLAIN, file_style
 from ucfrec.results.statistics import summary
 
 Row = Mapping[str, Any]
@@ -72,12 +72,13 @@ def colors(names: Iterable[str]) -> dict[str, str]:
     return {name: _FIXED.get(name) or next(free) for name in listed}
 
 
-@styled
+@file_style()
 def move_histogram(
     edges: Sequence[float], counts: Sequence[int], band: tuple[float, float], title: str = ""
 ) -> Figure:
     """Accepted edits by the length of their move, with the band (Figures 5 and 6, left)."""
-    figure, axes = _figure(COLUMN, 2.1, title)
+    length = r"length of the move $\|\Delta\|_2$ (standard deviations)"
+    figure, axes = _figure(COLUMN, 2.1, title, length, "accepted edits (%)")
     shares = 100 * np.asarray(counts) / max(1, sum(counts))
     axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=FACTUAL, edgecolor="white")
     for bound, name in zip(band, (r"$\rho_\mathrm{low}$", r"$\rho_\mathrm{high}$"), strict=True):
@@ -88,12 +89,10 @@ def move_histogram(
         )  # fmt: skip
     axes.set_xlim(0, 1.12 * max(edges[-1], band[1]))
     axes.set_ylim(0, 1.18 * max(shares.max(), 1e-9))
-    axes.set_xlabel(r"length of the move $\|\Delta\|_2$ (standard deviations)")
-    axes.set_ylabel("accepted edits (%)")
     return figure
 
 
-@styled
+@file_style()
 def acceptance_heatmap(
     lows: Sequence[float],
     highs: Sequence[float],
@@ -106,7 +105,8 @@ def acceptance_heatmap(
     Args:
         acceptance: (lows, highs) from 0 to 1, NaN where there is no such band.
     """
-    figure, axes = _figure(COLUMN, 2.6, title)
+    names = [rf"$\rho_\mathrm{{{side}}}$ (standard deviations)" for side in ("high", "low")]
+    figure, axes = _figure(COLUMN, 2.6, title, *names)
     image = axes.imshow(100 * acceptance, vmin=0, vmax=100, origin="lower", aspect="auto")
     axes.spines[["left", "bottom"]].set_visible(False)
     dark = colormaps[image.get_cmap().name]
@@ -124,13 +124,11 @@ def acceptance_heatmap(
     axes.set_xticks(range(len(highs)), [f"{value:g}" for value in highs])
     axes.set_yticks(range(len(lows)), [f"{value:g}" for value in lows])
     axes.tick_params(length=0)
-    axes.set_xlabel(r"$\rho_\mathrm{high}$ (standard deviations)")
-    axes.set_ylabel(r"$\rho_\mathrm{low}$ (standard deviations)")
     figure.colorbar(image, ax=axes, label="acceptance (%)", shrink=0.9)
     return figure
 
 
-@styled
+@file_style()
 def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") -> Figure:
     """Factual and edited states in the factual ones' first two principal components (Figures 5, 6).
 
@@ -161,35 +159,32 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
     return figure
 
 
-@styled
+@file_style()
 def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """Normalised score over λ, a line a dataset, mean ± standard deviation over seeds (Figure 2).
 
     Args:
         rows: lines (`ResultRow.as_line`) that differ in `task`, `lambda_mask` and `training_seed`.
     """
-    figure, axes = _figure(COLUMN, 2.5, title)
+    weight = r"weight of the mask loss $\lambda$"
+    figure, axes = _figure(COLUMN, 2.5, title, weight, "normalised score")
     places = sorted({row["lambda_mask"] for row in rows})
     scores = _group_seeds(rows, ("task", "lambda_mask"), "score")
     datasets = sorted({row["task"] for row in rows})
     for dataset, color in colors(datasets).items():
         at = [i for i, value in enumerate(places) if (dataset, value) in scores]
-        summaries = [summary(scores[dataset, places[i]]) for i in at]
-        mean, sd = (
-            np.array([getattr(point, name) for point in summaries]) for name in ("mean", "sd")
-        )
+        points = [summary(scores[dataset, places[i]]) for i in at]
+        mean, sd = np.array([(point.mean, point.sd) for point in points]).T
         axes.plot(at, mean, "o-", color=color, label=dataset)
         axes.fill_between(at, mean - sd, mean + sd, color=color, alpha=0.2, linewidth=0)
     # Places stand apart evenly: 0 has no place on a logarithmic axis.
     axes.set_xticks(range(len(places)), [f"{value:g}" for value in places])
-    axes.set_xlabel(r"weight of the mask loss $\lambda$")
-    axes.set_ylabel("normalised score")
     axes.grid(True, axis="y")
     _legend_below(figure, axes, 2)
     return figure
 
 
-@styled
+@file_style()
 def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """Return reached over target return, a line a method: mean over seeds, lowest to highest around
     it. On the dashed line, the target is reached.
@@ -197,7 +192,7 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     Args:
         rows: lines (`ResultRow.as_line`) that differ in `method`, `target_return` and seed.
     """
-    figure, axes = _figure(COLUMN, 2.5, title)
+    figure, axes = _figure(COLUMN, 2.5, title, "target return", "return achieved")
     reached = _group_seeds(rows, ("method", "target_return"), "return")
     for method, color in colors(sorted({row["method"] for row in rows})).items():
         at = sorted(target for name, target in reached if name == method)
@@ -211,14 +206,12 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     axes.plot([0, max(targets)], [0, max(targets)], "--", color="black", linewidth=0.9)
     axes.set_xlim(0, 1.03 * max(targets))
     axes.set_ylim(0, 1.1 * top)
-    axes.set_xlabel("target return")
-    axes.set_ylabel("return achieved")
     axes.grid(True)
     _legend_below(figure, axes, 4)
     return figure
 
 
-@styled
+@file_style()
 def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
     """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
 
@@ -227,7 +220,7 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
     Args:
         rows: with `method`, `distractor`, `training_seed` and `value`, in the order to be drawn.
     """
-    figure, axes = _figure(PAGE, 2.4, title)
+    figure, axes = _figure(PAGE, 2.4, title, ylabel=ylabel)
     values_by_bar = _group_seeds(rows, ("method", "distractor"), value)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     kinds = list(dict.fromkeys(row["distractor"] for row in rows))
@@ -243,13 +236,12 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xticks(range(len(methods)), [label(method) for method in methods])
     axes.tick_params(axis="x", length=0)
-    axes.set_ylabel(ylabel)
     axes.grid(True, axis="y")
     _legend_below(figure, axes, len(kinds))
     return figure
 
 
-@styled
+@file_style()
 def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     """Normalised scores as bars, a panel a dataset: mean over seeds, with its standard error
     (Tables 1, 3, 9 and 10).
@@ -281,7 +273,7 @@ def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     return figure
 
 
-@styled
+@file_style()
 def training_curves(
     curves: Mapping[str, Sequence[Mapping[int, float]]], ylabel: str, title: str = ""
 ) -> Figure:
@@ -291,7 +283,7 @@ def training_curves(
         curves: for each method, {step: value} of each seed; steps that not all seeds have are left
             out.
     """
-    figure, axes = _figure(COLUMN, 2.5, title)
+    figure, axes = _figure(COLUMN, 2.5, title, "training step", ylabel)
     for method, color in colors(curves).items():
         steps = sorted(set.intersection(*(set(seed) for seed in curves[method])))
         values = np.array([[seed[step] for step in steps] for seed in curves[method]])
@@ -300,21 +292,15 @@ def training_curves(
             steps, values.min(axis=0), values.max(axis=0), color=color, alpha=0.2, linewidth=0
         )
     axes.set_xlim(left=0)
-    axes.set_xlabel("training step")
-    axes.set_ylabel(ylabel)
     axes.grid(True)
     _legend_below(figure, axes, 4)
     return figure
 
 
-@styled
+@file_style()
 def attention_map(weights: Float64Array, title: str = "") -> Figure:
-    """How much the state token of every step of a window attends to every earlier token.
-
-    Args:
-        weights: (K, 3, K): a row for each querying step, then returns-to-go, states and actions of
-            each step.
-    """
+    """How much the state token of every step of a window attends to every earlier token: (K, 3, K)
+    weights by querying step, modality (return-to-go, state, action) and step."""
     figure = Figure(figsize=(PAGE, 2.5))
     figure.suptitle(title, fontsize=8)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
@@ -335,10 +321,15 @@ def attention_map(weights: Float64Array, title: str = "") -> Figure:
     return figure
 
 
-def _figure(width: float, height: float, title: str) -> tuple[Figure, Axes]:
+def _figure(
+    width: float, height: float, title: str, xlabel: str = "", ylabel: str = ""
+) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width, height))
     figure.suptitle(title, fontsize=8)
-    return figure, figure.subplots()
+    axes = figure.subplots()
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    return figure, axes
 
 
 def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:

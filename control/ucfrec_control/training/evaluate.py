@@ -18,7 +18,7 @@ from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
@@ -57,8 +57,7 @@ def evaluate_run(
     checkpoint; they and behaviour cloning take no target return.
 
     Args:
-        run: a run folder on a control store.
-        seed: seed of the environments and the bootstrap.
+        seed: of the environments and the bootstrap.
         env_id: environment to evaluate in; None for that of the data.
         targets: target returns, None for the largest that the policy expects in each state; empty
             for those of the preset, or that one if the policy was trained to know it.
@@ -133,14 +132,8 @@ def open_environment(
     distractor: float = 0.0,
     **settings: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`count` environments that show what was logged where the policy was trained.
-
-    Distractors are fixed to `distractor`.
-
-    Args:
-        wrappers: wrappers around each of them.
-        distractor: value that every distractor is fixed to.
-        settings: arguments of the environment, over those of the data.
+    """`count` environments that show what was logged where the policy was trained, distractors
+    fixed to `distractor`; `settings` are arguments over those of the data.
 
     Raises:
         InputError: `env_id` cannot be made, or its sizes are not those of the training.
@@ -261,7 +254,7 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
     dropped = trained.dropped
-    _, validation = training_views(without_columns(store, dropped))
+    _, validation = training_views(drop_columns(store, dropped))
     generator = np.random.default_rng(0)
     sources = trained.record.data.others.get("distractors", [])
     distractors = [distractor["dimension"] for distractor in sources]

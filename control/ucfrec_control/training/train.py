@@ -52,17 +52,13 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     targets: list[float] = []
     text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
-        if not all(_names(rule.get(key, value), value) for key, value in run.items()):
+        named = {key: rule.get(key, value) for key, value in run.items()}
+        if any(run[k] not in ([n] if isinstance(n, str) else n) for k, n in named.items()):
             continue
         for table, values in rule.get("set", {}).items():
             tables[table] = tables.get(table, {}) | values
         targets = rule.get("targets", targets)
     return Preset(tables, tuple(targets))
-
-
-def _names(names: str | list[str], value: str) -> bool:
-    """Whether a rule's `given` is `value`, or names it among others."""
-    return value in ([names] if isinstance(names, str) else names)
 
 
 def dataset_of(store: EpisodeStore) -> Mapping[str, Any]:

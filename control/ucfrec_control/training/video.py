@@ -40,13 +40,10 @@ def record_episode(
     frames.
 
     Args:
-        run: a run folder on a control store.
         out: `NAME.mp4`, or a folder for `frame-00000.png`, …; the first frame is the initial state.
             It is written when the episode has ended.
-        checkpoint: "last" or "best".
-        env_id: environment to act in; None for that of the data.
+        checkpoint, env_id, distractor: as of `evaluate_run`.
         target: target return; None for the preset's first.
-        distractor: value that every distractor is fixed to.
 
     Raises:
         InputError: as `evaluate_run`, or `out` exists, or the environment cannot be rendered.

@@ -57,27 +57,16 @@ class Log:
 
 
 def built_in(name: str, behaviors: Sequence[str], folder: Path, log: Log) -> Task:
-    """An environment of this package that needs no logs, with logs of its mixture of behaviors.
-
-    Args:
-        behaviors: built-in policies that are evaluated as references.
-    """
+    """An environment of this package that needs no logs, with logs of its mixture of behaviors, and
+    those that are evaluated as references."""
     environment = Environment(name)
     store = collect_store(environment, folder, log.sessions, log.seed)
     return Task(environment.title, store, (environment,), tuple(behaviors))
 
 
 def sardine(name: str, folder: Path, log: Log) -> Task:
-    """An environment of SARDINE, with logs of its mixture of oracles.
-
-    A twelfth of the sessions are collected, because they have 100 steps.
-
-    Args:
-        name: `sardine-static` or `sardine-boredinf`.
-
-    Raises:
-        InputError: `sardine-rec` is not installed.
-    """
+    """An environment of SARDINE, with logs of its mixture of oracles; a twelfth of the sessions are
+    collected, because they have 100 steps."""
     return simulated(Environment(name), folder, replace(log, sessions=max(1, log.sessions // 12)))
 
 

@@ -18,11 +18,7 @@ MASK: Final = ExitRule(window=10, threshold=0, max_turn=100)
 
 
 class _Insider(Memoryless):
-    """A policy that reads the environment itself, not what `info` says of it.
-
-    Raises:
-        InputError: `env` is not a Kuaishou environment.
-    """
+    """A policy that reads the environment itself, not what `info` says of it."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
         if not isinstance(env.unwrapped, KuaiEnv):

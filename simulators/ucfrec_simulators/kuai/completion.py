@@ -105,11 +105,7 @@ class Completed:
     """The completed table, computed on access and indexed like an array (see `Rewards`)."""
 
     def __init__(self, users: Float32Array, items: Float32Array) -> None:
-        """
-        Args:
-            users: (n_users, D).
-            items: (n_items, D).
-        """
+        """The table of users (n_users, D) and items (n_items, D)."""
         self._users, self._items = users, items
         self.shape = (len(users), len(items))
 

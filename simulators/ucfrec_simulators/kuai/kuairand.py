@@ -35,7 +35,6 @@ def kuairand(
     """The environment of KuaiRand's users × videos; the reward is the probability of a click.
 
     Args:
-        num_envs: number of parallel sessions, N.
         folder: written by `ucfrec_simulators.kuai.completion.complete`; None for
             `kuairand-environment` in the data folder.
 

@@ -29,7 +29,6 @@ def kuairec(
     observed.
 
     Args:
-        num_envs: number of parallel sessions, N.
         folder: has `small_matrix.csv` and `item_categories.csv`; None for `kuairec` in the data
             folder.
 

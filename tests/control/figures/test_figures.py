@@ -12,7 +12,6 @@ from tests.support.control_files import TINY, control, set_options, write_made
 from tests.support.result_rows import result_row
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes
-from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.results.rows import append_rows
@@ -56,12 +55,8 @@ def test_bars_are_as_high_as_the_drops_of_their_rows() -> None:
     rows = [
         result_row(
             50.0 - 7 * i * j - s,
-            metric="score",
-            task="d",
-            method=m,
-            training_seed=s,
-            conditions={"distractor": k},
-            metrics={"score_at_one": 0.0},
+            **{"metric": "score", "task": "d", "method": m, "training_seed": s},
+            **{"conditions": {"distractor": k}, "metrics": {"score_at_one": 0.0}},
         )
         for i, m in enumerate(("dt", "ucf", "ucf-screened"))
         for j, k in enumerate(("none", "deterministic", "early"))
@@ -193,16 +188,6 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     np.testing.assert_array_equal(as_given.get_xydata(), [[0, 0], [2000, 2000]])
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [("{}", "holds no list of result rows"), ("[1]", "row 1 is not a result row")],
-)
-def test_json_of_something_else_is_refused(tmp_path: Path, content: str, says: str) -> None:
-    (tmp_path / "x.json").write_text(content)
-    with pytest.raises(InputError, match=rf"x\.json.* {says}|x\.json, {says}"):
-        make_figures([], [tmp_path / "x.json"], tmp_path)
-
-
 def test_one_command_draws_what_it_can_and_names_what_is_missing(
     runs: Path, tmp_path: Path
 ) -> None:
@@ -210,18 +195,9 @@ def test_one_command_draws_what_it_can_and_names_what_is_missing(
     results, evaluated, out, copied = (tmp_path / name for name in names)
     targets = ("--target", 1000, "--target", 3000, "--episodes", 1, "--json", evaluated)
     control("evaluate", runs / "tangent", *targets)
-    rows = [
-        result_row(
-            value,
-            metric="score",
-            suite="control",
-            table="lambda",
-            method="ucf",
-            checkpoint="last",
-            conditions={"budget": "small", "lambda_mask": value},
-        )
-        for value in (0.0, 0.1)
-    ]
+    about = {"suite": "control", "table": "lambda", "method": "ucf", "checkpoint": "last"}
+    of = [{"budget": "small", "lambda_mask": weight} for weight in (0.0, 0.1)]
+    rows = [result_row(1.0, metric="score", **about, conditions=each) for each in of]
     append_rows(results, rows)
     shutil.copytree(runs, copied)
     write_run(copied / "tangent", {"store": str(tmp_path / "gone")})

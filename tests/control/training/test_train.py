@@ -39,10 +39,6 @@ def store(folder: Path) -> EpisodeStore:
     return EpisodeStore.open(folder / "store")
 
 
-def test_every_twentieth_trajectory_is_for_validation(store: EpisodeStore) -> None:
-    assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
-
-
 def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> None:
     run, out = folder / "store-run", tmp_path / "rows.json"
     printed, said = control("evaluate", run, "--episodes", 3, "--json", out)
@@ -110,13 +106,15 @@ def test_data_does_not_choose_what_is_imported(
 def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
     store: EpisodeStore, tmp_path: Path
 ) -> None:
-    episodes, steps = store.all_steps()
-    rewards = store.step_values(schema.REWARD, episodes, steps)
+    steps = store.all_steps()
+    rewards = store.step_values(schema.REWARD, *steps)
+    before = store.step_values(schema.OBSERVATION, *steps)
     bit = (rewards > np.median(rewards)).astype(np.float32)
+    # Every twentieth trajectory is for validation.
+    assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
     for flip, agreement in ((0.0, 1.0), (0.15, 0.85)):
         other = add_distractor(store, tmp_path / str(flip), flip, seed=1)
-        seen = other.step_values(schema.OBSERVATION, episodes, steps)
-        before = store.step_values(schema.OBSERVATION, episodes, steps)
+        seen = other.step_values(schema.OBSERVATION, *steps)
         np.testing.assert_array_equal(seen[:, :-1], before)
         assert (seen[:, -1] == bit).mean() == pytest.approx(agreement, abs=0.05)
         for name in (schema.SPLIT, schema.TERMINATED):
@@ -203,15 +201,6 @@ def test_presets_are_configurations_with_targets() -> None:
         assert dc.policy.return_scale == 1000
     assert find_preset("halfcheetah", "medium", "dt").targets == (12000, 6000)
     assert find_preset("walker2d", "mixed", "lsdt").targets == (10000,)
-
-
-def test_settings_win_over_presets(tmp_path: Path) -> None:
-    file = tmp_path / "x.toml"
-    file.write_text("[train]\nsteps = 7\nwarmup_steps = 3\n")
-    presets = {"train": {"steps": 5, "warmup_steps": 5, "learning_rate": 0.5}}
-    config = resolve_config("dt", file, ["train.warmup_steps=2"], presets=presets)
-    assert (config.train.steps, config.train.warmup_steps) == (7, 2)
-    assert config.train.learning_rate == 0.5
 
 
 def test_help_needs_none_of_the_extras() -> None:

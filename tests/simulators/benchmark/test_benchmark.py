@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
@@ -57,19 +56,22 @@ def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> None:
     # Each run acts by its own rule.
     runs = {TrainedPolicy.load(path.parent).rule for path in out.rglob(RUN)}
-    told = {f"{rule} ({rule.hash})" for rule in runs}
-    assert {row.rule for row in rows if row.training_seed is not None} == told
-    assert {row.target_return for row in rows if row.method == "dt+shared"} <= {
-        r.target for r in runs
-    }
-    assert {r.conditions.get("quantiles") for r in rows if r.training_seed is not None} == {"rule"}
+    trained = [row for row in rows if row.training_seed is not None]
+    assert {row.rule for row in trained} == {f"{rule} ({rule.hash})" for rule in runs}
+    assert {row.conditions.get("quantiles") for row in trained} == {"rule"}
+    of_dt = [row for row in rows if row.method == "dt+shared"]
+    assert {row.target_return for row in of_dt} <= {rule.target for rule in runs}
     records = [read_json(path) for path in out.rglob(RUN)]
     own = [record["rule"]["estimate"] for record in records if "rule" in record]
-    of_dt = [row.metrics for row in rows if row.method == "dt+shared"]
-    assert len(own) == len(of_dt)
-    assert {each["estimated_value"] for each in of_dt} == {each["value"] for each in own}
-    assert {each["estimated_value_error"] for each in of_dt} == {each["error"] for each in own}
-    assert not any("estimated_value" in row.metrics for row in rows if row.method != "dt+shared")
+    names = ("estimated_value", "estimated_value_error")
+    assert sorted(tuple(row.metrics[name] for name in names) for row in of_dt) == sorted(
+        (each["value"], each["error"]) for each in own
+    )
+    assert not any("estimated_value" in row.metrics for row in rows if row not in of_dt)
+
+
+def times_of(folder: Path, name: str) -> set[int]:
+    return {path.stat().st_mtime_ns for path in folder.rglob(name)}
 
 
 @pytest.mark.slow
@@ -113,7 +115,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert show(suite, ["main", "sweeps"], rows) in said
     # Trained and simulated again: the same numbers.
     monkeypatch.setattr(plan, "METHODS", {"popular": METHODS["popular"]})
-    weights = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
+    weights = times_of(tmp_path / "out", "best.safetensors")
     measured(suite, replace(request, again=True))
     again = read_rows(results)
     assert len(again) == len(rows)
@@ -121,8 +123,7 @@ def test_rows_are_those_of_the_evaluation_and_are_measured_once(
     assert methods == [*4 * ["dt+shared"], "random", "mixture", "optimal", *4 * ["popular"]]
     first, second = (sorted((r.method, str(r.log_seed), r.value) for r in x) for x in (rows, again))
     assert first == second
-    left = [path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("best.safetensors")]
-    assert len(set(left) - set(weights)) == 4
+    assert len(times_of(tmp_path / "out", "best.safetensors") - weights) == 4
     seeds = replace(request, evaluation_seed=5, log_seed=3, logs=1)
     measured(suite, seeds)
     last = read_rows(results)[-1]
@@ -167,46 +168,34 @@ def test_sardine_is_left_out_where_it_is_not_installed(
 def test_every_cell_of_every_table_has_a_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    budget = replace(TINY, seeds=1, tasks=("synthetic-taobao", "synthetic-catalog"))
-    budget = replace(
-        budget,
-        tasks_of={
-            "shared": ("synthetic-catalog",),
-            "sweeps": ("synthetic-taobao",),
-            "distractor": ("synthetic-taobao",),
-        },
-    )
+    pages, catalog = ("synthetic-taobao",), ("synthetic-catalog",)
+    tasks_of = {"shared": catalog, "sweeps": pages, "distractor": pages}
+    budget = replace(TINY, seeds=1, tasks=(*pages, *catalog), tasks_of=tasks_of)
     given = planned(tmp_path, budget)
-    every = [
-        *given.cells("main"),
-        *given.cells("shared"),
-        *given.cells("sweeps"),
-        *given.cells("distractor"),
-    ]
-    trained = [cell for cell in every if cell.store is not None]
+    tables = {name: list(given.cells(name)) for name in ("main", *tasks_of)}
+    trained = [cell for cells in tables.values() for cell in cells if cell.store is not None]
     folders = {(cell.run, cell.config) for cell in trained}
     assert len({run for run, _ in folders}) == len(folders), "a folder for every configuration"
     assert {cell.method for cell in trained} >= {"ucf", "ucf, λ = 0", "ucf, band 1–2"}
-    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "item-knn"]
-    assert not [c for c in trained if c.task == "synthetic-taobao" and c.method == "dt+shared"]
+    of_pages = {cell.method for cell in trained if cell.task in pages}
+    assert not of_pages & {"item-knn", "dt+shared"}
     plain, plus = (
-        next(c.config for c in trained if c.method == method and c.task == "synthetic-catalog")
+        next(c.config for c in trained if c.method == method and c.task in catalog)
         for method in ("dt", "dt+shared")
     )
     assert (plain.policy.exposure, plain.rule.choose) == (False, False)
     assert (plus.policy.exposure, plus.rule.choose) == (True, True)
-    swept = {cell.method: cell.config for cell in given.cells("sweeps")}
+    swept = {cell.method: cell.config for cell in tables["sweeps"]}
     smallest = swept["ucf, ε_r = 0.02 σ"].augment.epsilon_r
-    rewards = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
-    catalog = rewards.step_values("reward", *rewards.all_steps())
-    assert smallest == pytest.approx(0.02 * catalog.std())
-    distractors = [cell for cell in given.cells("distractor") if cell.task.endswith("distractor")]
+    store = EpisodeStore.open(trained[0].store)  # type: ignore[arg-type]
+    rewards = store.step_values("reward", *store.all_steps())
+    assert smallest == pytest.approx(0.02 * rewards.std())
+    distractors = [cell for cell in tables["distractor"] if cell.task.endswith("distractor")]
     planted = EpisodeStore.open(distractors[0].store)  # type: ignore[arg-type]
     assert planted.observation_size == 92
     assert [environment.rate for environment in distractors[0].environments] == [0.0, 1.0]  # type: ignore[attr-defined]
-    assert {cell.evaluation.target_quantile for cell in given.cells("distractor")} == {1.0, 0.99}
-    for table in ("main", "shared", "sweeps", "distractor"):
-        cells = list(given.cells(table))
+    assert {cell.evaluation.target_quantile for cell in tables["distractor"]} == {1.0, 0.99}
+    for cells in tables.values():
         paper = [cell for cell in cells if cell.method == "ucf-paper"]
         assert {cell.task for cell in paper} == {cell.task for cell in cells}
 
@@ -227,7 +216,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)
@@ -247,23 +236,9 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     assert run is not None
     screening = read_record(run).screening
     assert screening is not None
-    flagged = screening.flagged
-    assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {tuple(flagged)}
-    assert TrainedPolicy.load(run).dropped == tuple(flagged)
-
-
-def test_unknown_tables_and_budgets_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["benchmark", "recommendation", "--out", str(tmp_path / "out")]
-    assert main([*arguments, "--table", "table-2"]) == 2
-    assert (
-        "no table is called table-2; there are main, shared, distractor" in capsys.readouterr().err
-    )
-    suite: Benchmark = load_plugin("benchmarks", "recommendation")
-    with pytest.raises(InputError, match="no budget is called huge"):
-        measured(suite, BenchmarkRequest("huge", ["main"], tmp_path, tmp_path / "rows.jsonl", 1))
-    assert not (tmp_path / "out").exists()
+    flagged = tuple(screening.flagged)
+    assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {flagged}
+    assert TrainedPolicy.load(run).dropped == flagged
 
 
 def test_tables_of_rows_at_hand_are_shown_without_measuring(
@@ -278,6 +253,8 @@ def test_tables_of_rows_at_hand_are_shown_without_measuring(
     assert "| w | m | 2 | 11.5 ± 12 |" in capsys.readouterr().out, "the last of a seed counts"
     assert main([*arguments, "--table", "sweeps"]) == 2
     assert "has no rows of recommendation, sweeps" in capsys.readouterr().err
+    assert main(["benchmark", "recommendation", "--out", "out", "--table", "table-2"]) == 2
+    assert "no table is called table-2; there are main, shared, dist" in capsys.readouterr().err
 
 
 def test_a_given_log_is_dealt_out_by_session() -> None:
@@ -291,14 +268,8 @@ def test_a_given_log_is_dealt_out_by_session() -> None:
 
 
 def test_windows_drop_repeats_and_are_cut(tmp_path: Path) -> None:
-    log = pa.table(
-        {
-            "user_id": [2, 1, 1, 1, 1, 2],
-            "video_id": [7, 5, 5, 6, 8, 9],
-            "time_ms": [50, 20, 20, 10, 30, 5],
-            "date": [1, 1, 1, 1, 1, 2],
-        }
-    )
+    users, videos, times = [2, 1, 1, 1, 1, 2], [7, 5, 5, 6, 8, 9], [50, 20, 20, 10, 30, 5]
+    log = pa.table({"user_id": users, "video_id": videos, "time_ms": times, "date": [1] * 5 + [2]})
     pa.parquet.write_table(log, tmp_path / "log.parquet")
     rows = window([tmp_path / "log.parquet"], "time_ms", "date = 1")
     assert rows["video_id"].to_pylist() == [6, 5, 8, 7]
@@ -334,12 +305,12 @@ def test_kuairand_learns_from_what_came_before_its_environments(tmp_path: Path) 
         ({"tasks": ["nowhere"]}, "no task is called nowhere"),
         ({"training_seeds": 0}, "0 training seeds are requested"),
         ({"logs": 0}, "0 logs are requested"),
+        ({"budget": "huge"}, "no budget is called huge"),
     ],
 )
 def test_unknown_cells_are_refused(given: dict[str, Any], message: str, tmp_path: Path) -> None:
-    suite = load_plugin("benchmarks", "recommendation")
+    suite, out = load_plugin("benchmarks", "recommendation"), tmp_path / "out"
+    asked = {"budget": "small", "tables": ["main"], "results": tmp_path / "rows.jsonl"}
     with pytest.raises(InputError, match=message):
-        measured(
-            suite,
-            BenchmarkRequest("small", ["main"], tmp_path, tmp_path / "rows.jsonl", 1, **given),
-        )
+        measured(suite, BenchmarkRequest(**{**asked, **given}, out=out, workers=1))
+    assert not out.exists()

@@ -14,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import Plain
+from tests.support.played import play
 from tests.support.single_session import SingleSession
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
-from ucfrec.acting.rollout import Step, Uniform, rollout
+from ucfrec.acting.rollout import Uniform, rollout
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.states import ItemStates
 from ucfrec.errors import InputError
@@ -95,11 +96,8 @@ def test_gymnasium_accepts_it() -> None:
 @pytest.mark.parametrize("choose", [Uniform, Oracle, RandomMask])
 def test_regimes_mask_and_end_as_stated(regime: str, choose: Any) -> None:
     env = small(regime=regime)
-    steps: list[Step] = []
-    played = rollout(env, choose(env, 0), 60, seed=1, on_step=steps.append)
-    episodes = np.concatenate([step.episodes for step in steps])
-    items = np.concatenate([step.actions for step in steps])
-    shown = [items[episodes == e] for e in range(60)]
+    played, steps = play(env, choose(env, 0), 60, seed=1)
+    shown = [steps["actions"][steps["episodes"] == e] for e in range(60)]
     repeats = any(len(set(s.tolist())) < len(s) for s in shown)
     if regime == "NX_10":
         assert (played.lengths == 10).all()
@@ -108,18 +106,12 @@ def test_regimes_mask_and_end_as_stated(regime: str, choose: Any) -> None:
     # Seven tags and a memory of ten: everybody is bored by the eighth item.
     assert repeats or regime != "FB" or choose is not Uniform
     assert not repeats or regime == "FB"
-    users = np.concatenate([step.user_ids for step in steps if step.user_ids is not None])
-    assert set(users) <= set((np.arange(7) * 10 + 5).tolist())
+    assert set(steps["user_ids"]) <= set((np.arange(7) * 10 + 5).tolist())
 
 
 def test_random_items_have_no_tag_of_the_last_ten_and_are_otherwise_uniform() -> None:
-    env = KuaiEnv(
-        4000,
-        np.ones((1, 40), dtype=np.float32),
-        [(n % 20,) for n in range(40)],
-        EXITS["dorl-main"],
-        REGIMES["FB"],
-    )
+    tags_of = [(n % 20,) for n in range(40)]
+    env = KuaiEnv(4000, np.ones((1, 40), np.float32), tags_of, EXITS["dorl-main"], REGIMES["FB"])
     env.reset(seed=0)
     actor, tags = RandomMask(env, 3), []
     for _ in range(12):

@@ -1,5 +1,6 @@
 """Logs of a DDPG agent: exact densities, what it learned from is what is logged, it learns."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tests.support.played import play
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.arrays import Float32Array
 from ucfrec.errors import InputError
@@ -21,19 +23,11 @@ from ucfrec_simulators.taobao import synthetic as synthetic_taobao
 from ucfrec_simulators.taobao.ddpg import DdpgConfig
 from ucfrec_simulators.taobao.synthetic import SyntheticTaobao
 
-SMALL = DdpgConfig(
-    sessions=300,
-    snapshots=3,
-    warm_up=160,
-    updates=0.1,
-    batch_size=64,
-    buffer_size=20_000,
-    hidden=32,
+QUICK = {"updates": 0.1, "batch_size": 64, "buffer_size": 20_000, "hidden": 32}
+SMALL = DdpgConfig(sessions=300, snapshots=3, warm_up=160, **QUICK)
+needs_sb3 = pytest.mark.skipif(
+    find_spec("stable_baselines3") is None, reason="the extra collect is not installed"
 )
-
-
-def need_sb3() -> None:
-    pytest.importorskip("stable_baselines3", reason="needs ucfrec[collect]")
 
 
 @pytest.fixture(autouse=True)
@@ -75,8 +69,8 @@ def test_draws_follow_the_density(mean: float) -> None:
     assert (within / density).mean() == pytest.approx(length, rel=0.05)
 
 
+@needs_sb3
 def test_what_it_learns_from_is_what_is_logged() -> None:
-    need_sb3()
     env = SyntheticTaobao(16)
     agent = ddpg.Training(env, 0, SMALL)
     steps: list[Step] = []
@@ -108,20 +102,18 @@ class Slope(SyntheticTaobao):
         return 0.5 + 0.45 * (actions * self.corner).mean(axis=1)
 
 
+@needs_sb3
 @pytest.mark.slow
 def test_it_learns() -> None:
-    need_sb3()
     config = DdpgConfig(warm_up=3000, updates=1 / 16, batch_size=128, hidden=64)
-    rewards: list[Float32Array] = []
     env = Slope(128)
-    rollout(env, ddpg.Training(env, 0, config), 1500, 0, lambda s: rewards.append(s.rewards))
-    clicks = np.concatenate(rewards)
+    clicks = play(env, ddpg.Training(env, 0, config), 1500, 0)[1]["rewards"]
     assert clicks[:3000].mean() == pytest.approx(5, abs=0.2)
     assert clicks[-2000:].mean() > 7
 
 
+@needs_sb3
 def test_a_log_of_the_training_holds_its_densities(tmp_path: Path) -> None:
-    need_sb3()
     env = SyntheticTaobao(16)
     actor = ddpg.Training(env, 0, SMALL)
     simulator = synthetic_taobao.SIMULATOR
@@ -134,38 +126,26 @@ def test_a_log_of_the_training_holds_its_densities(tmp_path: Path) -> None:
     assert (density[warm:] != np.float32(0.5**27)).all()
 
 
+@needs_sb3
 @pytest.mark.slow
 def test_each_session_is_served_by_one_snapshot() -> None:
-    need_sb3()
     env = SyntheticTaobao(16)
     networks = ddpg.snapshots(env, 0, SMALL)
-    steps: list[Step] = []
-    rollout(env, ddpg.snapshot_mixture(env, 0, SMALL), 150, 0, steps.append)
-    episodes = np.concatenate([step.episodes for step in steps])
-    actions = np.concatenate([step.actions for step in steps])
-    observations = np.concatenate([step.observations for step in steps])
-    logged = np.concatenate([step.propensities for step in steps if step.propensities is not None])
-    scaled = observations / env.single_observation_space.high
-    explains = np.stack(
-        [
-            np.isclose(
-                reference_density(actions, ddpg._forward(network, scaled), SMALL.noise),
-                logged,
-                rtol=1e-3,
-            )
-            for network in networks
-        ]
-    )
-    servers = [np.flatnonzero(explains[:, episodes == e].all(axis=1)) for e in range(150)]
+    _, steps = play(env, ddpg.snapshot_mixture(env, 0, SMALL), 150, 0)
+    scaled = steps["observations"] / env.single_observation_space.high
+    means = [ddpg._forward(network, scaled) for network in networks]
+    densities = [reference_density(steps["actions"], mean, SMALL.noise) for mean in means]
+    explains = np.isclose(densities, steps["propensities"], rtol=1e-3)
+    of = [steps["episodes"] == e for e in range(150)]
+    servers = [np.flatnonzero(explains[:, own].all(axis=1)) for own in of]
     assert all(len(server) == 1 for server in servers)
     counts = np.bincount(np.concatenate(servers), minlength=3)
     assert (np.abs(counts - 50) < 4 * np.sqrt(150 * 2 / 9)).all()
 
 
+@needs_sb3
 @pytest.mark.slow
 def test_a_training_is_kept_and_its_seed_and_environment_decide_it(cache: Path) -> None:
-    need_sb3()
-
     def weights(environment: int, seed: int) -> np.ndarray:
         env = SyntheticTaobao(16, environment_seed=environment)
         networks = ddpg.snapshots(env, seed, SMALL)

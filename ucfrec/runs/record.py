@@ -224,7 +224,9 @@ class RunRecord(TrainingRecord):
     """Of the training sessions' returns, by share."""
     mean_return: Number
     reference_losses: dict[str, Number] | None = None
-    """See `ucfrec.runs.start.reference_losses`; None if actions are vectors."""
+    """Mean negative log-likelihood (nats) of the logged items over all validation steps: `uniform`
+    if all are equally probable, `popularity` if their probability is their share of the training
+    steps, with one added to every count. None if actions are vectors."""
     dropped_observations: tuple[Count, ...] = ()
     """Columns of the logged observation that the policy does not see, ascending."""
     screening: Screening | None = None

@@ -140,11 +140,7 @@ class TrainedPolicy:
         return trained
 
     def _require_equal_sizes(self) -> None:
-        """Check that the files of the run are of one catalogue and of one size of states.
-
-        Raises:
-            InputError: a file has another size than the run's record states.
-        """
+        """Check that the files of the run are of one catalogue and of one size of states."""
         sizes, states, dropped = self.record.sizes, self.item_states, self.dropped
         most = self.record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
@@ -153,24 +149,21 @@ class TrainedPolicy:
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
         state = self.record.observation_size + (0 if states is None else states.size)
-        sizes_found: dict[str, tuple[Any, Any]] = {}
-        if states is not None:
-            table = (sizes["items"], sizes["action"])
-            sizes_found[ITEM_STATES] = (
-                (table, sizes["state"]),
-                (tuple(states.embeddings.shape), state),
-            )
+        found: dict[str, tuple[Any, Any]] = {}
+        if states is None:
+            found[RUN] = (sizes["state"], state)
         else:
-            sizes_found[RUN] = (sizes["state"], state)
+            table = sizes["items"], sizes["action"], sizes["state"]
+            found[ITEM_STATES] = (table, (*states.embeddings.shape, state))
         # A store that was not made from logs has no tables of items and users.
         if self.item_ids is not None and (self.folder / ITEMS).exists():
-            sizes_found[ITEMS] = (sizes["items"], len(self.item_ids))
+            found[ITEMS] = (sizes["items"], len(self.item_ids))
         if states is not None and len(states.user_features) and (self.folder / USERS).exists():
-            sizes_found[USERS] = (len(states.user_features), len(self.user_ids))
+            found[USERS] = (len(states.user_features), len(self.user_ids))
         if self.counts is not None:
             shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
-            sizes_found[COUNTS] = (((sizes["items"],),) * 2, shapes)
-        for name, (stated, actual) in sizes_found.items():
+            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in found.items():
             if stated != actual:
                 raise InputError(
                     f"{self.folder / name} does not fit the run: it has {actual}, the run "

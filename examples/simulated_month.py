@@ -32,8 +32,7 @@ from ucfrec.off_policy.estimators import cluster_intervals
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.recommending.exposures import ExposureLog
 from ucfrec.recommending.requests import Limits, Request
-from ucfrec.recommending.responder import Answer, Responder
-from ucfrec.recommending.served import Served
+from ucfrec.recommending.responder import Answer, Responder, Served
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.refit import refit_within

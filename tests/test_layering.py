@@ -41,6 +41,7 @@ TESTED_HERE = {
     "tests/control/test_authors_networks.py",
     "tests/control/test_settings.py",
     "tests/logs/test_fuzzed_logs.py",
+    "tests/logs/test_refusals.py",
     "tests/policies/test_known_answers.py",
     "tests/reporting/test_page_items.py",
     "tests/runs/test_precision.py",

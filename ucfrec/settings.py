@@ -4,10 +4,14 @@ The annotation of a field gives its type and range, the assignment its default, 
 below it its meaning; error messages and `ucfrec settings` show all three.
 """
 
+import ast
 import difflib
+import inspect
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import wraps
+from itertools import pairwise
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -33,7 +37,6 @@ _CONFIG: Final = ConfigDict(
     strict=True,
     extra="forbid",
     allow_inf_nan=False,
-    use_attribute_docstrings=True,
 )
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
@@ -134,11 +137,26 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
     Args:
         name: of the table, the prefix of the keys.
     """
+    meanings: dict[str, str] = {}
+    for base in reversed([base for base in type(table).__mro__ if _fields(base)]):
+        meanings |= _read_docstrings(base)
     for key, info in _fields(type(table)).items():
-        infos = [_fields(base).get(key) for base in type(table).__mro__]
-        meaning = next((i.description for i in infos if i is not None and i.description), "")
+        meaning = meanings.get(key, "")
         allowed = _allowed(info.annotation, info.metadata)
         yield Setting(f"{name}.{key}", getattr(table, key), allowed, " ".join(meaning.split()))
+
+
+def _read_docstrings(table: type) -> dict[str, str]:
+    """Field to the docstring below it; read when it is shown, as reading all takes a moment."""
+    (source,) = ast.parse(textwrap.dedent(inspect.getsource(table))).body
+    assert isinstance(source, ast.ClassDef)
+    return {
+        field.target.id: text.value.value
+        for field, text in pairwise(source.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+        if isinstance(text.value.value, str)
+    }
 
 
 def is_table(cls: type) -> bool:

@@ -1,6 +1,6 @@
 """Any log: columns mapped by the user, features in files next to the log."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +23,10 @@ def _resolve(
         user_features=(FeatureTable(users, schema.USER_ID),) if users else (),
     )
     mapping = mapping.over(defaults)
-    features = {file.resolve() for file in (*items, *users, *_feature_files(mapping))}
+    # A table with `first_by`, of several rows per item or user, may be the log itself.
+    tables = (*mapping.item_features, *mapping.user_features)
+    named = (file for t in tables if not t.first_by for file in log_files(t.files))
+    features = {file.resolve() for file in (*items, *users, *named)}
     logs = tuple(file for file in files if file.resolve() not in features)
     if not logs:
         raise InputError(
@@ -38,12 +41,8 @@ def official_files(
 ) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """The logs among files and folders of a release, and the files that may hold features.
 
-    Args:
-        log: name of the log's file in the release; another file is a log if it is named by itself.
-        features: names of the other files in the release.
-
-    Raises:
-        InputError: there is no log.
+    A log is called `log`, or is named by itself and not called as the `features` are. Raises
+    InputError if there is none.
     """
     files = log_files(paths)
     folders = [Path(path) for path in paths if Path(path).is_dir()]
@@ -63,21 +62,22 @@ def official_files(
 def official_table(
     files: Sequence[Path], name: str, key: str, columns: tuple[str, ...], first_by: str = ""
 ) -> tuple[FeatureTable, ...]:
-    """The first file of a name as a table; empty if there is none."""
-    file = next((file for file in files if stem(file) == name), None)
-    return () if file is None else (FeatureTable((file,), key, columns, first_by),)
+    """The files of a name as one table, of a name with `_` at its end all that begin with it.
+
+    Of files with the same name, only the first counts; empty if there is none.
+    """
+    by_name = {
+        stem(file): file
+        for file in reversed(files)
+        if stem(file) == name or (name.endswith("_") and file.name.startswith(name))
+    }
+    parts = tuple(by_name[part] for part in sorted(by_name))
+    return (FeatureTable(parts, key, columns, first_by),) if parts else ()
 
 
 def stem(file: Path) -> str:
     """The name of a file without its endings."""
     return file.name.partition(".")[0]
-
-
-def _feature_files(mapping: LogMapping) -> Iterator[Path]:
-    """Files of one row per item or user; a table with `first_by` may be the log itself."""
-    for table in (*mapping.item_features, *mapping.user_features):
-        if not table.first_by:
-            yield from log_files(table.files)
 
 
 DATASET: Final = Dataset(

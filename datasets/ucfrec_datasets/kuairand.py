@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from ucfrec.errors import InputError
-from ucfrec.logs.mapping import Dataset, FeatureTable, LogMapping, Release, log_files
+from ucfrec.logs.mapping import Dataset, LogMapping, Release, log_files
+from ucfrec_datasets.generic import official_table
 
 LOGS: Final = ("log_standard_", "log_random_")
 FEATURES: Final = ("user_features_", "video_features_basic_", "video_features_statistic_")
@@ -85,23 +86,12 @@ def _resolve(
     statistics = log_files(statistic_paths) if statistic_paths else ()
     defaults = LogMapping(
         item_features=(
-            *_table(candidates, BASIC, "video_id", BASIC_COLUMNS),
-            *_table(statistics, STATISTIC, "video_id", STATISTIC_COLUMNS),
+            *official_table(candidates, BASIC, "video_id", BASIC_COLUMNS),
+            *official_table(statistics, STATISTIC, "video_id", STATISTIC_COLUMNS),
         ),
-        user_features=_table(candidates, USERS, "user_id", USER_COLUMNS),
+        user_features=official_table(candidates, USERS, "user_id", USER_COLUMNS),
     )
     return logs, mapping.over(defaults).over(MAPPING)
-
-
-def _table(
-    files: Sequence[Path], prefix: str, key: str, columns: tuple[str, ...]
-) -> tuple[FeatureTable, ...]:
-    """The files of one kind as one table; of files with the same name, only the first."""
-    by_name: dict[str, Path] = {}
-    for file in files:
-        if file.name.startswith(prefix):
-            by_name.setdefault(file.name.partition(".")[0], file)
-    return (FeatureTable(tuple(by_name.values()), key, columns),) if by_name else ()
 
 
 DATASET: Final = Dataset(

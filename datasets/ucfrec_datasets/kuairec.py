@@ -12,10 +12,7 @@ TRAINING, EVALUATION = "big_matrix", "small_matrix"
 FEATURES: Final = ("user_features", "item_categories", "item_daily_features")
 USERS, CATEGORIES, DAILY = FEATURES
 
-USER_COLUMNS: Final = (
-    *PROFILE,
-    *(f"onehot_feat{n}::VARCHAR" for n in range(18)),
-)
+USER_COLUMNS: Final = (*PROFILE, *(f"onehot_feat{n}::VARCHAR" for n in range(18)))
 
 CATEGORY_COLUMNS: Final = ("feat::INTEGER[]",)
 

@@ -18,8 +18,8 @@ from gymnasium.vector.utils import batch_space
 
 from ucfrec.acting.rollout import Actor, Informed
 from ucfrec.arrays import Array, BoolArray, Float32Array
-from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec_simulators.kuai import kuairand
@@ -41,7 +41,7 @@ def plant_distractor(
         flip: probability that the distractor is the opposite of the reward bit.
 
     Raises:
-        InputError: as `ucfrec.episodes.distractor.reward_bit`, or `out` exists.
+        InputError: as `ucfrec.episodes.writer.reward_bit`, or `out` exists.
     """
     distractor = reward_bit(store, flip, seed)
     planted = np.column_stack([distractor, logged_observations(store)])

@@ -29,11 +29,10 @@ from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
-from ucfrec.episodes.earlier import UserRows
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.sessions import seen_before
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.store import UserRows
+from ucfrec.episodes.windows import Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_baselines import PolicyRanker

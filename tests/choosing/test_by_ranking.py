@@ -15,7 +15,7 @@ from ucfrec.acting.scorer import logged_scores
 from ucfrec.choosing.by_ranking import SHOWN, LoggedEvidence, choose_by_ranking
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.off_policy.estimators import estimate

@@ -20,7 +20,7 @@ from ucfrec.choosing.by_simulation import (
     choose_by_simulation,
     find_neighbours,
 )
-from ucfrec.choosing.choice import Problem, RuleChoice, RuleConfig
+from ucfrec.choosing.choice import Evidence, Problem, RuleChoice, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -122,13 +122,6 @@ def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
     assert weighted.items < plain.items
 
 
-def test_a_rule_simulated_twice_gives_the_same(folder: Path, trained: TrainedPolicy) -> None:
-    rule = DecisionRule(2.0, reward_weight=1.0, temperature=0.5)
-    assert search_of(folder, trained).simulate([rule]) == search_of(folder, trained).simulate(
-        [rule]
-    )
-
-
 def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: TrainedPolicy) -> None:
     search = search_of(folder, trained, replace(FEW, sessions=30))
     rules = [
@@ -176,6 +169,14 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.level([low, high]) == [high]
     search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
+    # Of these, the simplest: the higher temperature, whatever comes first.
+    assert search.best([low, high]) == search.best([high, low]) == high
+    # Or the one that the log says most of: the likelihood, then the hits.
+    likely = replace(low, evidence=Evidence(0.1, 0.2))
+    unlikely = replace(high, evidence=Evidence(0.3, 0.1))
+    assert search.most_evident([unlikely, likely]) == likely
+    hitting = replace(high, evidence=Evidence(0.3, 0.2))
+    assert search.most_evident([likely, hitting]) == hitting
 
 
 def test_rules_far_behind_are_not_simulated_in_all_sessions(

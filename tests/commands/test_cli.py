@@ -355,23 +355,35 @@ def _numbers(file: Path) -> list[dict[str, object]]:
     return [{n: repr(value) for n, value in row.items() if n not in passing} for row in rows]
 
 
-def estimates_in(out: Path) -> dict[str, ResultRow]:
-    """Rows of `ope --json` by estimator."""
-    return {row.method: row for row in read_results(out)}
+def estimate(
+    arguments: str, log: pd.DataFrame | Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[dict[str, ResultRow], str]:
+    """Rows by estimator, and what is printed, of `ope RUN LOG OPTIONS`."""
+    if isinstance(log, pd.DataFrame):
+        log.to_parquet(log_file := folder / "log.parquet")
+        log = log_file
+    run, *options = arguments.split()
+    capsys.readouterr()
+    assert main(["ope", run, str(log), *options, "--json", str(folder / "rows.json")]) == 0
+    rows = {row.method: row for row in read_results(folder / "rows.json")}
+    return rows, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("choice", [["--temperature", "1"], ["--temperature", "0"]])
+def collect_at_random(folder: Path, sessions: int, seed: int = 0) -> Path:
+    words = f"collect --env synthetic-catalog --behavior random --sessions {sessions} --seed {seed}"
+    assert main([*words.split(), "--out", str(folder / "logs")]) == 0
+    return folder / "logs" / "sessions.parquet"
+
+
+@pytest.mark.parametrize("temperature", [1, 0])
 def test_ope_writes_the_rows_it_prints(
-    catalog: tuple[str, Path], choice: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    catalog: tuple[str, Path], temperature: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, logs = catalog
-    out = tmp_path / "rows.json"
-    arguments = ["ope", run, str(logs), *choice, "--seed", "3", "--json", str(out)]
-    assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    rows = estimates_in(out)
+    arguments = f"{run} --temperature {temperature} --seed 3"
+    rows, printed = estimate(arguments, logs, tmp_path, capsys)
     weighted = set(rows) - {"logged", "DM", "FQE"}
-    assert weighted or choice == ["--temperature", "0"]
+    assert weighted or not temperature
     assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
@@ -387,28 +399,22 @@ def test_ope_writes_the_rows_it_prints(
         assert row.data_fingerprint
         assert row.command
     # These are the logs that the run was trained on, and it says so.
-    assert all(f"warning: {line}" in printed for line in rows["logged"].details["warnings"])
-    assert rows["logged"]["seen_in_training"] > 0.8
-    assert "of the rows were seen in training" in rows["logged"].details["warnings"][0]
-    assert rows["logged"].details["reliable"] is False
+    logged = rows["logged"]
+    assert all(f"warning: {line}" in printed for line in logged.details["warnings"])
+    assert logged["seen_in_training"] > 0.8
+    assert "of the rows were seen in training" in logged.details["warnings"][0]
+    assert logged.details["reliable"] is False
     assert "verdict: Do not rely on this estimate" in printed
-    assert main(arguments) == 0
-    assert {name: row.metrics for name, row in estimates_in(out).items()} == {
-        name: row.metrics for name, row in rows.items()
-    }
+    again, _ = estimate(arguments, logs, tmp_path, capsys)
+    assert [row.metrics for row in again.values()] == [row.metrics for row in rows.values()]
 
 
 def test_ope_tells_from_uniform_logs_what_playing_tells(
-    catalog: tuple[str, Path], tmp_path: Path
+    catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, _ = catalog
-    collected = ["--behavior", "random", "--sessions", "3000", "--out", str(tmp_path / "logs")]
-    assert main(["collect", "--env", "synthetic-catalog", *collected]) == 0
-    out = tmp_path / "rows.json"
-    given = ["--temperature", "1.5", "--reward-weight", "0", "--json", str(out)]
-    assert main(["ope", run, str(tmp_path / "logs/sessions.parquet"), *given]) == 0
-    rows = estimates_in(out)
-    trained = TrainedPolicy.load(Path(run))
+    arguments = f"{catalog[0]} --temperature 1.5 --reward-weight 0"
+    rows, _ = estimate(arguments, collect_at_random(tmp_path, 3000), tmp_path, capsys)
+    trained = TrainedPolicy.load(Path(catalog[0]))
     actor = trained.actor(512, replace(trained.rule, temperature=1.5, reward_weight=0.0))
     env = Environment("synthetic-catalog", None).simulator().make(512, None)
     returns = rollout(env, actor, 4000, seed=0).returns
@@ -417,10 +423,8 @@ def test_ope_tells_from_uniform_logs_what_playing_tells(
     for name in ("IPS", "SNIPS", "PDIS", "DR"):
         row = rows[name]
         assert row["R_cum_low"] - 2 * error < truth < row["R_cum_high"] + 2 * error, name
-    errors = {
-        name: error for name, row in rows.items() if (error := row.metrics.get("R_cum_error"))
-    }
-    assert errors["DR"] < errors["PDIS"] < errors["IPS"]
+    errors = [rows[name]["R_cum_error"] for name in ("DR", "PDIS", "IPS")]
+    assert errors == sorted(errors)
     assert rows["DR"]["overlap"] == pytest.approx(1, abs=0.05)
     # Simulated clocks are coarse: a few users are shown the same item at the same time.
     assert 0 < rows["DR"]["seen_in_training"] < 0.05
@@ -456,23 +460,10 @@ def test_a_model_card_lies_beside_every_run_with_what_was_measured(
 def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, _ = catalog
-    collected = ["--behavior", "random", "--sessions", "1500", "--out", str(tmp_path / "logs")]
-    assert main(["collect", "--env", "synthetic-catalog", *collected, "--seed", "7"]) == 0
-    out, fresh = tmp_path / "rows.json", str(tmp_path / "logs/sessions.parquet")
-    asked = [
-        "--targets",
-        "q0.5,6",
-        "--temperatures",
-        "1,0",
-        "--reward-weight",
-        "0",
-        "--json",
-        str(out),
-    ]
-    assert main(["ope", run, fresh, *asked]) == 0
-    printed = capsys.readouterr().out
-    rows = read_results(out)
+    run, logs = catalog[0], collect_at_random(tmp_path, 1500, seed=7)
+    arguments = f"{run} --targets q0.5,6 --temperatures 1,0 --reward-weight 0"
+    _, printed = estimate(arguments, logs, tmp_path, capsys)
+    rows = read_results(tmp_path / "rows.json")
     names = list(dict.fromkeys(row.details["candidate"] for row in rows))
     assert len(names) == 4
     assert names[-1] == "target return 6, temperature 0"
@@ -484,61 +475,49 @@ def test_ope_ranks_targets_and_rules_and_says_which_it_cannot_judge(
     first = min(ranked.values(), key=lambda row: row["rank"])
     assert f"choice: {first.details['selection']}" in printed
     assert sum(row["probability_best"] for row in ranked.values()) == pytest.approx(1)
-    for row in ranked.values():
-        assert row["band_low"] < row["band_high"]
-    assert "neither a return nor a quantile" in refused(
-        ["ope", run, fresh, "--targets", "5,much"], capsys
-    )
-    assert "name a run folder" in refused(["ope", fresh], capsys)
+    assert all(row["band_low"] < row["band_high"] for row in ranked.values())
+    for more, says in (
+        ([run, "--targets", "5,much"], "neither a return nor a quantile"),
+        ([run, "--temperatures", "1,hot"], "are not numbers; write e.g. 0,0.5,1"),
+        ([], "name a run folder"),
+    ):
+        assert says in refused(["ope", *more, str(logs)], capsys)
     # Without logs, the test split of the run's store.
-    assert main(["ope", run, *asked[:2]]) == 0
+    assert main(["ope", run, "--targets", "q0.5,6"]) == 0
     assert "test split of " in capsys.readouterr().out
 
 
 def test_ope_without_propensities_has_only_models_and_without_one_leaves_a_session_out(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, logs = catalog
-    log = pd.read_parquet(logs)
-    strange = log.tail(2).assign(item_id=987654)
-    without = pd.concat([log, strange]).drop(columns="propensity")
-    without.to_parquet(tmp_path / "without.parquet")
-    log.assign(propensity=log.propensity.where(log.index != 5)).to_parquet(tmp_path / "one.parquet")
-    for name in ("without", "one"):
-        out = tmp_path / f"{name}.json"
-        given = ["--temperature", "1", "--json", str(out)]
-        assert main(["ope", run, str(tmp_path / f"{name}.parquet"), *given]) == 0
-        rows = list(estimates_in(out).values())
-        printed = capsys.readouterr().out
-        if name == "without":
-            assert [row.method for row in rows] == ["logged", "DM", "FQE"]
-            assert "overlap" not in rows[0].metrics
-            assert "no session has all its propensities" in printed
-            assert "warning: 2 rows show items" in printed
-            assert rows[0]["unknown_item_rows"] == 2
-        else:
-            assert {"DR", "SNPDIS"} <= {row.method for row in rows}
-            assert rows[0]["sessions_without_propensity"] == 1
-            assert "warning: 1 of 300 sessions have a step without propensity" in printed
+    run, log = catalog[0], pd.read_parquet(catalog[1])
+    without = pd.concat([log, log.tail(2).assign(item_id=987654)]).drop(columns="propensity")
+    rows, printed = estimate(f"{run} --temperature 1", without, tmp_path, capsys)
+    assert [*rows] == ["logged", "DM", "FQE"]
+    assert "overlap" not in rows["logged"].metrics
+    assert "no session has all its propensities" in printed
+    assert "warning: 2 rows show items" in printed
+    assert rows["logged"]["unknown_item_rows"] == 2
+    hole = log.assign(propensity=log.propensity.where(log.index != 5))
+    rows, printed = estimate(f"{run} --temperature 1", hole, tmp_path, capsys)
+    assert {"DR", "SNPDIS"} <= rows.keys()
+    assert rows["logged"]["sessions_without_propensity"] == 1
+    assert "warning: 1 of 300 sessions have a step without propensity" in printed
 
 
 def test_ope_estimates_propensities_if_asked_and_says_so(
     catalog: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, logs = catalog
-    log = pd.read_parquet(logs).drop(columns="propensity")
-    log.to_parquet(tmp_path / "without.parquet")
-    arguments = ["ope", run, str(tmp_path / "without.parquet"), "--estimate-propensities"]
-    arguments += ["--temperature", "1"]
-    out = tmp_path / "rows.json"
-    assert main([*arguments, "--reward-range", "0", "1", "--lift", "0.5", "--json", str(out)]) == 0
-    rows = estimates_in(out)
-    printed = capsys.readouterr().out
+    run, log = catalog[0], pd.read_parquet(catalog[1]).drop(columns="propensity")
+    arguments = f"{run} --estimate-propensities --temperature 1"
+    more = f"{arguments} --reward-range 0 1 --lift 0.5"
+    rows, printed = estimate(more, log, tmp_path, capsys)
     assert {"IPS", "DR"} <= set(rows)
     assert f"with the propensities of {len(log):,} steps estimated (held-out loss" in printed
     assert rows["DR"].details["declared"].startswith("with the propensities of")
     assert rows["DR"]["wanted_lift"] == 0.5
-    assert "name the least one first" in refused([*arguments, "--reward-range", "1", "0"], capsys)
+    backwards = ["ope", *arguments.split(), str(catalog[1]), "--reward-range", "1", "0"]
+    assert "name the least one first" in refused(backwards, capsys)
 
 
 def test_score_and_ope_refuse_what_they_cannot_use(
@@ -579,26 +558,35 @@ def test_a_run_of_another_store_or_configuration_is_refused(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["train", "nowhere", "--out", "run"], "nowhere is not an episode store"),
-        (["evaluate", "nowhere", "--env", "synthetic-taobao"], "nowhere is not a run folder"),
-        (["evaluate", "--env", "synthetic-taobao"], "name a run folder"),
-        (["evaluate", "--env", "taobao", "--behavior", "random"], "no simulator is called"),
-        (["evaluate", "--env", "synthetic-taobao", "--behavior", "best"], "it has .*optimal"),
-        (["prepare", "nowhere.parquet", "--out", "store"], "nowhere.parquet does not exist"),
-        (["report"], "name a run folder"),
+        ("train nowhere --out run", "nowhere is not an episode store"),
+        ("evaluate nowhere --env synthetic-taobao", "nowhere is not a run folder"),
+        ("evaluate --env synthetic-taobao", "name a run folder"),
+        ("evaluate --env taobao --behavior random", "no simulator is called"),
+        ("evaluate --env synthetic-taobao --behavior best", "it has .*optimal"),
+        ("prepare nowhere.parquet --out store", "nowhere.parquet does not exist"),
+        (
+            "prepare log.csv --out store --session-by user --gap-minutes 5",
+            "--gap-minutes needs --session-by gap, not user",
+        ),
+        ("report", "name a run folder"),
+        ("ope . scored.parquet --scored --filter-seen", "give --filter-seen to score"),
+        ("compare logs --arms A", "--arms A: write two names, A,B"),
+        ("compare logs --expected 0", "--expected is 0.0; give a difference above 0"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
-    arguments: list[str],
+    arguments: str,
     says: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    printed = refused(arguments, capsys)
+    Path("log.csv").write_text("user_id,item_id,timestamp,reward\n1,1,1,1\n")
+    Path("run.json").write_text("{}")
+    printed = refused(arguments.split(), capsys)
     assert re.search(says, printed), printed
-    assert list(tmp_path.iterdir()) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "run.json"}
 
 
 def test_a_policy_is_not_played_in_a_environment_it_does_not_fit(
@@ -609,31 +597,11 @@ def test_a_policy_is_not_played_in_a_environment_it_does_not_fit(
 
 
 def test_a_package_that_is_missing_is_named_with_its_extra() -> None:
-    for module, extra in {
-        "h5py": "control",
-        "stable_baselines3": "collect",
-        "optuna": "tune",
-    }.items():
-        said = explanation(ModuleNotFoundError(name=f"{module}.part"))
-        assert said is not None
-        assert f"install ucfrec[{extra}]" in said
+    extras = {"h5py": "control", "stable_baselines3": "collect", "optuna": "tune"}
+    for module, extra in extras.items():
+        text = explanation(ModuleNotFoundError(name=f"{module}.part"))
+        assert text is not None
+        assert f"install ucfrec[{extra}]" in text
     # A defect of ucfrec, such as a package that no extra has, is shown with its traceback.
     assert explanation(ModuleNotFoundError(name="hypothesis")) is None
     assert explanation(ModuleNotFoundError(name="ucfrec.nowhere")) is None
-
-
-def test_a_gap_is_refused_where_sessions_are_not_split_by_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "log.csv").write_text("user_id,item_id,timestamp,reward\n1,1,1,1\n")
-    command = ["prepare", str(tmp_path / "log.csv"), "--out", str(tmp_path / "store")]
-    assert main([*command, "--session-by", "user", "--gap-minutes", "5"]) == 2
-    assert "--gap-minutes needs --session-by gap, not user" in capsys.readouterr().err
-
-
-def test_seen_items_are_filtered_where_probabilities_are_computed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "run.json").write_text("{}")
-    assert main(["ope", str(tmp_path), "scored.parquet", "--scored", "--filter-seen"]) == 2
-    assert "give --filter-seen to score" in capsys.readouterr().err

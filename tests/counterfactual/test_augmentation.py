@@ -48,10 +48,9 @@ from ucfrec.counterfactual.generators import (
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
 from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
-from ucfrec.episodes.augmented import AugmentedEpisodes, TrainingEpisodes
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Transitions
+from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.user_model.reward_fit import fit_item_reward_model
 

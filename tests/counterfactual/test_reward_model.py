@@ -11,7 +11,6 @@ from torch.distributions import Normal, kl_divergence
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, Posterior, kl_to_prior
 from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
-from ucfrec.errors import InputError
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 
@@ -74,19 +73,6 @@ def test_a_model_of_unpredictable_rewards_gives_a_warning(tmp_path: Path) -> Non
     assert fit_warning(float("nan")) != ""
 
 
-def test_equal_rewards_and_empty_splits_are_refused(tmp_path: Path) -> None:
-    some = planted(300, 0).transitions
-    flat = replace(some, rewards=torch.full((300,), 0.1))
-    none = planted(0, 0).transitions
-    with pytest.raises(InputError, match=r"all 300 training rewards equal 0\.1"):
-        fit_crm(flat, some, QUICK, tmp_path, seed=0)
-    with pytest.raises(InputError, match="no held-out transitions"):
-        fit_crm(some, none, QUICK, tmp_path, seed=0)
-    with pytest.raises(InputError, match="no training transitions"):
-        fit_crm(none, some, QUICK, tmp_path, seed=0)
-    assert not list(tmp_path.iterdir())
-
-
 def test_dimensions_that_never_vary_are_inert(tmp_path: Path) -> None:
     train = planted(2_000, 0).transitions
     crm, _ = fit_crm(train, planted(500, 1).transitions, QUICK, tmp_path, seed=0)
@@ -128,10 +114,10 @@ def test_the_elbo_is_equation_2() -> None:
     assert torch.equal(crm.abduct(s, a, r), q.mean)
     posterior = Normal(q.mean, (0.5 * q.log_variance).exp())
     z = q.mean + posterior.stddev * noise
-    elbo = crm.elbo(crm.given(s, a), crm.residual(s, a, r), noise)
+    log_likelihood, kl_of_model = crm.elbo(crm.given(s, a), crm.residual(s, a, r), noise)
     likelihood = Normal(crm.predict(s, a, z), QUICK.decoder_std)
     expected = likelihood.log_prob(r)  # type: ignore[no-untyped-call]
-    torch.testing.assert_close(elbo.log_likelihood, expected)
+    torch.testing.assert_close(log_likelihood, expected)
     kl = kl_divergence(posterior, Normal(torch.zeros(()).double(), 1.0))
-    torch.testing.assert_close(elbo.kl, kl.sum(-1))
+    torch.testing.assert_close(kl_of_model, kl.sum(-1))
     torch.testing.assert_close(kl_to_prior(Posterior(q.mean, q.log_variance)), kl)

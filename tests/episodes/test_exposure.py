@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ucfrec.episodes import exposure
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, quantiles
+from ucfrec.episodes.exposure import ExposureTerm, Likeness, quantiles
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Windows
 
 B, K, ITEMS, TAGS, LAGS, KNOTS = 4, 6, 9, 5, 3, 4
 LOW, HIGH = 1.0, 5.0

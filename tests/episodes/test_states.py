@@ -21,9 +21,9 @@ from tests.support.episodes import (
     state_before,
     write_store,
 )
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
 

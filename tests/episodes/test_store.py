@@ -1,12 +1,11 @@
 """The episode store against plain Python readers of the same episodes."""
 
 import hashlib
-import json
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from itertools import chain, pairwise, product
+from itertools import chain, pairwise
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import matplotlib as mpl
 import numpy as np
@@ -15,11 +14,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import chisquare
 
 from tests.recommending.test_recommend import random_log
 from tests.support.episodes import (
-    Logged,
+    LENGTHS,
+    SHARDS,
+    all_windows,
+    are_equal,
     episode_columns,
     lengths_of,
     random_episodes,
@@ -28,47 +29,30 @@ from tests.support.episodes import (
     step_columns,
     write_store,
 )
+from tests.support.short_validation import short_validation
+from tests.support.tagged import tagged_log, tagged_mapping
 from ucfrec import schema
 from ucfrec.episodes import store as store_module
 from ucfrec.episodes import view as view_module
-from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_folder, read_json, write_json
+from ucfrec.files.atomic import atomic_folder, read_json
 from ucfrec.logs import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
-
-LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
-SHARDS = (2**24, 6, 1)
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory() as name:
-        yield Path(name)
-
-
-def same(a: Windows, b: Windows) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
-
-
-def every_window(store: EpisodeStore, length: int) -> Windows:
-    return store.windows(*store.all_steps(), length)
-
+from ucfrec.runs.config import resolve_config
+from ucfrec.runs.run import train_run
 
 lengths_of_episodes = st.lists(st.integers(1, 8), min_size=1, max_size=6)
 
 
-# What is written is what is read.
-
-
 @pytest.mark.parametrize("shard_steps", SHARDS)
 @pytest.mark.parametrize("items", [True, False])
-def test_every_column_comes_back(folder: Path, items: bool, shard_steps: int) -> None:
+def test_every_column_comes_back(tmp_path: Path, items: bool, shard_steps: int) -> None:
     episodes = random_episodes(LENGTHS, items=items)
-    write_store(folder / "store", episodes, shard_steps=shard_steps)
-    store = EpisodeStore.open(folder / "store")
+    write_store(tmp_path / "store", episodes, shard_steps=shard_steps)
+    store = EpisodeStore.open(tmp_path / "store")
 
     assert len(store) == store.n_episodes == len(LENGTHS)
     assert store.n_steps == sum(LENGTHS)
@@ -117,59 +101,58 @@ def test_neither_shards_nor_the_size_of_appends_show(
         assert np.array_equal(parts.returns, whole.returns)
         for column in of_episodes:
             assert np.array_equal(parts.episode_values(column), whole.episode_values(column))
-        assert same(every_window(parts, 4), every_window(whole, 4))
+        assert are_equal(all_windows(parts, 4), all_windows(whole, 4))
 
 
-def test_large_stores_are_cut_between_episodes(folder: Path) -> None:
+def test_large_stores_are_cut_between_episodes(tmp_path: Path) -> None:
     lengths = [3, 3, 6, 1, 7, 2, 4, 5]
-    store = write_store(folder / "store", random_episodes(lengths), shard_steps=6)
-    cut = [np.diff(np.load(p)).tolist() for p in sorted(folder.glob("store/shard-*/offsets.npy"))]
+    store = write_store(tmp_path / "store", random_episodes(lengths), shard_steps=6)
+    cut = [np.diff(np.load(p)).tolist() for p in sorted(tmp_path.glob("store/shard-*/offsets.npy"))]
     assert list(chain(*cut)) == lengths
     assert len(cut) == store.record.n_shards > 2
     # A shard is full when it holds 6 steps; the episode that fills it is not torn apart.
     assert all(sum(shard) >= 6 > sum(shard[:-1]) for shard in cut[:-1])
 
 
-def test_splits_are_counted_in_the_record(folder: Path) -> None:
+def test_splits_are_counted_in_the_record(tmp_path: Path) -> None:
     episodes = random_episodes(LENGTHS)
-    store = write_store(folder / "store", episodes, shard_steps=6)
+    store = write_store(tmp_path / "store", episodes, shard_steps=6)
     for number, name in enumerate(schema.SPLITS):
         mine = [e for e in episodes if e.split == number]
         assert store.record.splits[name] == {"episodes": len(mine), "steps": sum(map(len, mine))}
 
 
-def test_without_a_split_everything_is_for_training(folder: Path) -> None:
+def test_without_a_split_everything_is_for_training(tmp_path: Path) -> None:
     store = EpisodeStore.write(
-        folder / "store", {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))}, np.array([3])
+        tmp_path / "store",
+        {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))},
+        np.array([3]),
     )
     assert store.split("train").n_steps == 3
     assert store.split("test").n_episodes == 0
 
 
-# The fingerprint.
-
-
 def fingerprint(
-    folder: Path,
+    tmp_path: Path,
     steps: dict[str, np.ndarray],
     lengths: np.ndarray,
     of_episodes: dict[str, np.ndarray],
 ) -> str:
-    with tempfile.TemporaryDirectory(dir=folder) as name:
+    with tempfile.TemporaryDirectory(dir=tmp_path) as name:
         store = EpisodeStore.write(Path(name) / "store", steps, lengths, of_episodes)
         return str(store.record.fingerprint)
 
 
 @pytest.mark.parametrize("items", [True, False])
-def test_the_fingerprint_knows_every_value(folder: Path, items: bool) -> None:
+def test_the_fingerprint_knows_every_value(tmp_path: Path, items: bool) -> None:
     episodes = random_episodes(LENGTHS, items=items)
     steps, lengths, of_episodes = (
         step_columns(episodes),
         lengths_of(episodes),
         episode_columns(episodes),
     )
-    seen = {fingerprint(folder, steps, lengths, of_episodes)}
-    assert fingerprint(folder, steps, lengths, of_episodes) in seen
+    seen = {fingerprint(tmp_path, steps, lengths, of_episodes)}
+    assert fingerprint(tmp_path, steps, lengths, of_episodes) in seen
 
     rng = np.random.default_rng(0)
     for columns in (steps, of_episodes):
@@ -178,7 +161,7 @@ def test_the_fingerprint_knows_every_value(folder: Path, items: bool) -> None:
             at = tuple(rng.integers(size) for size in values.shape)
             changed[at] = not changed[at] if values.dtype == bool else 1 - changed[at]
             new = fingerprint(
-                folder,
+                tmp_path,
                 {**steps, name: changed} if columns is steps else steps,
                 lengths,
                 {**of_episodes, name: changed} if columns is of_episodes else of_episodes,
@@ -188,15 +171,15 @@ def test_the_fingerprint_knows_every_value(folder: Path, items: bool) -> None:
 
     shifted = lengths.copy()
     shifted[[2, 3]] += (-1, 1)  # the same steps, another boundary
-    assert fingerprint(folder, steps, shifted, of_episodes) not in seen
+    assert fingerprint(tmp_path, steps, shifted, of_episodes) not in seen
     without = {k: v for k, v in steps.items() if k != schema.PROPENSITY}
-    assert fingerprint(folder, without, lengths, of_episodes) not in seen
+    assert fingerprint(tmp_path, without, lengths, of_episodes) not in seen
 
 
-def test_the_fingerprint_knows_what_numbers_stand_for(folder: Path) -> None:
+def test_the_fingerprint_knows_what_numbers_stand_for(tmp_path: Path) -> None:
     def write(name: str, ids: list[str]) -> str:
-        (folder / name).mkdir()
-        writer = StoreWriter(folder / name)
+        (tmp_path / name).mkdir()
+        writer = StoreWriter(tmp_path / name)
         steps = {schema.REWARD: np.ones(2), schema.ITEM: np.array([0, 1])}
         writer.append(steps, np.array([True, False]), {schema.SPLIT: np.zeros(2, dtype=int)})
         return str(writer.finish("reward", {}, ids={"items": ids}).fingerprint)
@@ -204,180 +187,12 @@ def test_the_fingerprint_knows_what_numbers_stand_for(folder: Path) -> None:
     assert write("a", ["x", "y"]) == write("b", ["x", "y"]) != write("c", ["y", "x"])
 
 
-# Windows.
-
-
-@given(
-    lengths=lengths_of_episodes,
-    length=st.integers(1, 10),
-    window=st.integers(1, 5),
-    users=st.integers(0, 2),
-    observation=st.integers(0, 2),
-    items=st.booleans(),
-    shard_steps=st.sampled_from(SHARDS),
-    data=st.data(),
-)
-def test_windows_equal_a_row_by_row_reading(
-    lengths: list[int],
-    length: int,
-    window: int,
-    users: int,
-    observation: int,
-    items: bool,
-    shard_steps: int,
-    data: st.DataObject,
-) -> None:
-    observation = observation if items else observation + 1
-    episodes = random_episodes(lengths, seed=len(lengths), observation=observation, items=items)
-    states = some_states(users, window) if items else None
-    episode = st.integers(0, len(lengths) - 1)
-    chosen = data.draw(st.lists(episode, min_size=1, max_size=8))
-    ends = [data.draw(st.integers(0, lengths[e] - 1)) for e in chosen]
-    with tempfile.TemporaryDirectory() as name:
-        store = write_store(Path(name) / "store", episodes, states, shard_steps)
-        got = store.windows(np.array(chosen), np.array(ends), length)
-
-    assert got.states.shape == (len(chosen), length, store.state_size)
-    assert got.states.dtype == got.rewards.dtype == got.returns_to_go.dtype == torch.float32
-    assert got.timesteps.dtype == torch.int64
-    assert got.actions.dtype == (torch.int64 if items else torch.float32)
-    for b, (number, end) in enumerate(zip(chosen, ends, strict=True)):
-        logged = episodes[number]
-        for k in range(length):
-            step = end - (length - 1) + k
-            assert got.mask[b, k] == (step >= 0)
-            if step < 0:
-                continue
-            assert got.rewards[b, k] == logged.rewards[step]
-            assert got.returns_to_go[b, k] == logged.return_to_go(step)
-            assert got.timesteps[b, k] == step
-            if logged.actions is None:
-                assert got.actions[b, k] == logged.items[step]
-            else:
-                assert np.array_equal(got.actions[b, k], logged.actions[step])
-            expected = state_before(logged, step, states)
-            np.testing.assert_allclose(got.states[b, k], expected, rtol=1e-5, atol=1e-6)
-
-
-def test_the_documented_example(folder: Path) -> None:
-    steps = {schema.REWARD: np.array([9.0, 5, 6, 7, 8]), schema.ACTION: np.zeros((5, 1))}
-    steps[schema.OBSERVATION] = np.zeros((5, 1))
-    store = EpisodeStore.write(folder / "store", steps, np.array([1, 4]))
-    window = store.windows(np.array([1]), np.array([1]), 3)
-    assert window.rewards.tolist() == [[0, 5, 6]]
-    assert window.mask.tolist() == [[False, True, True]]
-    assert window.timesteps.tolist() == [[0, 0, 1]]
-    assert window.returns_to_go.tolist() == [[0, 26, 21]]
-
-
-@pytest.mark.parametrize("items", [True, False])
-def test_padding_is_zero_with_a_plus_sign(folder: Path, items: bool) -> None:
-    episodes = random_episodes(LENGTHS, items=items)
-    for episode in episodes:  # all signs negative: a product with the mask would leave −0.0
-        episode.rewards = [-1.0] * len(episode)
-        episode.observations = -np.abs(episode.observations)
-        if episode.actions is not None:
-            episode.actions = -np.abs(episode.actions)
-    store = write_store(folder / "store", episodes, some_states() if items else None)
-    windows = every_window(store, 12)
-    padding = ~windows.mask
-    assert padding.sum() > 100
-    for name, values in vars(windows).items():
-        padded = values[padding]
-        assert not padded.any(), name
-        assert padded.dtype == torch.bool or not torch.signbit(padded).any(), name
-
-    moved = store.transitions(*store.all_steps())
-    beyond = moved.next_states[moved.last]
-    assert len(beyond) == store.n_episodes
-    assert not beyond.any()
-    assert not torch.signbit(beyond).any()
-
-
-def test_a_window_of_no_rows_is_empty(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    none = np.empty(0, dtype=np.int64)
-    assert store.windows(none, none, 4).states.shape == (0, 4, store.state_size)
-
-
-# Views, splits and drawing.
-
-
-@pytest.mark.parametrize("shard_steps", SHARDS)
-def test_views_see_their_episodes_only(folder: Path, shard_steps: int) -> None:
-    episodes = random_episodes(LENGTHS)
-    store = write_store(folder / "store", episodes, some_states(), shard_steps)
-    view = store.select(np.array([6, 2, 4])).select(np.array([2, 0]))
-    assert view.episode_ids.tolist() == [4, 6]
-    assert view.lengths.tolist() == [LENGTHS[4], LENGTHS[6]]
-    assert view.episode_values(schema.USER).tolist() == [episodes[4].user, episodes[6].user]
-    assert view.returns.tolist() == [episodes[4].return_to_go(0), episodes[6].return_to_go(0)]
-    at = np.array([0, 0, 1]), np.array([1, 4, 0])
-    assert same(view.windows(*at, 5), store.windows(np.array([4, 4, 6]), at[1], 5))
-    walked = view.all_steps()
-    assert np.array_equal(view.locate(np.arange(view.n_steps)), walked)
-    assert walked[0].tolist() == [0] * LENGTHS[4] + [1] * LENGTHS[6]
-    assert walked[1].tolist() == [*range(LENGTHS[4]), *range(LENGTHS[6])]
-
-
-@pytest.mark.parametrize("shard_steps", SHARDS)
-@pytest.mark.parametrize("items", [True, False])
-def test_a_view_leaves_out_some_of_what_was_observed(
-    folder: Path, items: bool, shard_steps: int
-) -> None:
-    episodes = random_episodes(LENGTHS, observation=3, items=items)
-    store = write_store(folder / "store", episodes, some_states() if items else None, shard_steps)
-    view = store.select(np.array([6, 2, 4])).without_observation_dimensions([1])
-    assert (view.observation_size, view.state_size) == (2, store.state_size - 1)
-    for part in (view, view.select(np.array([2, 0]))):
-        seen, whole = (every_window(each, 4) for each in (part, store.select(part.episode_ids)))
-        # What is observed comes last in a state.
-        assert torch.equal(seen.states[..., :-2], whole.states[..., :-3])
-        assert torch.equal(seen.states[..., -2:], whole.states[..., [-3, -1]])
-        assert same(replace(seen, states=whole.states), whole)
-    last = every_window(view.without_observation_dimensions([0]), 4)
-    assert torch.equal(last.states[..., -1], every_window(view, 4).states[..., -1])
-    assert last.states.shape[-1] == view.state_size - 1
-    assert store.observation_size == 3
-
-
-def test_splits_part_the_episodes(folder: Path) -> None:
-    episodes = random_episodes(LENGTHS * 4)
-    store = write_store(folder / "store", episodes, shard_steps=6)
-    views = [store.split(name) for name in schema.SPLITS]
-    for number, view in enumerate(views):
-        assert view.episode_ids.tolist() == [
-            i for i, episode in enumerate(episodes) if episode.split == number
-        ]
-        assert (view.episode_values(schema.SPLIT) == number).all()
-    everything = np.concatenate([view.episode_ids for view in views])
-    assert sorted(everything.tolist()) == list(range(len(episodes)))
-
-
-def test_draws_are_uniform_over_steps(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    store = store.select(np.array([0, 2, 3, 5]))
-    episodes, steps = store.draw_steps(np.random.default_rng(0), 40_000)
-    assert (steps >= 0).all()
-    assert (steps < store.lengths[episodes]).all()
-    starts = np.cumsum(store.lengths) - store.lengths
-    counts = np.bincount(starts[episodes] + steps, minlength=store.n_steps)
-    assert len(counts) == store.n_steps
-    assert chisquare(counts).pvalue > 1e-3
-
-    again = store.draw_steps(np.random.default_rng(0), 40_000)
-    assert np.array_equal(episodes, again[0])
-    assert np.array_equal(steps, again[1])
-    other = store.draw_steps(np.random.default_rng(1), 40_000)
-    assert not np.array_equal(steps, other[1])
-
-
 @pytest.mark.parametrize("limit", [1_000_000, 10])
-def test_state_statistics(folder: Path, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_statistics(tmp_path: Path, limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store_module, "_STATISTICS_STEPS", limit)
     episodes = random_episodes(LENGTHS)
     states = some_states()
-    store = write_store(folder / "store", episodes, states).select(np.array([1, 2, 5, 7]))
+    store = write_store(tmp_path / "store", episodes, states).select(np.array([1, 2, 5, 7]))
     logged = [
         state_before(episodes[e], t, states) for e in store.episode_ids for t in range(LENGTHS[e])
     ]
@@ -385,9 +200,6 @@ def test_state_statistics(folder: Path, limit: int, monkeypatch: pytest.MonkeyPa
     mean, std = store.state_statistics
     np.testing.assert_allclose(mean, seen.mean(0), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(std, seen.std(0), rtol=1e-3, atol=1e-4)
-
-
-# A store in memory.
 
 
 @given(lengths_of_episodes, st.booleans(), st.integers(0, 9))
@@ -399,7 +211,7 @@ def test_a_store_in_memory_is_the_one_on_disk(lengths: list[int], items: bool, s
     with tempfile.TemporaryDirectory() as name:
         disk = write_store(Path(name) / "store", episodes, states)
         for a, b in ((memory, disk), (memory.split("train"), disk.split("train"))):
-            assert same(every_window(a, 3), every_window(b, 3))
+            assert are_equal(all_windows(a, 3), all_windows(b, 3))
             assert np.array_equal(a.returns, b.returns)
             for column in of_steps:
                 read = a.step_values(column, *a.all_steps()), b.step_values(column, *b.all_steps())
@@ -425,13 +237,10 @@ def test_wrong_arrays_make_no_store_in_memory() -> None:
         EpisodeStore.from_arrays(steps, np.array([3, 1]), {schema.USER: np.zeros(1)})
 
 
-# What is said of them, and shapes.
-
-
-def test_a_store_says_what_it_holds(folder: Path) -> None:
+def test_a_store_says_what_it_holds(tmp_path: Path) -> None:
     episodes = random_episodes([700, 800])
     episodes[0].split = episodes[1].split = 0
-    store = write_store(folder / "store", episodes, some_states())
+    store = write_store(tmp_path / "store", episodes, some_states())
     assert repr(store) == "EpisodeStore(1,500 steps, 2 episodes, 11 items, reward=reward)"
     train = store.split("train").select(np.array([0]))
     assert (
@@ -446,163 +255,10 @@ def test_a_store_says_what_it_holds(folder: Path) -> None:
     )
 
 
-def test_steps_that_an_episode_does_not_have_are_refused(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    for episodes, ends, length, message in (
-        ([0], [LENGTHS[0]], 2, "episode 0 has 3 steps, none numbered 3"),
-        ([0], [-1], 2, "episode 0 has 3 steps, none numbered -1"),
-        ([-1], [0], 2, "no episodes -1 to -1"),
-        ([0, len(LENGTHS)], [0, 0], 2, f"no episodes 0 to {len(LENGTHS)}"),
-        ([0, 1], [0], 2, "two arrays of the same length"),
-        ([[0]], [[0]], 2, "two arrays of the same length"),
-        ([0], [0], 0, "at least 1 step"),
-    ):
-        with pytest.raises(InputError, match=message):
-            store.windows(np.array(episodes), np.array(ends), length)
-    with pytest.raises(InputError, match="no split is called 'training'; there are train, valid"):
-        store.split("training")
-
-
-# Opening, and what can be wrong.
-
-
-def test_opening_reads_the_record_only(folder: Path) -> None:
-    write_store(folder / "store", random_episodes(LENGTHS), shard_steps=6)
-    for column in folder.glob("store/shard-*/*"):
-        column.write_bytes(bytes(column.stat().st_size))
-    store = EpisodeStore.open(folder / "store")
-    assert store.record.n_steps == sum(LENGTHS)
-
-
-def test_columns_are_mapped_not_read(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS, items=False))
-    at = np.array([0]), np.array([0])
-    before = float(store.step_values(schema.REWARD, *at)[0])
-    column = np.load(folder / "store" / "shard-00000" / "reward.npy", mmap_mode="r+")
-    column[0] = before + 1
-    column.flush()
-    assert store.step_values(schema.REWARD, *at)[0] == before + 1
-
-
-def change_reward_name(path: Path) -> None:
-    path.write_text(path.read_text().replace('"reward": "reward"', '"reward": "reword"'))
-
-
-RECORDS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "newer": (
-        lambda path: path.write_text(json.dumps({"version": schema.STORE_VERSION + 1})),
-        "upgrade ucfrec",
-    ),
-    "cut": (lambda path: path.write_text("{"), r"meta\.json"),
-    "no object": (lambda path: path.write_text("[]"), r"meta\.json"),
-    "nothing in it": (lambda path: path.write_text("{}"), r"meta\.json"),
-    "another type": (lambda path: path.write_text('{"version": "1"}'), r"meta\.json"),
-    "no text": (lambda path: path.write_bytes(b"\xff"), r"meta\.json"),
-    "missing": (Path.unlink, r"not an episode store.*meta\.json"),
-    "changed": (change_reward_name, r"meta\.json was changed after ucfrec wrote it"),
-}
-
-
-@pytest.mark.parametrize(("damage", "message"), RECORDS.values(), ids=RECORDS)
-def test_a_damaged_record_is_named(
-    folder: Path, damage: Callable[[Path], object], message: str
-) -> None:
-    write_store(folder / "store", random_episodes(LENGTHS))
-    damage(folder / "store" / "meta.json")
-    with pytest.raises(InputError, match=message):
-        EpisodeStore.open(folder / "store")
-
-
-def use(store: EpisodeStore) -> None:
-    store.episode_values(schema.USER)
-    every_window(store, 3)
-
-
-DAMAGE: dict[str, Callable[[Path], object]] = {
-    "missing": Path.unlink,
-    "empty": lambda path: path.write_bytes(b""),
-    "cut in the header": lambda path: path.write_bytes(path.read_bytes()[:50]),
-    "cut in the data": lambda path: path.write_bytes(path.read_bytes()[:-3]),
-    "not numpy": lambda path: path.write_bytes(b"PK or something else entirely" * 9),
-    "a flipped bit": lambda path: path.write_bytes(flip(path.read_bytes())),
-}
-COLUMNS = ("reward", "item", "return_to_go", "offsets", "user")
-
-
-def flip(content: bytes) -> bytes:
-    return content[:-1] + bytes([content[-1] ^ 16])
-
-
-@pytest.mark.parametrize(
-    ("column", "damage"), [*product(COLUMNS, ["a flipped bit"]), *product(["item"], DAMAGE)]
-)
-def test_a_damaged_column_is_named_when_it_is_used(folder: Path, column: str, damage: str) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
-    DAMAGE[damage](folder / "store" / "shard-00001" / f"{column}.npy")
-    with pytest.raises(InputError, match=rf"shard-00001/{column}\.npy") as caught:
-        use(EpisodeStore.open(store.path))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_column_of_another_length_is_named(folder: Path) -> None:
-    write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
-    path = folder / "store" / "shard-00001" / "reward.npy"
-    np.save(path, np.load(path)[:-1])
-    with pytest.raises(InputError, match=r"reward\.npy is truncated: 152 of 156 bytes"):
-        use(EpisodeStore.open(folder / "store"))
-    without_checksums(folder / "store")
-    with pytest.raises(InputError, match="'reward' has 31 of 32 steps"):
-        use(EpisodeStore.open(folder / "store"))
-
-
-def without_checksums(store: Path) -> None:
-    """Let other content of its files pass."""
-    write_json(store / "meta.json", {**read_json(store / "meta.json"), "files": {}})
-
-
-@pytest.mark.parametrize("middle", [[2**63 - 1, -(2**63)], [3, 3], [4, 2]])
-def test_offsets_that_do_not_ascend_are_damage(folder: Path, middle: list[int]) -> None:
-    """Differences of the first wrap around to positive numbers."""
-    write_store(folder / "store", random_episodes([3, 3, 3]))
-    path = folder / "store" / "shard-00000" / "offsets.npy"
-    np.save(path, np.array([0, *middle, np.load(path)[-1]]))
-    without_checksums(folder / "store")
-    with pytest.raises(InputError, match="do not ascend from 0"):
-        use(EpisodeStore.open(folder / "store"))
-
-
-def test_an_item_that_the_catalogue_lacks_is_named(folder: Path) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    without_checksums(store.path)
-    path = store.path / "shard-00000" / "item.npy"
-    items = np.load(path)
-    items[3] = 10**6
-    np.save(path, items)
-    with pytest.raises(InputError, match="'item' has items from 0 to 1000000, there are 11"):
-        use(EpisodeStore.open(store.path))
-
-
-def test_a_column_that_was_never_logged_is_named(folder: Path) -> None:
-    steps = {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))}
-    store = EpisodeStore.write(folder / "store", steps, np.array([3]))
-    with pytest.raises(InputError, match="no column 'propensity'"):
-        store.step_values(schema.PROPENSITY, np.array([0]), np.array([0]))
-
-
-@pytest.mark.parametrize("shard_steps", SHARDS)
-def test_steps_beyond_the_store_are_refused(folder: Path, shard_steps: int) -> None:
-    store = write_store(folder / "store", random_episodes(LENGTHS), shard_steps=shard_steps)
-    with pytest.raises(IndexError):
-        store.step_values(schema.REWARD, np.array([7]), np.array([LENGTHS[7]]))
-
-
-# Writing whole or not at all.
-
-
-def contents(folder: Path) -> dict[str, str]:
+def contents(tmp_path: Path) -> dict[str, str]:
     return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
+        str(path.relative_to(tmp_path)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(tmp_path.rglob("*"))
         if path.is_file()
     }
 
@@ -629,20 +285,20 @@ def bad_writes() -> dict[str, tuple[dict[str, object], str]]:
 
 
 @pytest.mark.parametrize("case", bad_writes())
-def test_a_write_that_fails_leaves_nothing(folder: Path, case: str) -> None:
+def test_a_write_that_fails_leaves_nothing(tmp_path: Path, case: str) -> None:
     arguments, message = bad_writes()[case]
     steps = {schema.REWARD: np.ones(4), schema.ACTION: np.ones((4, 2))}
     given_arguments = {"steps": steps, "lengths": np.array([3, 1]), "shard_steps": 1} | arguments
     with pytest.raises((InputError, KeyError), match=message):
-        EpisodeStore.write(folder / "store", **given_arguments)  # type: ignore[arg-type]
-    assert list(folder.iterdir()) == []
+        EpisodeStore.write(tmp_path / "store", **given_arguments)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_half_way_leaves_nothing(folder: Path) -> None:
+def test_a_failure_half_way_leaves_nothing(tmp_path: Path) -> None:
     steps = {schema.REWARD: np.ones(4), schema.ITEM: np.arange(4)}
 
     def write() -> None:
-        with atomic_folder(folder / "store") as scratch:
+        with atomic_folder(tmp_path / "store") as scratch:
             writer = StoreWriter(scratch, shard_steps=2)
             for _ in range(3):
                 first = np.array([True, False, True, False])
@@ -652,63 +308,21 @@ def test_a_failure_half_way_leaves_nothing(folder: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         write()
-    assert list(folder.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_a_store_is_never_overwritten(folder: Path) -> None:
-    write_store(folder / "store", random_episodes(LENGTHS))
-    before = contents(folder)
+def test_a_store_is_never_overwritten(tmp_path: Path) -> None:
+    write_store(tmp_path / "store", random_episodes(LENGTHS))
+    before = contents(tmp_path)
     with pytest.raises(InputError, match="exists already"):
-        write_store(folder / "store", random_episodes([2, 2]))
-    assert contents(folder) == before
+        write_store(tmp_path / "store", random_episodes([2, 2]))
+    assert contents(tmp_path) == before
 
 
-def test_the_same_episodes_make_the_same_bytes(folder: Path) -> None:
+def test_the_same_episodes_make_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_store(folder / name, random_episodes(LENGTHS), shard_steps=6)
-    assert contents(folder / "a") == contents(folder / "b")
-
-
-@pytest.mark.parametrize("long_enough", [1, 1000])
-def test_steps_in_batches_are_all_steps(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, long_enough: int
-) -> None:
-    """Also where they are read as slices across shards."""
-    monkeypatch.setattr(view_module, "_BATCH_STEPS", 7)
-    monkeypatch.setattr(view_module, "_LONG_ENOUGH", long_enough)
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
-    for view in (store, store.select(np.array([2, 0, 2])), store.select(np.array([1, 2, 0]))):
-        episodes, steps = zip(*view.step_batches(), strict=True)
-        assert len(episodes) == -(-view.n_steps // 7)
-        listed = view.all_steps()
-        np.testing.assert_array_equal(np.concatenate(episodes), listed[0])
-        np.testing.assert_array_equal(np.concatenate(steps), listed[1])
-        rewards, items = (view.step_values(n, *listed) for n in (schema.REWARD, schema.ITEM))
-        np.testing.assert_array_equal(view.column(schema.REWARD), rewards)
-        counts = np.bincount(items, minlength=len(view.item_states.embeddings))
-        np.testing.assert_array_equal(view.item_counts(), counts)
-    assert store.select(np.array([], dtype=np.int64)).column(schema.REWARD).shape == (0,)
-
-
-def test_views_share_mapped_columns_with_their_store(folder: Path) -> None:
-    """A view costs no second mapping; its windows are those of the store it was taken from."""
-    store = write_store(folder / "store", random_episodes(LENGTHS), some_states())
-    whole = every_window(store, 3)
-    for column in folder.glob("store/shard-*/reward.npy"):
-        column.unlink()
-    assert same(every_window(store.select(np.arange(len(LENGTHS))), 3), whole)
-
-
-def test_user_rows_are_those_of_the_source(folder: Path) -> None:
-    states = some_states(users=2)
-    logged = [
-        Logged([1.0], np.zeros((1, 0)), items=[0], user=3),
-        Logged([1.0], np.zeros((1, 0)), items=[0], user=-1),
-    ]
-    store = write_store(folder / "store", logged, states)
-    seen = every_window(store, 1).states[:, 0, -2:]
-    assert torch.equal(seen[0], states.user_features[3])
-    assert not seen[1].any()
+        write_store(tmp_path / name, random_episodes(LENGTHS), shard_steps=6)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 def test_the_frame_has_the_rows_of_the_log(tmp_path: Path) -> None:
@@ -740,3 +354,139 @@ def test_a_notebook_shows_the_store(tmp_path: Path) -> None:
     assert all(f"<td>{name}</td>" in html for name in ("all", "train", "validation", "test"))
     axes = store.plot()
     assert sum(bar.get_height() for bar in axes.patches) == len(store)
+
+
+def with_bot(log: pd.DataFrame, rows: int) -> pd.DataFrame:
+    """The log with a user of one session, who clicks on everything, in its first part.
+
+    Items are drawn as people see them: the policy learns of all rows, and should be the same.
+    """
+    rng, begin = np.random.default_rng(1), int(log.timestamp.min())
+    bot = pd.DataFrame({"user_id": 101, "item_id": rng.choice(log.item_id, rows), "reward": 1.0})
+    bot["timestamp"] = begin + np.sort(rng.choice(10**7, rows, replace=False))
+    return pd.concat([log[log.user_id != 101], bot])
+
+
+def trained(tmp_path: Path, log: pd.DataFrame) -> tuple[EpisodeStore, dict[str, Any]]:
+    tmp_path.mkdir()
+    log.to_parquet(tmp_path / "log.parquet")
+    bounds = tuple(float(log.timestamp[log.user_id != 101].quantile(q)) for q in (0.8, 0.9))
+    options = PrepareOptions(session_by="gap", gap_minutes=30, embedding_size=6, split=bounds)
+    prepare([tmp_path / "log.parquet"], tagged_mapping(tmp_path), tmp_path / "store", options)
+    store = EpisodeStore.open(tmp_path / "store")
+    settings = [
+        *("train.steps=60", "train.learning_rate=3e-3", "train.validate_every=20"),
+        *("policy.dim=16", "policy.context=4", "augment.copies=0", "rule.least_items=2.0"),
+        *("rule.temperatures=[1.0]", "rule.reward_weights=[0.0, 2.0]"),
+        *("rule.lookaheads=[0.0]", "rule.tag_windows=[0]", "rule.tag_runs=[0]"),
+    ]
+    with short_validation():
+        train_run(store, tmp_path / "run", resolve_config("popular", None, settings))
+    candidates = read_json(tmp_path / "run" / "candidates.json")
+    return store, {**read_json(tmp_path / "run" / "run.json"), "candidates": candidates}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*as bots have")
+def test_a_user_of_4000_rows_in_a_session_changes_nothing_that_is_learned_of_people(
+    tmp_path: Path,
+) -> None:
+    log = tagged_log(1500)
+    _, people = trained(tmp_path / "people", log)
+    store, bot = trained(tmp_path / "bot", with_bot(log, 4000))
+    assert store.lengths.max() == 4000
+    store = store.split("train")
+    kept = store.without_long_sessions()
+    assert kept.n_steps == store.n_steps - 4000
+    assert kept.without_long_sessions() is kept
+    ends = [each["rule"]["session_end"] for each in (people, bot)]
+    assert ends[0]["kept"] == ends[1]["kept"]
+    assert ends[1]["rows"] < ends[0]["rows"]
+    assert ends[1]["loss"]["constant"] == pytest.approx(ends[0]["loss"]["constant"], rel=0.1)
+    assert bot["reward_model"]["train_rows"] < people["reward_model"]["train_rows"]
+    rules = [each["rule"]["rule"] for each in (people, bot)]
+    for name in rules[0].keys() - {"target"}:
+        assert rules[0][name] == rules[1][name], name
+    longest = [max(each["length"] for each in e["candidates"]) for e in (people, bot)]
+    assert longest[1] == pytest.approx(longest[0], rel=0.3)
+    targets = [each["rule"]["target"] for each in bot["candidates"]]
+    assert max(target for target in targets if target is not None) <= kept.returns.max()
+
+
+GAP = 10
+
+
+def store_of(log: pd.DataFrame, gap: int | None) -> EpisodeStore:
+    """A store of rows by user and time, whose sessions end with a pause of more than `gap`."""
+    first = (log.user.diff() != 0) | (log.timestamp.diff() > (np.inf if gap is None else gap))
+    session = first.cumsum() - 1
+    items = 12
+    return EpisodeStore.from_arrays(
+        {name: log[name].to_numpy() for name in (schema.ITEM, schema.REWARD, schema.TIMESTAMP)},
+        np.bincount(session),
+        {schema.USER: log.user[first].to_numpy()},
+        ItemStates(torch.randn(items, 3), torch.zeros(0, 0), 0.0, 1.0),
+    )
+
+
+@given(seed=st.integers(0, 10_000), gap=st.sampled_from([None, GAP]), share=st.floats(0.1, 0.9))
+def test_the_rows_before_a_step_are_those_of_the_user(
+    seed: int, gap: int | None, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    n = 40
+    log = pd.DataFrame({"user": rng.integers(5, size=n), "item": rng.integers(12, size=n)})
+    log["reward"] = rng.integers(2, size=n).astype(float)
+    log["timestamp"] = np.cumsum(rng.integers(1, 8, size=n))
+    early = log.timestamp <= log.timestamp.quantile(share)
+    parts = [log[rows].sort_values(["user", "timestamp"]) for rows in (early, ~early)]
+    earlier, later = (store_of(part, gap) for part in parts)
+    rows = UserRows.of(later, later.episode_values(schema.USER), earlier)
+    view = rows.continued(gap)
+
+    assert view.n_steps == later.n_steps
+    for long_enough in (1, 1000):
+        with patch.object(view_module, "_LONG_ENOUGH", long_enough):
+            assert view.column(schema.ITEM).tolist() == parts[1]["item"].tolist()
+    episodes, steps = view.all_steps()
+    recent = rows.recent(np.arange(view.n_steps), 4)
+    owner, seen = rows.seen(np.arange(view.n_steps))
+    for number, row in enumerate(parts[1].itertuples()):
+        before = log[(log.user == row.user) & (log.timestamp < row.timestamp)]
+        newest = before.iloc[::-1][:4]
+        count = len(newest)
+        assert recent[0][number].tolist() == [*newest["item"], *[-1] * (4 - count)]
+        assert recent[1][number].tolist() == [*newest["reward"], *[0.0] * (4 - count)]
+        assert sorted(seen[owner == number]) == sorted(before["item"])
+        pauses = np.diff([*before.timestamp, row.timestamp])
+        ended = np.flatnonzero(pauses > (np.inf if gap is None else gap))
+        session = before.iloc[ended[-1] + 1 if len(ended) else 0 :]
+        at = np.array([episodes[number]]), np.array([steps[number]])
+        assert steps[number] == len(session)
+        assert view.items_before(*at)[1].tolist() == session["item"].tolist()
+        assert view.rewards_before(*at)[0] == session["reward"].sum()
+        assert view.step_values(schema.ITEM, *at)[0] == row.item
+        window = view.windows(*at, 6)
+        assert int(window.mask.sum()) == min(6, len(session) + 1)
+        assert window.returns_to_go[0, -1] == _rest(parts[1], row, gap)
+
+
+def _rest(part: pd.DataFrame, row, gap: int | None) -> float:  # type: ignore[no-untyped-def]
+    after = part[(part.user == row.user) & (part.timestamp >= row.timestamp)]
+    ended = np.flatnonzero(np.diff(after.timestamp) > (np.inf if gap is None else gap))
+    return float(after.reward.iloc[: ended[0] + 1 if len(ended) else None].sum())
+
+
+def test_rows_that_are_in_both_logs_count_once() -> None:
+    log = pd.DataFrame({"user": 0, "item": range(8), "reward": 1.0, "timestamp": range(8)})
+    rows = UserRows.of(store_of(log[4:], None), np.array([0]), store_of(log, None))
+    assert rows.recent(np.array([3]), 8)[0].tolist() == [[6, 5, 4, 3, 2, 1, 0, -1]]
+
+
+def test_users_that_are_not_known_have_no_earlier_rows() -> None:
+    log = pd.DataFrame({"user": 0, "item": range(8), "reward": 1.0, "timestamp": range(8)})
+    unknown = store_of(log[4:].assign(user=-1), None)
+    rows = UserRows.of(unknown, np.array([7]), store_of(log, None))
+    assert rows.continued(None) is unknown
+    with pytest.raises(IndexError):
+        rows.recent(np.array([4]), 1)

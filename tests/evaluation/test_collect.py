@@ -109,7 +109,7 @@ def test_the_record_says_what_was_run(tmp_path: Path) -> None:
     assert record["behavior"] == "mixture"
     assert (record["sessions"], record["seed"]) == (300, 3)
     assert record["mean_return"] == pytest.approx(played.returns.mean())
-    assert {"ucfrec", "gymnasium", "numpy", "torch"} == set(record["versions"])
+    assert {"ucfrec", "gymnasium", "numpy", "torch", "python"} == set(record["versions"])
 
 
 def test_bad_input_leaves_nothing_behind(tmp_path: Path) -> None:

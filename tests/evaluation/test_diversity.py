@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, Uniform, rollout
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.diversity import (

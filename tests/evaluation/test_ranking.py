@@ -18,9 +18,8 @@ from tests.recommending.test_recommend import SETTINGS, random_log
 from tests.support.logs import store_of
 from ucfrec import Recommender, schema
 from ucfrec.commands.cli import main
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.states import TrainingCounts
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation import ranking
 from ucfrec.evaluation.ranking import (

@@ -107,8 +107,6 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
     assert "javascript:" not in listed
     refused = got(explorer, "/", host="evil.example")
     assert refused.status_code == 400
-    assert "evil.example" in refused.json()["error"]
-    assert "the address that `ucfrec explore` printed" in refused.json()["error"]
 
 
 @pytest.mark.parametrize(

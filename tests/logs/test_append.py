@@ -200,7 +200,7 @@ def test_logs_of_only_new_ids_are_noted(grown: Path, tmp_path: Path, name: str) 
 
 def test_new_ids_without_features_are_noted(grown: Path, tmp_path: Path) -> None:
     logs, old = [grown / "later.parquet"], tagged_mapping(tmp_path)
-    items = rf"items\.parquet: {NEW} of {NEW} new items have no row.*embeddings say nothing"
+    items = rf"items\.parquet: {NEW} of {NEW} new items have no row; their features count as"
     users = rf"users\.parquet: {NEW} of {NEW} new users have no row"
     with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match=users):
         append_logs(grown / "store", logs, tmp_path / "old", old)

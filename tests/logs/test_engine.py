@@ -2,7 +2,6 @@
 
 import gzip
 import re
-import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -208,13 +207,6 @@ def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     assert not list(folder.iterdir())
 
 
-def test_a_memory_limit_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"memory_limit 'much' is not a size; write e\.g\. 2GB"):  # noqa: SIM117
-        with engine([], tmp_path, "much"):
-            pass
-    assert not list(tmp_path.iterdir())
-
-
 def test_hostile_column_names_stay_names(tmp_path: Path) -> None:
     """Names and types of columns come from files, and into SQL."""
     rows = 40
@@ -249,23 +241,6 @@ def test_every_connection_is_closed_to_the_environment() -> None:
     found = {path.name for path in files if opens.search(path.read_text(encoding="utf-8"))}
     assert found == {"engine.py"}
     assert quote("it's") == "'it''s'"
-
-
-def test_scratch_of_a_killed_process_goes_with_the_next(inputs: list[Path], tmp_path: Path) -> None:
-    code = (
-        "import os, sys; from pathlib import Path; from ucfrec.logs.engine import engine\n"
-        "with engine([], Path(sys.argv[1])) as connection:\n"
-        "    connection.execute('CREATE TABLE t AS SELECT range AS x FROM range(100000)')\n"
-        "    os.kill(os.getpid(), 9)\n"
-    )
-    folder = tmp_path / "scratch"
-    folder.mkdir()
-    for _ in range(2):
-        subprocess.run([sys.executable, "-c", code, str(folder)], check=False)
-        assert sum(path.is_dir() for path in folder.iterdir()) == 1
-    with engine(inputs, folder):
-        assert sum(path.is_dir() for path in folder.iterdir()) == 1
-    assert list(folder.iterdir()) == []
 
 
 START = 1_700_000_000_000

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputNote
 from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
@@ -69,25 +69,6 @@ def test_the_index_of_a_frame_is_no_feature(tmp_path: Path) -> None:
         prepare([tmp_path / "log.parquet"], given, tmp_path / name, OPTIONS)
         states.append((tmp_path / name / "item_states.safetensors").read_bytes())
     assert states[0] == states[1]
-
-
-@pytest.mark.parametrize(
-    ("ids", "keys", "message"),
-    [
-        ([1, 2, 12], [21, 22, 23, 24], r"item_id of the log, which are 1, 2, 12, …, and key is 21"),
-        ([1, 2, 12], ["i1", "i2", "i12"], r"key is never such an id; let the key be"),
-        ([1, 2, 12], [1.4, 2.4, 11.6], r"key is never such an id"),
-        ([2**53, 2**53 + 2], [2.0**53, 2.0**53 + 2], r"key is never such an id"),
-        (["a1", "a2", "a12"], [1, 2, 12], r"which are 'a1', 'a12', 'a2', …, and key is '1', '12'"),
-        (["1", "2", "12"], ["01", "02", "012"], r"key is '01', '012', '02', …"),
-    ],
-)
-def test_features_of_nothing_in_the_log_are_refused(
-    tmp_path: Path, ids: list[object], keys: list[object], message: str
-) -> None:
-    mapping = mapping_of(tmp_path, ids, keys)
-    with pytest.raises(InputError, match=rf"features\.parquet: no row belongs to .*{message}"):
-        validate([tmp_path / "log.parquet"], mapping, OPTIONS)
 
 
 def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:
@@ -184,11 +165,6 @@ def test_columns_of_lists_are_told_apart(separate: bool) -> None:
     assert shared(tags, 3, 2) == 0
 
 
-def test_items_without_tags_or_a_row_share_none() -> None:
-    tags = tags_of([["a"], []], items=4)
-    np.testing.assert_array_equal(tags, [[0], [-1], [-1], [-1]])
-
-
 def test_at_most_sixteen_tags_are_kept_the_most_frequent() -> None:
     many = [f"tag {n:02}" for n in range(TAGS_PER_ITEM + 9)]
     lists: Lists = [[*many], many[9:], [*many[9:], "own"], ["own"]]
@@ -208,11 +184,6 @@ def test_a_catalogue_keeps_at_most_a_thousand_tags() -> None:
     tags = tags_of([*lists, None])
     assert int(tags.max()) == DISTINCT_TAGS - 1
     assert len(np.unique(tags[tags >= 0])) == DISTINCT_TAGS
-
-
-def test_tags_do_not_depend_on_the_order_of_lists() -> None:
-    lists: Lists = [["b", "a", "b"], ["c", "a"], ["c"]]
-    np.testing.assert_array_equal(tags_of(lists), tags_of([["a", "b"], ["a", "c"], ["c"]]))
 
 
 def test_a_catalogue_of_empty_lists_has_no_tags() -> None:

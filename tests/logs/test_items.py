@@ -9,17 +9,13 @@ import torch
 from scipy import sparse
 from sklearn.utils.extmath import randomized_svd
 
-from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
 from ucfrec.logs.append import append_logs
-from ucfrec.logs.features import EncodedFeatures
 from ucfrec.logs.items import (
     Exposure,
     SparseRows,
     item_embeddings,
     right_singular_vectors,
-    write_item_states,
 )
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -144,14 +140,6 @@ def test_reward_scale_of_the_training_window(tmp_path: Path) -> None:
     assert states.reward_high == pytest.approx(train.mean() + 2 * train.std(ddof=0))
 
 
-def test_equal_rewards_in_the_training_window_are_an_error(tmp_path: Path) -> None:
-    log = make_log()
-    log.loc[log["timestamp"] < START + 3000, "reward"] = 1.0
-    with pytest.raises(InputError, match=r"all 3000 rewards of the training split equal 1"):
-        learn(tmp_path / "a", log)
-    assert not (tmp_path / "a" / "s").exists()
-
-
 def test_the_same_log_gives_the_same_bits(tmp_path: Path) -> None:
     log = make_log()
     first = learn(tmp_path / "a", log).item_states.embeddings
@@ -167,39 +155,6 @@ def test_few_users_or_items_give_few_dimensions(tmp_path: Path) -> None:
     one_item = Exposure(tmp_path / "one_item", np.array([4]))
     one_item.add(np.arange(4), zero, np.ones(4))
     assert item_embeddings(one_item).shape == (1, 1)
-
-
-def test_states_can_be_written_without_features(tmp_path: Path) -> None:
-    store = learn(tmp_path / "a", make_log(), features=False)
-    items, users = (
-        pd.read_parquet(store.path / f"{name}.parquet").train_count.to_numpy()
-        for name in ("items", "users")
-    )
-    known = EncodedFeatures(None, None, items, users, np.zeros((30, 0), dtype=np.int64))
-    write_item_states(store.path, tmp_path, known, 4)
-    found = ItemStates.load(store.path / "item_states.safetensors")
-    assert found.embeddings.shape == (30, 4)
-    assert found.embeddings[:27].norm(dim=1).min() > 0.1
-    assert found.user_features.shape == (90, 0)
-    assert found.tags.shape[1] == 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda items: pd.concat([items, items[:3]]), r"3 of 35 rows repeat a item_id"),
-        (lambda items: items.drop(columns="price"), r"no column 'price' \(item_id feature\)"),
-        (lambda items: items.rename(columns={"item_id": "iid"}), r"no column 'item_id'"),
-        (
-            lambda items: items.assign(group=[{"a": 1}] * 32),
-            r"item_id feature \(group\) is STRUCT.*cast it",
-        ),
-    ],
-)
-def test_bad_features_are_one_clear_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(InputError, match=message):
-        learn(tmp_path / "a", make_log(), items=change(catalogue()))
-    assert not (tmp_path / "a" / "s").exists()
 
 
 def on_disk(path: Path, matrix: sparse.csr_matrix) -> SparseRows:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.support.logs import write
+from tests.support.logs import START, random_log, write
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
@@ -21,25 +21,18 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec_datasets import generic
 
-START = 1_700_000_000_000
 SMALL = PrepareOptions(embedding_size=4)
-
-
-def make_log(rows: int = 400, users: int = 100, step: int = 600_000) -> pd.DataFrame:
-    generator = np.random.default_rng(0)
-    log = pd.DataFrame({"user_id": generator.integers(users, size=rows)})
-    log["item_id"] = generator.integers(20, size=rows)
-    log["timestamp"] = START + step * np.arange(rows)
-    log["reward"] = (generator.random(rows) < 0.3) * 1.0
-    return log
 
 
 def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
     """The report of a folder and its meta.json's fingerprint, with features as files say."""
     logs, mapping = generic.DATASET.resolve([folder], LogMapping(columns))
     report = prepare(logs, mapping, out, SMALL)
-    fingerprint = pd.read_json(out / "meta.json", typ="series")["fingerprint"]
-    return {**report, "fingerprint": fingerprint}
+    return {**report, "fingerprint": fingerprint(out)}
+
+
+def fingerprint(store: Path) -> str:
+    return EpisodeStore.open(store).record.fingerprint
 
 
 # Folders
@@ -50,7 +43,7 @@ def prepared(folder: Path, out: Path, **columns: str) -> dict[str, Any]:
     [("user_id", ".csv"), ("item_id", ".parquet"), ("reward", ".csv"), ("timestamp", ".parquet")],
 )
 def test_the_name_of_a_folder_replaces_no_column(tmp_path: Path, name: str, suffix: str) -> None:
-    log = make_log()
+    log = random_log()
     write(log, tmp_path / f"{name}=7" / f"log{suffix}")
     report = validate([tmp_path / f"{name}=7" / f"log{suffix}"], LogMapping())
     assert report["users"] == log["user_id"].nunique()
@@ -58,7 +51,7 @@ def test_the_name_of_a_folder_replaces_no_column(tmp_path: Path, name: str, suff
 
 
 def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
-    log = make_log()
+    log = random_log()
     days = pd.to_datetime(log["timestamp"], unit="ms").dt.strftime("%Y-%m-%d")
     lake = tmp_path / "lake"
     for day, part in log.groupby(days):
@@ -74,7 +67,7 @@ def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
 
 
 def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
-    write(make_log(), tmp_path / "log.parquet")
+    write(random_log(), tmp_path / "log.parquet")
     users = pd.DataFrame({"user_id": range(100), "age": np.arange(100) % 7 * 1.0})
     for part in range(2):
         write(users[part::2], tmp_path / "users.parquet" / f"part={part}" / "0.parquet")
@@ -84,20 +77,18 @@ def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
 
 
 def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
-    log = make_log()
+    log = random_log()
     log["user_id"] %= 9
     for user, part in log.groupby("user_id"):
         write(part.drop(columns="user_id"), tmp_path / f"user_id={user}" / "a%20b=x" / "p.parquet")
     given = LogMapping(partitions=True)
     assert validate(log_files([tmp_path]), given)["users"] == log["user_id"].nunique()
-    with pytest.raises(InputError, match="has no column 'user_id'"):
-        validate(log_files([tmp_path]), LogMapping())
     (batch,) = read_histories([tmp_path], given, "reward", 1000)
     assert batch.column("user_id").to_pylist() == sorted(log["user_id"].unique())
 
 
 def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
-    log = make_log().drop(columns="user_id")
+    log = random_log().drop(columns="user_id")
     for name in ("7", "007", "a%20b"):
         write(log, tmp_path / f"user_id={name}" / "part.parquet")
     (batch,) = read_histories([tmp_path], LogMapping(partitions=True), "reward", 1000)
@@ -106,43 +97,26 @@ def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
 
 def test_numbers_in_folders_stay_numbers_beside_a_folder_without_a_value(tmp_path: Path) -> None:
     for name in ("3", "__HIVE_DEFAULT_PARTITION__"):
-        write(make_log(), tmp_path / f"weight={name}" / "part.parquet")
+        write(random_log(), tmp_path / f"weight={name}" / "part.parquet")
     given = LogMapping(partitions=True)
     (batch,) = read_histories([tmp_path], given, "coalesce(weight, 7)", 1000)
     assert {*batch.column("rewards").flatten().to_pylist()} == {7}
-
-
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-def test_a_folder_that_contradicts_its_file_is_refused(tmp_path: Path, suffix: str) -> None:
-    log = make_log()
-    write(log.assign(user_id=7), tmp_path / "user_id=7" / f"log{suffix}")
-    assert validate(log_files([tmp_path]), LogMapping(partitions=True))["users"] == 1
-    write(log, tmp_path / "user_id=8" / f"log{suffix}")
-    with pytest.raises(InputError, match="in the file, but its folder says another value"):
-        validate(log_files([tmp_path]), LogMapping(partitions=True))
 
 
 # Parts
 
 
 def test_parts_of_a_log_are_joined_by_the_names_of_their_columns(tmp_path: Path) -> None:
-    log = make_log()
+    log = random_log()
     whole = write(log, tmp_path / "log.parquet")
     parts = tmp_path / "parts"
     write(log[:100], parts / "a.parquet")
     write(log[100:200][["reward", "timestamp", "item_id", "user_id"]], parts / "b.parquet")
     write(log[200:300].assign(more="x")[["more", *log.columns]], parts / "c.parquet")
     write(log[300:].rename(columns=str.upper), parts / "d.csv")
-    stores = [
-        prepare([each], LogMapping(), tmp_path / f"store-{n}", SMALL)
-        for n, each in enumerate((whole, parts))
-    ]
-    assert stores[0]["steps"] == stores[1]["steps"] == 400
-    fingerprints = {
-        pd.read_json(tmp_path / f"store-{n}" / "meta.json", typ="series")["fingerprint"]
-        for n in range(2)
-    }
-    assert len(fingerprints) == 1
+    for n, path in enumerate((whole, parts)):
+        assert prepare([path], LogMapping(), tmp_path / f"store-{n}", SMALL)["steps"] == 400
+    assert fingerprint(tmp_path / "store-0") == fingerprint(tmp_path / "store-1")
 
 
 USERS = pd.DataFrame(
@@ -151,17 +125,14 @@ USERS = pd.DataFrame(
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-@pytest.mark.parametrize(
-    "second",
-    [["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]],
-)
+@pytest.mark.parametrize("second", [["spend", "age", "user_id"], ["AGE", "User_ID", "spend"]])
 def test_parts_of_features_are_joined_by_the_names_of_their_columns(
     tmp_path: Path, suffix: str, second: list[str]
 ) -> None:
     reports = []
     for n, columns in enumerate((list(USERS.columns), second)):
         folder = tmp_path / str(n)
-        write(make_log(), folder / "log.parquet")
+        write(random_log(), folder / "log.parquet")
         write(USERS[:50], folder / "users.parquet" / f"0{suffix}")
         part = USERS[50:][[name.lower() for name in columns]]
         part.columns = columns  # type: ignore[assignment]
@@ -171,15 +142,12 @@ def test_parts_of_features_are_joined_by_the_names_of_their_columns(
 
 
 def test_a_column_of_some_parts_is_missing_in_the_others(tmp_path: Path) -> None:
-    write(make_log(), tmp_path / "log.parquet")
+    write(random_log(), tmp_path / "log.parquet")
     write(USERS[:50], tmp_path / "users.parquet" / "0.parquet")
     write(USERS[50:][["user_id", "age"]], tmp_path / "users.parquet" / "1.parquet")
     first = prepared(tmp_path, tmp_path / "store-0")
     write(USERS[50:].assign(spend=None), tmp_path / "users.parquet" / "1.parquet")
     assert prepared(tmp_path, tmp_path / "store-1")["fingerprint"] == first["fingerprint"]
-    write(USERS[50:].assign(spend="many"), tmp_path / "users.parquet" / "1.parquet")
-    with pytest.raises(InputError, match=r"spend is VARCHAR here and DOUBLE in .*0\.parquet"):
-        prepared(tmp_path, tmp_path / "store-2")
 
 
 @pytest.mark.parametrize("change", [("spend", np.nan), ("city", "Rome")])
@@ -187,7 +155,7 @@ def test_the_fingerprint_covers_every_feature_value(
     tmp_path: Path, change: tuple[str, object]
 ) -> None:
     users = USERS.assign(city=np.where(USERS["user_id"] % 2, "Oslo", "Lima"))
-    write(make_log(), tmp_path / "log.parquet")
+    write(random_log(), tmp_path / "log.parquet")
     write(users, tmp_path / "users.parquet")
     first = prepared(tmp_path, tmp_path / "store-0")["fingerprint"]
     write(users.sample(frac=1, random_state=0), tmp_path / "users.parquet")
@@ -197,11 +165,10 @@ def test_the_fingerprint_covers_every_feature_value(
     assert prepared(tmp_path, tmp_path / "store-2")["fingerprint"] != first
 
 
-@pytest.mark.parametrize("key", ["User_Id"])
-def test_a_key_is_no_feature_whatever_its_case(tmp_path: Path, key: str) -> None:
+def test_a_key_is_no_feature_whatever_its_case(tmp_path: Path) -> None:
     fingerprints = set()
-    for name in (key, "user_id"):
-        write(make_log(), tmp_path / name / "log.parquet")
+    for name in ("User_Id", "user_id"):
+        write(random_log(), tmp_path / name / "log.parquet")
         users = USERS[["user_id", "age"]].rename(columns={"user_id": name})
         write(users, tmp_path / name / "users.parquet")
         report = prepared(tmp_path / name, tmp_path / f"store-{len(fingerprints)}-{name}")
@@ -210,7 +177,7 @@ def test_a_key_is_no_feature_whatever_its_case(tmp_path: Path, key: str) -> None
 
 
 def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> None:
-    write(make_log(), tmp_path / "log.parquet")
+    write(random_log(), tmp_path / "log.parquet")
     users = USERS[["user_id", "age"]].rename(columns={"user_id": "uid"})
     write(users, tmp_path / "people.parquet")
     found = set()
@@ -218,8 +185,7 @@ def test_what_an_expression_for_the_key_reads_is_no_feature(tmp_path: Path) -> N
         table = FeatureTable((tmp_path / "people.parquet",), "UID::BIGINT", columns)
         mapping = LogMapping(user_features=(table,))
         prepare([tmp_path / "log.parquet"], mapping, tmp_path / f"store-{n}", SMALL)
-        meta = pd.read_json(tmp_path / f"store-{n}" / "meta.json", typ="series")
-        found.add(meta["fingerprint"])
+        found.add(fingerprint(tmp_path / f"store-{n}"))
     assert len(found) == 1
 
 
@@ -248,13 +214,10 @@ def test_an_identifier_of_a_csv_file_is_its_text(tmp_path: Path, late: str, rows
 
 
 def test_text_of_a_csv_file_that_is_whole_numbers_throughout_is_numbers(tmp_path: Path) -> None:
-    log = make_log()
-    stores = []
     for name in ("log.csv", "log.parquet"):
-        write(log, tmp_path / name)
-        prepare([tmp_path / name], LogMapping(), tmp_path / f"store-{name}", SMALL)
-        stores.append(pd.read_json(tmp_path / f"store-{name}" / "meta.json", typ="series"))
-    assert stores[0]["fingerprint"] == stores[1]["fingerprint"]
+        path = write(random_log(), tmp_path / name)
+        prepare([path], LogMapping(), tmp_path / f"store-{name}", SMALL)
+    assert fingerprint(tmp_path / "store-log.csv") == fingerprint(tmp_path / "store-log.parquet")
     assert pq.read_table(tmp_path / "store-log.csv" / "users.parquet")["user_id"].type == pa.int64()
 
 
@@ -264,7 +227,7 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
 ) -> None:
     """With `like`, as in `score`, `rank` and `ope`: '01' is not 1."""
     ids = [*map(str, range(1, 60)), "01"]
-    log, later = make_log(2000, 60, 20_000), make_log(600, 59, 20_000)
+    log, later = random_log(2000, 60), random_log(600, 59)
     later["user_id"] += 1
     if text == "log":
         log["user_id"] = [ids[n] for n in log["user_id"]]
@@ -275,13 +238,8 @@ def test_users_of_text_and_of_integers_are_the_same_if_their_text_is(
     write(log, tmp_path / "log.parquet")
     write(later, tmp_path / "later.parquet")
     prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store", SMALL)
-    prepare(
-        [tmp_path / "later.parquet"],
-        LogMapping(),
-        tmp_path / "found",
-        SMALL,
-        like=tmp_path / "store",
-    )
+    like, found = tmp_path / "store", tmp_path / "found"
+    prepare([tmp_path / "later.parquet"], LogMapping(), found, SMALL, like=like)
     known = [*map(str, pq.read_table(tmp_path / "store" / "users.parquet")["user_id"].to_pylist())]
     numbers = EpisodeStore.open(tmp_path / "found").episode_values("user")
     users = pq.read_table(tmp_path / "found" / "episode_users.parquet")["user_id"].to_pylist()
@@ -309,7 +267,7 @@ def test_ids_with_and_without_decimals_are_noted_and_can_be_made_one(
 
 
 def test_text_without_a_character_is_no_id(tmp_path: Path) -> None:
-    log = make_log().astype({"user_id": str, "item_id": str})
+    log = random_log().astype({"user_id": str, "item_id": str})
     log.loc[:1, "user_id"] = ""
     log.loc[2:2, "item_id"] = ""
     log.to_parquet(tmp_path / "log.parquet")
@@ -318,13 +276,13 @@ def test_text_without_a_character_is_no_id(tmp_path: Path) -> None:
 
 
 def test_keys_of_features_in_a_csv_file_are_their_text(tmp_path: Path) -> None:
-    write(make_log(), tmp_path / "log.parquet")
+    write(random_log(), tmp_path / "log.parquet")
     keys = [f"{n:03d}" for n in range(100)]
     write(USERS.assign(user_id=keys), tmp_path / "users.csv")
     # 100 to 999 would be their own text; of these, none is.
     with pytest.raises(InputError, match=r"no row belongs to a user_id of the log"):
         prepared(tmp_path, tmp_path / "store", user_id="user_id + 100")
-    log = make_log()
+    log = random_log()
     log["user_id"] = log["user_id"].map("{:03d}".format)
     write(log, tmp_path / "log.parquet")
     assert prepared(tmp_path, tmp_path / "store-1")["users"] == log["user_id"].nunique()
@@ -334,7 +292,7 @@ def test_keys_of_features_in_a_csv_file_are_their_text(tmp_path: Path) -> None:
 
 
 def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path) -> None:
-    log = make_log(1500, 60)
+    log = random_log(1500, 60)
     nulls = pd.Series([None] * 700, dtype="float64")
     write(log[:700].assign(propensity=nulls), tmp_path / "a.parquet")
     write(log[700:].assign(propensity=0.05), tmp_path / "b.parquet")
@@ -344,8 +302,7 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("suffix", "kind"),
-    [(".parquet", "object"), (".parquet", "string"), (".csv", "object")],
+    ("suffix", "kind"), [(".parquet", "object"), (".parquet", "string"), (".csv", "object")]
 )
 @pytest.mark.parametrize(
     "name", ["propensity", "session_id", "is_random", "observation", "feedback"]
@@ -353,7 +310,7 @@ def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path
 def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     tmp_path: Path, suffix: str, name: str, kind: str
 ) -> None:
-    log = make_log(200)
+    log = random_log(200)
     filled: dict[str, Any] = {
         "propensity": 0.5,
         "session_id": "s" + log["user_id"].astype(str),
@@ -378,14 +335,6 @@ def test_a_column_without_a_value_has_the_type_of_the_other_parts(
     assert (report["steps"], report["dropped"]["null_key"]) == (200 - missing, missing)
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
-def test_a_log_without_any_row_is_refused(tmp_path: Path, suffix: str) -> None:
-    write(make_log()[:0], tmp_path / f"a{suffix}")
-    write(make_log()[:0], tmp_path / f"b{suffix}")
-    with pytest.raises(InputError, match=rf"a{suffix} and 1 more is empty \(0 rows\)"):
-        validate(log_files([tmp_path]), LogMapping())
-
-
 @pytest.mark.parametrize(
     ("expression", "value"),
     [
@@ -404,7 +353,7 @@ def test_truth_values_are_numbers_in_arithmetic(
     value: Callable[[pd.DataFrame], "pd.Series[float]"] | None,
 ) -> None:
     generator = np.random.default_rng(0)
-    log = make_log()
+    log = random_log()
     for name in ("is_click", "is_like"):
         log[name] = generator.random(len(log)) < 0.5
     path = write(log, tmp_path / f"log{suffix}")
@@ -420,7 +369,7 @@ def test_truth_values_are_numbers_in_arithmetic(
 
 
 def test_columns_that_are_not_used_cost_next_to_nothing(tmp_path: Path) -> None:
-    log = make_log(300)
+    log = random_log(300)
     generator = np.random.default_rng(0)
 
     def seconds(columns: int) -> float:
@@ -434,27 +383,6 @@ def test_columns_that_are_not_used_cost_next_to_nothing(tmp_path: Path) -> None:
         return min(took)
 
     assert seconds(1000) < 1.5 * seconds(10) + 0.1
-
-
-FAULTS = {
-    "too many fields": (
-        lambda lines: [*lines[:20], lines[20] + ",1"],
-        r"line 21 has 5 fields, the",
-    ),
-    "too few fields": (lambda lines: [*lines[:20], "1,2"], r"line 21 has 2 fields, the header 4;"),
-    "no header": (lambda lines: lines[1:], r"line 1 has values \(\d+, .*instead of the names"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_csv_lines_of_other_lengths_and_a_missing_header_are_refused(
-    tmp_path: Path, fault: str
-) -> None:
-    change, message = FAULTS[fault]
-    lines = make_log()[["user_id", "item_id", "timestamp", "reward"]].to_csv(index=False)
-    (tmp_path / "log.csv").write_text("\n".join(change(lines.splitlines()[:40])) + "\n")
-    with pytest.raises(InputError, match=rf"log\.csv, {message}"):
-        validate([tmp_path / "log.csv"], LogMapping())
 
 
 def test_lines_that_begin_with_a_hash_are_rows(tmp_path: Path) -> None:
@@ -474,13 +402,13 @@ def test_lines_that_begin_with_a_hash_are_rows(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("title", ["# exported by the shop", ""])
 def test_a_title_above_the_header_is_skipped(tmp_path: Path, title: str) -> None:
-    log = make_log()
+    log = random_log()
     (tmp_path / "log.csv").write_text(f"{title}\n{log.to_csv(index=False)}")
     assert validate([tmp_path / "log.csv"], LogMapping())["rows_read"] == len(log)
 
 
 def test_endings_are_read_in_any_case_and_other_tables_are_named(tmp_path: Path) -> None:
-    log = make_log()
+    log = random_log()
     log.to_parquet(tmp_path / "a.PARQUET")
     log.to_csv(tmp_path / "b.Csv", index=False)
     log.to_csv(tmp_path / "c.tsv", index=False, sep="\t")
@@ -493,39 +421,13 @@ def test_endings_are_read_in_any_case_and_other_tables_are_named(tmp_path: Path)
 
 
 def test_a_store_in_a_folder_that_is_called_like_a_column_is_read(tmp_path: Path) -> None:
-    path = write(make_log(), tmp_path / "log.parquet")
+    path = write(random_log(), tmp_path / "log.parquet")
     store = tmp_path / "item_id=3" / "user_id=4" / "store"
     store.parent.mkdir(parents=True)
     prepare([path], LogMapping(), store, SMALL)
     report = prepare([path], LogMapping(), tmp_path / "like", SMALL, like=store)
     assert (report["steps"], report["dropped"]["unknown_item"]) == (400, 0)
     assert (EpisodeStore.open(tmp_path / "like").episode_values("user") >= 0).all()
-
-
-@pytest.mark.parametrize(
-    ("suffix", "second"), [(".parquet", "reward"), (".csv", "REWARD"), (".csv.gz", "reward")]
-)
-def test_two_columns_of_one_name_are_refused(tmp_path: Path, suffix: str, second: str) -> None:
-    log = make_log()
-    log[second + " "] = 1 - log.reward
-    log.columns = [name.strip() for name in log.columns]
-    file = tmp_path / f"log{suffix}"
-    if suffix == ".parquet":
-        names = [str(name) for name in log.columns]
-        pq.write_table(pa.table([log.iloc[:, i] for i in range(log.shape[1])], names=names), file)
-    else:
-        log.to_csv(file, index=False)
-    with pytest.raises(InputError, match=r"(?i)has more than one column reward; rename or remove"):
-        prepared(file, tmp_path / "store")
-
-
-@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
-def test_another_encoding_is_named(tmp_path: Path, encoding: str) -> None:
-    log = make_log()
-    log["item_id"] = "é" + log.item_id.astype(str)
-    log.to_csv(tmp_path / "log.csv", index=False, encoding=encoding)
-    with pytest.raises(InputError, match="not in UTF-8; convert it"):
-        prepared(tmp_path / "log.csv", tmp_path / "store")
 
 
 def test_a_field_of_50_megabytes_is_refused_in_a_second(tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """A run on logs in sessions, and other logs to evaluate it on."""
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.recommending.test_recommend import SETTINGS, random_log
 from ucfrec import UCF, EpisodeStore
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.off_policy.score import LoggedSessions, read_logged_sessions
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -29,3 +33,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def trained(folder: Path) -> TrainedPolicy:
     return TrainedPolicy.load(folder / "run")
+
+
+@pytest.fixture
+def log(folder: Path) -> pd.DataFrame:
+    return pd.read_parquet(folder / "rest.parquet")
+
+
+Read = Callable[..., AbstractContextManager[LoggedSessions]]
+
+
+@pytest.fixture
+def read(trained: TrainedPolicy, tmp_path: Path) -> Read:
+    """Reads a frame for the run, with rows of unknown items or without."""
+
+    def read(log: pd.DataFrame, keep: bool = False) -> AbstractContextManager[LoggedSessions]:
+        log.to_parquet(tmp_path / "log.parquet")
+        return read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep)
+
+    return read
+
+
+@pytest.fixture
+def logged(read: Read, log: pd.DataFrame) -> Iterator[LoggedSessions]:
+    with read(log) as logged:
+        yield logged

@@ -23,7 +23,6 @@ from ucfrec.off_policy.estimators import (
     session_terms,
     tune,
 )
-from ucfrec.off_policy.evaluate import step_value
 from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 
 
@@ -287,22 +286,6 @@ def test_the_behavior_itself_is_its_own_mean() -> None:
         assert one.high == pytest.approx(returns.mean() + 1.98 * error, abs=0.3 * error)
 
 
-def test_weights_without_a_reward_have_no_interval() -> None:
-    """Of 10,000 sessions, those that the policy would repeat had no reward: that is not 0 ± 0."""
-    rng = np.random.default_rng(0)
-    action = rng.integers(100, size=10_000)
-    steps = LoggedSteps(
-        session=np.arange(10_000),
-        reward=(action > 50).astype(float),
-        propensity=np.full(10_000, 0.01),
-        target=(action == 7).astype(float),
-    )
-    for name in ("IPS", "SNIPS", "PDIS", "SNPDIS"):
-        one = estimate(steps, 0)[name]
-        assert one.value == 0
-        assert (one.low, one.high) == (None, None)
-
-
 def test_a_few_missing_propensities_leave_their_sessions_out() -> None:
     """One in 4,000 does not switch the rest off."""
     steps = random_steps([2] * 2000, modelled=False)
@@ -371,68 +354,6 @@ def test_shrinking_is_tuned_to_err_less_where_weights_are_heavy() -> None:
         assert squared[name] < 0.85 * squared["none"], name
         unshrunk = parameters[0 if "Gaussian" in name else -1]
         np.testing.assert_allclose(shrink(weights, unshrunk), weights)
-
-
-ITEMS = 6
-PAYS = np.linspace(0, 1, ITEMS)
-TARGET = np.array([0.05, 0.05, 0.1, 0.2, 0.2, 0.4])
-TRUTH = float(TARGET @ PAYS)
-
-
-def logs(seed: int, share: float = 0.2, sessions: int = 300, wrong: float = 1.0) -> LoggedSteps:
-    """Sessions of six steps of three users each; a share of the steps shows a random item, with its
-    propensity, and the others favour bad items, with none."""
-    rng, n = np.random.default_rng(seed), 6 * sessions
-    user = np.arange(sessions) // 3
-    random = rng.random(n) < share
-    usual = rng.choice(ITEMS, n, p=TARGET[::-1])
-    item = np.where(random, rng.integers(ITEMS, size=n), usual)
-    # Steps of a user are alike.
-    liking = rng.normal(0, 0.3, user.max() + 1)[user][np.repeat(np.arange(sessions), 6)]
-    return LoggedSteps(
-        session=np.repeat(np.arange(sessions), 6),
-        reward=PAYS[item] + liking + rng.normal(0, 0.3, n),
-        propensity=np.where(random, wrong / ITEMS, np.nan),
-        target=TARGET[item],
-        # A model that is wrong by a constant.
-        model=Modelled(np.full(n, TRUTH + 0.2), np.zeros(n), np.zeros(n), PAYS[item] + 0.2),
-        user=user,
-    )
-
-
-def test_intervals_cover_the_value_of_the_policy_per_step() -> None:
-    covered = dict.fromkeys(("IPS", "SNIPS", "DR"), 0)
-    values = []
-    for seed in range(25):
-        found = step_value(logs(seed), 0).estimates
-        values.append([found[name].value for name in covered])
-        for name in covered:
-            low, high = found[name].low, found[name].high
-            assert low is not None
-            assert high is not None
-            covered[name] += low <= TRUTH <= high
-    assert min(covered.values()) >= 21
-    np.testing.assert_allclose(np.mean(values, axis=0), TRUTH, atol=0.03)
-
-
-def test_the_lift_is_over_the_same_steps_as_logged() -> None:
-    steps = logs(1)
-    found = step_value(steps, 0)
-    known = ~np.isnan(steps.propensity)
-    assert (found.steps, found.of) == (known.sum(), len(known))
-    logged = found.estimates["logged"].value
-    assert logged == pytest.approx(steps.reward[known].mean())
-    assert found.lift.value == pytest.approx(found.estimates["DR"].value - logged)
-    assert found.lift.low is not None
-    assert found.lift.low > 0
-    assert "not an estimate of the session return" in str(found)
-    assert found.doubt is None
-
-
-def test_wrong_propensities_are_doubted() -> None:
-    doubt = step_value(logs(2, wrong=0.5), 0).doubt
-    assert doubt is not None
-    assert "where 1 is expected" in doubt
 
 
 def column(values: np.ndarray) -> np.ndarray:

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.off_policy.conftest import Read
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
-from ucfrec.logs import LogMapping
-from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
-from ucfrec.off_policy.score import read_logged_sessions
+from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy, step_value
+from ucfrec.off_policy.logged_steps import LoggedSteps, Modelled
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
@@ -19,9 +19,8 @@ RULE = DecisionRule(7.5, temperature=1.0)
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_logs_of_one_user_are_refused_before_anything_is_fitted(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, log: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     log[log.user_id == log.user_id.iloc[0]].to_parquet(tmp_path / "one.parquet")
     assert main(["ope", str(folder / "run"), str(tmp_path / "one.parquet")]) == 2
     said = capsys.readouterr().err.splitlines()
@@ -31,13 +30,11 @@ def test_logs_of_one_user_are_refused_before_anything_is_fitted(
 
 @pytest.mark.parametrize(("share", "forbids"), [(0.0, False), (0.02, False), (0.2, True)])
 def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path, share: float, forbids: bool
+    log: pd.DataFrame, trained: TrainedPolicy, read: Read, share: float, forbids: bool
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     lacking = int(share * len(log))
     log.loc[log.index[:lacking], "reward"] = np.nan
-    log.to_parquet(tmp_path / "log.parquet")
-    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read(log, keep=True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0)
     text = f"{lacking:,} of {len(log):,} rows have no finite reward"
     assert any(text in warning for warning in report.warnings) == (lacking > 0)
@@ -45,20 +42,17 @@ def test_rows_without_reward_are_said_and_many_forbid_a_verdict(
 
 
 def test_an_item_twice_on_a_page_is_said(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
+    log: pd.DataFrame, trained: TrainedPolicy, read: Read
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet").drop_duplicates("user_id")
-    pd.concat([log, log.iloc[:3]]).to_parquet(tmp_path / "log.parquet")
-    pages = EstimateOptions(pages=True)
-    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    log, pages = log.drop_duplicates("user_id"), EstimateOptions(pages=True)
+    with read(pd.concat([log, log.iloc[:3]]), keep=True) as logged:
         report = evaluate_off_policy(trained, logged, rule=RULE, seed=0, options=pages)
     assert any("3 rows repeat the user, item and time" in each for each in report.warnings)
 
 
 def test_steps_with_a_propensity_are_estimated_where_sessions_cannot_be(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, log: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     random = np.random.default_rng(0).random(len(log)) < 0.3
     log.assign(propensity=np.where(random, 1 / 30, np.nan)).to_parquet(tmp_path / "log.parquet")
     files = [str(tmp_path / "log.parquet"), "--json", str(tmp_path / "ope.json")]
@@ -88,3 +82,58 @@ def test_options_are_checked_before_logs_are_opened(
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.startswith(f"ucfrec ope: {says}")
+
+
+ITEMS = 6
+PAYS = np.linspace(0, 1, ITEMS)
+TARGET = np.array([0.05, 0.05, 0.1, 0.2, 0.2, 0.4])
+TRUTH = float(TARGET @ PAYS)
+
+
+def random_logs(
+    seed: int, share: float = 0.2, sessions: int = 300, wrong: float = 1.0
+) -> LoggedSteps:
+    """Sessions of six steps of three users each; a fifth of the steps shows a random item, with its
+    propensity, and the others favour bad items, with none."""
+    rng, n = np.random.default_rng(seed), 6 * sessions
+    user = np.arange(sessions) // 3
+    random = rng.random(n) < 0.2
+    usual = rng.choice(ITEMS, n, p=TARGET[::-1])
+    item = np.where(random, rng.integers(ITEMS, size=n), usual)
+    # Steps of a user are alike.
+    liking = rng.normal(0, 0.3, user.max() + 1)[user][np.repeat(np.arange(sessions), 6)]
+    return LoggedSteps(
+        session=np.repeat(np.arange(sessions), 6),
+        reward=PAYS[item] + liking + rng.normal(0, 0.3, n),
+        propensity=np.where(random, wrong / ITEMS, np.nan),
+        target=TARGET[item],
+        # A model that is wrong by a constant.
+        model=Modelled(np.full(n, TRUTH + 0.2), np.zeros(n), np.zeros(n), PAYS[item] + 0.2),
+        user=user,
+    )
+
+
+def test_intervals_cover_the_value_of_the_policy_per_step() -> None:
+    covered = dict.fromkeys(("IPS", "SNIPS", "DR"), 0)
+    values = []
+    for seed in range(25):
+        found = step_value(random_logs(seed), 0).estimates
+        values.append([found[name].value for name in covered])
+        for name in covered:
+            covered[name] += found[name].low <= TRUTH <= found[name].high
+    assert min(covered.values()) >= 21
+    np.testing.assert_allclose(np.mean(values, axis=0), TRUTH, atol=0.03)
+
+
+def test_the_lift_is_over_the_same_steps_as_logged() -> None:
+    steps = random_logs(1)
+    found = step_value(steps, 0)
+    known = ~np.isnan(steps.propensity)
+    assert (found.steps, found.of) == (known.sum(), len(known))
+    logged = found.estimates["logged"].value
+    assert logged == pytest.approx(steps.reward[known].mean())
+    assert found.lift.value == pytest.approx(found.estimates["DR"].value - logged)
+    assert found.lift.low > 0
+    assert "not an estimate of the session return" in str(found)
+    assert found.doubt is None
+    assert "where 1 is expected" in step_value(random_logs(2, wrong=0.5), 0).doubt

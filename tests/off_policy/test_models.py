@@ -11,7 +11,6 @@ import torch
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
-from ucfrec.logs import LogMapping
 from ucfrec.off_policy import LoggedSteps, estimate
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.off_policy.models import (
@@ -25,20 +24,13 @@ from ucfrec.off_policy.models import (
     group_items,
     make_inputs,
 )
-from ucfrec.off_policy.score import LoggedSessions, read_logged_sessions, score_steps
+from ucfrec.off_policy.score import LoggedSessions, score_steps
 from ucfrec.runs.trained_policy import TrainedPolicy
-
-
-@pytest.fixture
-def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
-        yield logged
 
 
 def inputs_of(steps: int, seed: int) -> StepInputs:
     generator = torch.Generator().manual_seed(seed)
-    parts = [torch.randn(steps, size, generator=generator) for size in (20, 4, 4, 2)]
-    return StepInputs(parts[0], 15, *parts[1:])
+    return StepInputs(*(torch.randn(steps, size, generator=generator) for size in (15, 5, 4, 4, 2)))
 
 
 def test_a_file_gives_back_what_was_written(
@@ -72,12 +64,11 @@ def test_context_is_the_state_the_return_left_and_the_window(
             steps = np.arange(step)
             values = logged.store.step_values("reward", np.full(step, episode), steps)
             earned[row] = float(values.sum())
-        left = seen[-1].context[:, seen[-1].state_size]
+        left = seen[-1].window[:, 0]
         torch.testing.assert_close(left, target - earned, atol=1e-4, rtol=1e-4)
-    size = seen[0].state_size
-    torch.testing.assert_close(seen[0].context[:, :size], seen[1].context[:, :size])
-    assert seen[0].context.shape[1] == size + 1 + trained.policy.config.dim
-    assert not torch.allclose(seen[0].context[:, size + 1 :], seen[1].context[:, size + 1 :])
+    torch.testing.assert_close(seen[0].states, seen[1].states)
+    assert seen[0].window.shape[1] == 1 + trained.policy.config.dim
+    assert not torch.allclose(seen[0].window[:, 1:], seen[1].window[:, 1:])
 
 
 def test_features_are_those_that_the_scores_are_made_from(
@@ -181,8 +172,7 @@ def test_users_are_predicted_by_models_of_others() -> None:
         fit_behavior(lambda: iter([states]), one, GROUP_OF[one], session, 0, session // 4)
         for one in (item, changed)
     ]
-    if (models[0].temperature, models[0].share) == (models[1].temperature, models[1].share):
-        np.testing.assert_array_equal(models[0].item[same], models[1].item[same])
+    np.testing.assert_array_equal(models[0].item[same], models[1].item[same])
 
 
 def test_unknown_items_are_left_alone() -> None:
@@ -194,7 +184,6 @@ def test_unknown_items_are_left_alone() -> None:
     assert (model.item[item < 0] == 1).all()
     # Items do not follow the state: each of nine, whatever it is.
     np.testing.assert_allclose(model.item[item >= 0], 1 / 9, rtol=0.1)
-    assert model.share == 1
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -3,7 +3,7 @@
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.off_policy.conftest import Read
 from tests.support.replay import replayed
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
@@ -33,12 +34,6 @@ from ucfrec.runs.record import store_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 RULE = DecisionRule(7.5, temperature=1.0)
-
-
-@pytest.fixture
-def logged(folder: Path, trained: TrainedPolicy) -> Iterator[LoggedSessions]:
-    with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
-        yield logged
 
 
 RULES = {
@@ -70,10 +65,10 @@ def test_scores_are_those_of_an_actor_that_replays_the_session(
 
 
 def test_rows_are_those_of_the_log_in_its_sessions(
-    folder: Path, trained: TrainedPolicy, logged: LoggedSessions
+    log: pd.DataFrame, trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
     frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
-    log = pd.read_parquet(folder / "rest.parquet").sort_values(["user_id", "timestamp"])
+    log = log.sort_values(["user_id", "timestamp"])
     for name in ("user_id", "item_id", "timestamp", "reward"):
         np.testing.assert_array_equal(frame[name], log[name])
     np.testing.assert_allclose(frame.propensity, 1 / 30)
@@ -84,10 +79,10 @@ def test_rows_are_those_of_the_log_in_its_sessions(
 
 
 def test_nothing_of_the_step_or_after_it_is_looked_at(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
+    log: pd.DataFrame, trained: TrainedPolicy, read: Read
 ) -> None:
     """Rewards and items from a step on, changed: it is scored as before."""
-    log = pd.read_parquet(folder / "rest.parquet").sort_values(["user_id", "timestamp"])
+    log = log.sort_values(["user_id", "timestamp"])
     gaps = (log.timestamp.diff() > 20 * 60_000) | (log.user_id.diff() != 0)
     session = gaps.cumsum()
     later = log.groupby(session).cumcount() >= 1
@@ -95,10 +90,9 @@ def test_nothing_of_the_step_or_after_it_is_looked_at(
         reward=np.where(later, 1 - log.reward, log.reward),
         item_id=np.where(later, (log.item_id + 7) % 30, log.item_id),
     )
-    changed.to_parquet(tmp_path / "changed.parquet")
     thought = []
-    for file in (folder / "rest.parquet", tmp_path / "changed.parquet"):
-        with read_logged_sessions(trained, [file], LogMapping()) as logged:
+    for rows in (log, changed):
+        with read(rows) as logged:
             _, steps = logged.store.all_steps()
             batches = score_steps(trained, logged.store, RULE)
             thought.append(torch.cat([b.log_probabilities for b in batches]).numpy()[steps <= 1])
@@ -139,80 +133,51 @@ def test_features_at_the_policy_are_the_mean_over_its_items(
     np.testing.assert_allclose(at_policy, mean, rtol=1e-4, atol=1e-5)
 
 
-def test_items_the_run_does_not_know_are_counted(folder: Path, tmp_path: Path) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
+def test_items_the_run_does_not_know_are_counted(
+    log: pd.DataFrame, trained: TrainedPolicy, read: Read
+) -> None:
     strange = log.head(4).assign(item_id=[991, 992, 993, 993])
-    pd.concat([log, strange]).to_parquet(tmp_path / "log.parquet")
-    trained = TrainedPolicy.load(folder / "run")
-    files = [tmp_path / "log.parquet"]
-    with read_logged_sessions(trained, files, LogMapping()) as logged:
+    with read(pd.concat([log, strange])) as logged:
         assert logged.report["dropped"]["unknown_item"] == 4
         assert sum(map(len, score(trained, logged, RULE))) == len(log)
-    strange.to_parquet(tmp_path / "log.parquet")
-    with (
-        pytest.raises(InputError, match=r"no row is left \(4 rows: item is not in the store"),
-        read_logged_sessions(trained, files, LogMapping()),
+    for rows, keep_unknown, says in (
+        (strange, False, r"no row is left \(4 rows: item is not in the store"),
+        (strange, True, r"in all 4 rows the item is not in the store"),
     ):
-        pass
+        with pytest.raises(InputError, match=says), read(rows, keep_unknown):
+            pass
 
 
 def test_unknown_items_may_stay_with_no_probability(
-    folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
+    log: pd.DataFrame, trained: TrainedPolicy, logged: LoggedSessions, read: Read
 ) -> None:
     """Every third row shows something new: its probability is 0, and what came before in the
     session is evaluated as usual."""
-    log = pd.read_parquet(folder / "rest.parquet")
     new = np.arange(len(log)) % 3 == 0
-    log.assign(item_id=np.where(new, 999, log.item_id)).to_parquet(tmp_path / "log.parquet")
     before = collect_steps(trained, logged, RULE, seed=0)[0]
-    files = [tmp_path / "log.parquet"]
-    with read_logged_sessions(trained, files, LogMapping(), keep_unknown=True) as kept:
+    with read(log.assign(item_id=np.where(new, 999, log.item_id)), keep=True) as kept:
         unknown = kept.store.step_values("item", *kept.store.all_steps()) < 0
         assert kept.unknown_items == unknown.sum() == new.sum()
         assert kept.report["dropped"]["unknown_item"] == 0
         steps = collect_steps(trained, kept, RULE, seed=0)[0]
     assert (steps.target[unknown] == 0).all()
     assert (steps.weights[unknown] == 0).all()
-    untouched = np.logical_and.accumulate(~unknown)
-    for session in range(len(steps.first)):
-        rows = slice(steps.first[session], steps.last[session] + 1)
-        untouched[rows] = np.logical_and.accumulate(~unknown[rows])
+    untouched = ~unknown
+    for first, last in zip(steps.first, steps.last, strict=True):
+        untouched[first : last + 1] = np.logical_and.accumulate(~unknown[first : last + 1])
     assert untouched.sum() > 300
     np.testing.assert_allclose(steps.target[untouched], before.target[untouched], rtol=1e-4)
 
 
-def test_logs_of_another_catalogue_are_refused(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
-    log.assign(item_id=log.item_id + 1000).to_parquet(tmp_path / "log.parquet")
-    with (
-        pytest.raises(InputError, match=r"in all .* rows the item is not in the store"),
-        read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True),
-    ):
-        pass
-
-
-def test_logs_of_users_the_run_does_not_know_are_noted(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
+def test_logs_of_users_the_run_does_not_know_are_noted(log: pd.DataFrame, read: Read) -> None:
     users = log.user_id.nunique()
     padded = log.assign(user_id=log.user_id.map("{:07}".format))
     # Fewer than 20 users, or a tenth of known ones, say nothing.
     few = padded[padded.user_id.isin(padded.user_id.unique()[:19])]
-    known = log.user_id.unique()[: users // 8]
-    some = padded.assign(
-        user_id=padded.user_id.where(~log.user_id.isin(known), log.user_id.map(str))
-    )
+    known = log.user_id.isin(log.user_id.unique()[: users // 8])
+    some = padded.assign(user_id=padded.user_id.where(~known, log.user_id.map(str)))
     for each, noted in ((padded, True), (few, False), (some, False)):
-        each.to_parquet(tmp_path / "log.parquet")
-        with (
-            warnings.catch_warnings(record=True) as said,
-            read_logged_sessions(
-                trained, [tmp_path / "log.parquet"], LogMapping(), keep_unknown=True
-            ),
-        ):
+        with warnings.catch_warnings(record=True) as said, read(each, keep=True):
             pass
         found = [str(note.message) for note in said if note.category is InputNote]
         assert len(found) == noted
@@ -220,14 +185,11 @@ def test_logs_of_users_the_run_does_not_know_are_noted(
 
 
 def test_ids_may_be_text_where_the_run_has_integers(
-    folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
+    log: pd.DataFrame, logged: LoggedSessions, read: Read
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     text = log.assign(user_id=log.user_id.map("{}".format), item_id=log.item_id.map("{}".format))
     text.loc[text.index[0], "user_id"] = "somebody"
-    text.to_parquet(tmp_path / "log.parquet")
-    files = [tmp_path / "log.parquet"]
-    with read_logged_sessions(trained, files, LogMapping()) as other:
+    with read(text) as other:
         there = other.store.step_values("item", *other.store.all_steps())
         assert len(there) == len(log)
         assert sorted(there) == sorted(logged.store.step_values("item", *logged.store.all_steps()))
@@ -236,13 +198,12 @@ def test_ids_may_be_text_where_the_run_has_integers(
 
 @pytest.mark.parametrize(("duplicates", "kept"), [("lowest", min), ("highest", max)])
 def test_rows_that_repeat_count_as_in_the_training_log(
-    folder: Path,
+    log: pd.DataFrame,
     trained: TrainedPolicy,
     tmp_path: Path,
     duplicates: str,
     kept: Callable[..., float],
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     twice = pd.concat([log, log.assign(reward=kept(-1.0, 2.0)), log.assign(reward=0.5)])
     twice.to_parquet(tmp_path / "twice.parquet")
     data = trained.record.data.model_copy(update={"duplicates": duplicates})
@@ -253,7 +214,7 @@ def test_rows_that_repeat_count_as_in_the_training_log(
 
 @pytest.mark.parametrize(("pause", "new_session"), [(60_000, False), (3_600_000, True)])
 def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path, pause: int, new_session: bool
+    folder: Path, trained: TrainedPolicy, read: Read, pause: int, new_session: bool
 ) -> None:
     """Two rounds of serving: what was seen is in the store of the run, or in the scored log."""
     rule = DecisionRule(trained.rule.target, temperature=1.0)
@@ -267,8 +228,7 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
         served.append(rows.assign(timestamp=rows.user_id.map(last) + pause))
         before = pd.concat([before, served[-1]])
     log = pd.concat(served).sort_values(["user_id", "timestamp"])
-    log.to_parquet(tmp_path / "served.parquet")
-    with read_logged_sessions(trained, [tmp_path / "served.parquet"], LogMapping()) as logged:
+    with read(log) as logged:
         whole, filtered = (
             pd.concat(score(trained, logged, rule, filter_seen)) for filter_seen in (False, True)
         )
@@ -282,24 +242,24 @@ def test_items_that_users_have_seen_are_excluded_as_they_were_when_serving(
 @pytest.mark.parametrize(("seen", "expected"), [(0, 0.0), (300, 0.5)])
 def test_the_share_of_rows_seen_in_training(
     folder: Path,
+    log: pd.DataFrame,
     trained: TrainedPolicy,
-    tmp_path: Path,
+    read: Read,
     monkeypatch: pytest.MonkeyPatch,
     seen: int,
     expected: float,
 ) -> None:
     monkeypatch.setattr("ucfrec.episodes.view._BATCH_STEPS", 100)
     train = pd.read_parquet(folder / "train.parquet").sort_values("timestamp")
-    rest = pd.read_parquet(folder / "rest.parquet").head(600 - seen)
     # The last tenth of the training log is its test split, which the run never saw.
-    pd.concat([train.head(seen), rest]).to_parquet(tmp_path / "log.parquet")
-    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping()) as logged:
+    with read(pd.concat([train.head(seen), log.head(600 - seen)])) as logged:
         assert share_seen(trained, logged.store) == pytest.approx(expected, abs=0.01)
 
 
-def test_judging_by_the_training_log_is_refused(folder: Path, trained: TrainedPolicy) -> None:
-    log = folder / "train.parquet"
-    with read_logged_sessions(trained, [log], LogMapping(), keep_unknown=True) as logged:
+def test_judging_by_the_training_log_is_refused(
+    folder: Path, trained: TrainedPolicy, read: Read
+) -> None:
+    with read(pd.read_parquet(folder / "train.parquet"), keep=True) as logged:
         rule = DecisionRule(5.0, temperature=1.0)
         evaluated = evaluate_off_policy(trained, logged, rule=rule, seed=0)
     assert not evaluated.verdict.reliable
@@ -328,14 +288,13 @@ def test_a_refit_has_seen_the_test_split_too(
 
 
 def test_without_the_training_store_nothing_is_known(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
+    folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
 ) -> None:
     shutil.copytree(folder / "store", tmp_path / "store")
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
         moved = replace(trained, record=trained.record.copy_with(**places))
-        with read_logged_sessions(trained, [folder / "rest.parquet"], LogMapping()) as logged:
-            assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
+        assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
 
 
 def test_a_run_that_was_moved_with_its_store_finds_it(

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.off_policy.conftest import Read
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.logs import LogMapping
 from ucfrec.off_policy import scored
 from ucfrec.off_policy.evaluate import EstimateOptions, evaluate_off_policy
-from ucfrec.off_policy.score import about_scores, read_logged_sessions, score
+from ucfrec.off_policy.score import about_scores, score
 from ucfrec.off_policy.scored import evaluate_scored
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -26,13 +27,13 @@ RULE = DecisionRule(7.5, temperature=1.0)
 WEIGHED = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "clipped IPS")
 
 
-def scored_parts(folder: Path, trained: TrainedPolicy, out: Path, lacking: int) -> Path:
-    """The logs of `folder`, some without propensity, scored into three files of any sessions."""
-    log = pd.read_parquet(folder / "rest.parquet")
+def scored_parts(
+    log: pd.DataFrame, trained: TrainedPolicy, read: Read, out: Path, lacking: int
+) -> Path:
+    """The logs, now with other propensities or none, scored into three files of any sessions."""
     log["propensity"] = np.random.default_rng(0).uniform(0.02, 0.06, len(log))
     log.loc[log.index[:lacking], "propensity"] = np.nan
-    log.to_parquet(out / "log.parquet")
-    with read_logged_sessions(trained, [out / "log.parquet"], LogMapping()) as logged:
+    with read(log) as logged:
         frame = pd.concat(score(trained, logged, RULE), ignore_index=True)
     (out / "scored").mkdir()
     for part, (begin, end) in enumerate(((0, 70), (70, 71), (71, len(frame)))):
@@ -44,19 +45,20 @@ def scored_parts(folder: Path, trained: TrainedPolicy, out: Path, lacking: int) 
 
 @pytest.mark.parametrize(("lacking", "discount", "rows"), [(0, 1.0, 7), (25, 0.8, 64)])
 def test_estimates_are_those_from_the_logs(
-    folder: Path,
+    log: pd.DataFrame,
     trained: TrainedPolicy,
+    read: Read,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     lacking: int,
     discount: float,
     rows: int,
 ) -> None:
-    parts = scored_parts(folder, trained, tmp_path, lacking)
+    parts = scored_parts(log, trained, read, tmp_path, lacking)
     monkeypatch.setattr(scored, "_BATCH_ROWS", rows)
     options = EstimateOptions(discount=discount)
     found = evaluate_scored(trained, [parts], rule=RULE, seed=3, options=options)
-    with read_logged_sessions(trained, [tmp_path / "log.parquet"], LogMapping(), True) as logged:
+    with read(log, keep=True) as logged:
         expected = evaluate_off_policy(trained, logged, rule=RULE, seed=3, options=options)
     ours, theirs = ({row.method: row for row in each.rows} for each in (found, expected))
     assert {*WEIGHED} <= {*ours}
@@ -106,8 +108,9 @@ def rewrite(file: Path, column: str, values: Any) -> None:
     ],
 )
 def test_scored_rows_that_cannot_be_used_are_refused(
-    folder: Path,
+    log: pd.DataFrame,
     trained: TrainedPolicy,
+    read: Read,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     column: str,
@@ -115,7 +118,7 @@ def test_scored_rows_that_cannot_be_used_are_refused(
     says: str | None,
 ) -> None:
     monkeypatch.setattr(scored, "_BATCH_ROWS", 7)
-    parts = scored_parts(folder, trained, tmp_path, 0)
+    parts = scored_parts(log, trained, read, tmp_path, 0)
     file, rule, options = parts / "part-2.parquet", RULE, EstimateOptions()
     if column in ("pages", "reward_range"):
         options = EstimateOptions(**{column: values})
@@ -135,33 +138,19 @@ def test_scored_rows_that_cannot_be_used_are_refused(
         pq.write_table(pq.read_table(file).drop_columns([column]), file)
     else:
         rewrite(file, column, values)
-    if says is None:
+    with nullcontext() if says is None else pytest.raises(InputError, match=says):
         evaluate_scored(trained, [parts], rule=rule, seed=0, options=options)
-        return
-    with pytest.raises(InputError, match=says):
-        evaluate_scored(trained, [parts], rule=rule, seed=0, options=options)
-
-
-def test_the_command_reads_what_score_writes(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, out, rule = str(folder / "run"), str(tmp_path / "scored.parquet"), ["--temperature", "1"]
-    assert main(["score", run, str(folder / "rest.parquet"), "--out", out, *rule]) == 0
-    results = str(tmp_path / "ope.json")
-    assert main(["ope", run, out, "--scored", *rule, "--json", results]) == 0
-    said = capsys.readouterr().out
-    assert "SNPDIS" in said
-    assert "verdict:" in said
-    assert main(["ope", run, out, "--scored", *rule, "--temperatures", "1,2"]) == 2
-    assert main(["ope", run, "--scored"]) == 2
-    assert main(["report", run, "--results", results, "--out", str(tmp_path / "r.html")]) == 0
 
 
 @pytest.mark.parametrize(("share", "forbids"), [(0.0, False), (0.02, False), (0.2, True)])
-def test_unknown_items_left_out_of_scores_are_named_as_the_cause(
-    folder: Path, tmp_path: Path, share: float, forbids: bool
+def test_the_command_reads_what_score_writes_and_names_unknown_items(
+    folder: Path,
+    log: pd.DataFrame,
+    tmp_path: Path,
+    share: float,
+    forbids: bool,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    log = pd.read_parquet(folder / "rest.parquet")
     unknown = int(share * len(log))
     log.loc[log.index[:unknown], "item_id"] = 10**6
     log.to_parquet(tmp_path / "log.parquet")
@@ -169,21 +158,29 @@ def test_unknown_items_left_out_of_scores_are_named_as_the_cause(
     results = tmp_path / "ope.json"
     assert main(["score", run, str(tmp_path / "log.parquet"), "--out", out, *rule]) == 0
     assert main(["ope", run, out, "--scored", *rule, "--json", str(results)]) == 0
+    said = capsys.readouterr().out
+    assert "SNPDIS" in said
+    assert "verdict:" in said
     line = json.loads(results.read_text())[-1]["details"]
     text = f"{unknown:,} of {len(log):,} rows show items that the run does not know"
     assert any(text in each for each in line["warnings"]) == (unknown > 0)
     assert (text in line["verdict"]) == forbids
+    if not unknown:
+        assert main(["ope", run, out, "--scored", *rule, "--temperatures", "1,2"]) == 2
+        assert main(["ope", run, "--scored"]) == 2
+        page = str(tmp_path / "r.html")
+        assert main(["report", run, "--results", str(results), "--out", page]) == 0
 
 
 @pytest.mark.parametrize("session_by", [pytest.param("gap", marks=pytest.mark.slow), "session_id"])
 def test_rows_are_those_of_one_process(
-    folder: Path, spark: Any, session_by: str, tmp_path: Path
+    folder: Path, log: pd.DataFrame, spark: Any, session_by: str, tmp_path: Path
 ) -> None:
     """With new users and items, sessions that go on from the store, and rows that cannot be used"""
-    train, log = (pd.read_parquet(folder / f"{name}.parquet") for name in ("train", "rest"))
     run = folder / "run"
     if session_by == "session_id":
         run, options = tmp_path / "run", ["--session-by", "session_id", "--reward", "reward"]
+        train = pd.read_parquet(folder / "train.parquet")
         train, log = (each.assign(session_id=each.timestamp // 10**7) for each in (train, log))
         train.to_parquet(tmp_path / "train.parquet")
         store = str(tmp_path / "store")
@@ -205,12 +202,3 @@ def test_rows_are_those_of_one_process(
     assert len(list((tmp_path / "spark").iterdir())) == 2
     pd.testing.assert_frame_equal(found["spark"], found["torch"], rtol=1e-4, atol=1e-6)
     assert found["spark"].session.nunique() == found["spark"].session.max() + 1 > 100
-
-
-def test_sessions_are_numbered_over_all_parts(tmp_path: Path) -> None:
-    parts = [[0, 0, 1], [0], [0, 1, 2, 2]]
-    for number, sessions in enumerate(parts):
-        frame = pd.DataFrame({"user_id": number, "session": sessions})
-        frame.to_parquet(tmp_path / f"part-{number}.parquet", index=False)
-    scored.number_sessions(tmp_path, [2, 1, 3])
-    assert pd.read_parquet(tmp_path).session.to_list() == [0, 0, 1, 2, 3, 4, 5, 5]

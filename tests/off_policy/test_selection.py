@@ -47,11 +47,11 @@ def test_the_best_of_four_policies_is_chosen() -> None:
     chosen, correlations, regrets, held, within = 0, [], [], 0, 0
     for seed in range(20):
         found = evaluated(seed)
-        chosen += found.chosen.name == "best"
+        chosen += found.standings[0].name == "best"
         named = {one.name: one for one in found.standings}
         ranks = [named[name].rank for name in truth]
         correlations.append(spearmanr(ranks, [-value for value in truth.values()]).statistic)
-        regrets.append(truth["best"] - truth[found.chosen.name])
+        regrets.append(truth["best"] - truth[found.standings[0].name])
         held += all(named[name].low <= truth[name] <= named[name].high for name in truth)
         within += regrets[-1] <= found.regret + 1e-12
         assert sum(one.probability_best for one in found.standings) == pytest.approx(1)
@@ -72,7 +72,7 @@ def test_the_luck_of_the_chosen_is_taken_off() -> None:
     naive, corrected, held = [], [], 0
     for seed in range(30):
         found = select([str(k) for k in range(20)], equal(seed, 20), seed)
-        naive.append(found.chosen.value)
+        naive.append(found.standings[0].value)
         corrected.append(found.corrected)
         held += all(one.low <= 1 <= one.high for one in found.standings)
         assert found.regret > 0
@@ -85,10 +85,10 @@ def test_one_clear_winner_loses_nothing() -> None:
     terms = equal(0, 4)
     terms[:, 2] += 2
     found = select(list("abcd"), terms, 0)
-    assert found.chosen.name == "c"
-    assert found.chosen.probability_best == 1
+    assert found.standings[0].name == "c"
+    assert found.standings[0].probability_best == 1
     assert found.regret == 0
-    assert found.corrected == pytest.approx(found.chosen.value, abs=0.01)
+    assert found.corrected == pytest.approx(found.standings[0].value, abs=0.01)
     assert found.headline.startswith("No other has a higher value than c: ")
     assert [one.rank for one in found.standings] == [1, 2, 3, 4]
 
@@ -96,11 +96,11 @@ def test_one_clear_winner_loses_nothing() -> None:
 def test_the_band_of_one_is_an_interval_and_of_many_is_wider() -> None:
     terms = np.random.default_rng(0).normal(size=(2000, 30))
     one, many = select(["0"], terms[:, :1], 0), select([str(k) for k in range(30)], terms, 0)
-    width = (one.chosen.high - one.chosen.low) / one.chosen.error / 2
+    width = (one.standings[0].high - one.standings[0].low) / one.standings[0].error / 2
     assert width == pytest.approx(1.96, abs=0.1)
     assert one.regret == 0
     assert one.headline == "0 is the only candidate"
-    wide = (many.chosen.high - many.chosen.low) / many.chosen.error / 2
+    wide = (many.standings[0].high - many.standings[0].low) / many.standings[0].error / 2
     assert wide == pytest.approx(3.13, abs=0.15)  # the 95% quantile of 30 normal deviations
 
 
@@ -138,8 +138,7 @@ def test_only_candidates_whose_verdicts_stand_are_ranked() -> None:
         ),
     }
     choice = choose(reports, seed=0)
-    assert choice.selection is not None
-    assert [one.name for one in choice.selection.standings] == ["later", "uniform"]
+    assert [one.name for one in choice.standings] == ["later", "uniform"]
     assert "propensities are too small" in choice.excluded["propensities wrong"]
     truth = (
         np.arange(1.0, test_verdict.ITEMS + 1)
@@ -147,7 +146,7 @@ def test_only_candidates_whose_verdicts_stand_are_ranked() -> None:
         / np.arange(1.0, test_verdict.ITEMS + 1).sum()
     )
     assert choice.columns("later")["band_low"] < truth < choice.columns("later")["band_high"]
-    assert choice.columns("later")["corrected"] <= choice.selection.chosen.value
+    assert choice.columns("later")["corrected"] <= choice.standings[0].value
     assert "regret" not in choice.columns("uniform")
     assert set(choice.columns("propensities wrong")) == {"selection"}
 
@@ -155,7 +154,7 @@ def test_only_candidates_whose_verdicts_stand_are_ranked() -> None:
 def test_no_candidate_may_stand() -> None:
     steps, _ = logs(100)
     choice = choose({"a": report(steps), "b": report(steps)}, seed=0)
-    assert choice.selection is None
+    assert choice.standings == ()
     assert choice.headline == "The logs allow no conclusion on any of the candidates"
     assert set(choice.excluded) == {"a", "b"}
 

@@ -1,6 +1,5 @@
 """Exposure, advantage weights and the largest return, in every policy; without them, nothing."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -17,13 +16,14 @@ from tests.policies.test_ucf import (
     other,
     random_windows,
     sessions_of,
+    trained,
 )
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Exposed
 from ucfrec.errors import InputError
-from ucfrec.fitting.loop import RowAdamW, clip_gradients
+from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead, advantage_weights
 from ucfrec.policies.registry import policy_class
@@ -51,18 +51,6 @@ def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     return policy
 
 
-def trained(policy: SequencePolicy, steps: int = 25) -> SequencePolicy:
-    windows = random_windows(VECTORS if policy.head.__class__.__name__ != "ItemHead" else TAGGED)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
-    policy.train()
-    for step in range(steps):
-        torch.manual_seed(step)
-        optimizer.zero_grad()
-        policy.loss(windows)[0].backward()
-        optimizer.step()
-    return policy.eval()
-
-
 @kinds
 @policies
 def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict[str, int]) -> None:
@@ -70,7 +58,7 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
     policy, windows = build(name, sizes, **ADDITIONS, **more), random_windows(sizes)
     policy.eval()
     before = policy.loss(windows)[1]
-    trained(policy)
+    trained(policy, windows, 25)
     loss, scalars = policy.loss(windows)
     assert torch.isfinite(loss)
     assert {"action_loss", "value_loss"} <= scalars.keys()
@@ -107,32 +95,11 @@ def test_every_learner_learns_from_sampled_items(name: str) -> None:
         assert policy.eval().action_loss(windows) < expected - 0.05
 
 
-def test_a_step_costs_about_the_same_in_every_catalogue() -> None:
-    """A full softmax of 400,000 items would take a hundred times as long as one of 4,000."""
-    seconds, steps = {4_000: 1e9, 400_000: 1e9}, {}
-    windows = random_windows(TAGGED)
-    for n in seconds:
-        torch.manual_seed(0)
-        policy_type = policy_class("ucf")
-        config = policy_type.Config(**SMALL, sampled_above=100, sampled_items=256)
-        policy = policy_type(config, {**TAGGED, "items": n}).train()
-        steps[n] = policy, RowAdamW(policy.parameters(), fused=True)
-    for _ in range(8):
-        for n, (policy, optimizer) in steps.items():
-            start = time.thread_time()
-            optimizer.zero_grad()
-            policy.loss(windows)[0].backward()  # type: ignore[no-untyped-call]
-            clip_gradients(policy.parameters(), 0.25)
-            optimizer.step()
-            seconds[n] = min(seconds[n], time.thread_time() - start)
-    assert seconds[400_000] < 4 * seconds[4_000]
-
-
 @policies
 def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     """Prediction t with the term is prediction t without it plus what `Exposed.before` says."""
-    policy = trained(build(name, TAGGED, exposure=True, exposure_window=3))
     windows = random_windows(TAGGED)
+    policy = trained(build(name, TAGGED, exposure=True, exposure_window=3), windows, 25)
     head = policy.head
     assert isinstance(head, ItemHead)
     assert head.exposure is not None

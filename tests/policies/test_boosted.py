@@ -34,7 +34,7 @@ def test_tables_are_the_trees_of_scikit_learn(
     at = store.locate(numbers[:200])
     windows = store.windows(*at, 6)
     monkeypatch.setattr(policy, "_inputs", lambda *_: torch.from_numpy(inputs[:200, None]))
-    found = policy._scored(windows, windows.actions[:, -1:])[:, 0]
+    found = policy._score(windows, windows.actions[:, -1:])[:, 0]
     torch.testing.assert_close(
         found.double(), trees(torch.from_numpy(inputs[:200])), atol=1e-4, rtol=1e-4
     )
@@ -44,12 +44,12 @@ def test_only_the_best_items_are_boosted(fitted: tuple[BoostedPolicy, EpisodeSto
     policy, store = fitted
     windows = store.windows(*store.locate(np.arange(40)), 6)
     scores = policy.act(windows)
-    rates = policy._rate(policy.liked, policy.shown)
+    rates = policy._rate(policy.liked, policy.impressions)
     others = rates.argsort(descending=True)[5:]
     apart = scores[:, others] - rates[others]
     torch.testing.assert_close(apart, apart[:, :1].expand_as(apart))
     best = rates.topk(5).indices
-    torch.testing.assert_close(scores[:, best], policy._scored(windows, best))
+    torch.testing.assert_close(scores[:, best], policy._score(windows, best))
 
 
 def test_a_row_does_not_tell_the_trees_what_they_predict(

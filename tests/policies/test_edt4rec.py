@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.policies.test_ucf import CATALOG, VECTORS, both_heads, build, changed_at, random_windows
+from tests.policies.test_ucf import (
+    CATALOG,
+    VECTORS,
+    both_heads,
+    build,
+    changed_at,
+    random_windows,
+    trained,
+)
 from tests.support.episodes import lengths_of, random_episodes, some_states, write_store
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
@@ -18,12 +26,10 @@ from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.dt import CDT4RecPolicy, DT4RecPolicy
 from ucfrec.policies.edt4rec import (
     ConservativeQ,
-    CQLConfig,
     EDT4RecPolicy,
     _consistent,
-    _entropy,
     optimistic_returns,
-    relabelled,
+    relabel,
 )
 from ucfrec.policies.registry import policy_class
 from ucfrec.runs.config import resolve_config
@@ -68,29 +74,18 @@ def test_switching_the_distinguishing_part_off_changes_loss_and_gradient(
     )
 
 
-def trained(policy: SequencePolicy, windows: Windows, steps: int = 150) -> SequencePolicy:
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
-    policy.train()
-    for step in range(steps):
-        torch.manual_seed(step)
-        optimizer.zero_grad()
-        policy.loss(windows)[0].backward()
-        optimizer.step()
-    return policy.eval()
-
-
 @both_heads
 def test_the_reward_estimator_learns_the_reward_of_the_action_taken(sizes: dict[str, int]) -> None:
     policy, windows = build("cdt4rec", sizes, dropout=0.0), random_windows(sizes)
     assert isinstance(policy, CDT4RecPolicy)
     first = policy.loss(windows)[1]["reward_loss"]
-    trained(policy, windows)
+    trained(policy, windows, 150)
     assert policy.loss(windows)[1]["reward_loss"] < 0.1 * first
     hidden = policy.transform(policy.normalize(windows))
-    estimate = policy.estimated_rewards(hidden, windows.mask)
+    estimate = policy.estimate_rewards(hidden, windows.mask)
     later = changed_at(windows, (slice(None), 6), ("actions",))
     hidden = policy.transform(policy.normalize(later))
-    moved = policy.estimated_rewards(hidden, windows.mask)
+    moved = policy.estimate_rewards(hidden, windows.mask)
     torch.testing.assert_close(moved[:, :6], estimate[:, :6])
     assert not torch.allclose(moved[:, 6], estimate[:, 6])
 
@@ -138,7 +133,7 @@ def test_the_entropy_constraint_holds_and_its_multiplier_follows(sizes: dict[str
         before = policy.log_multiplier.item()
         trained(policy, windows, 250)
         features = policy.features(policy.normalize(_consistent(windows)))[windows.mask]
-        entropies[beta] = _entropy(policy.head, features, None).item()
+        entropies[beta] = policy.head.entropy(features).item()
         if beta < 0:
             assert policy.log_multiplier.item() < before
         else:
@@ -176,8 +171,7 @@ def test_relabelling_is_a_store_that_promises_no_less(tmp_path: Path, items: boo
     episodes = random_episodes([5, 3, 7, 1, 4], items=items)
     store = write_store(tmp_path / "store", episodes, some_states() if items else None)
     view = store.select(np.array([0, 2, 4]))
-    config = CQLConfig(steps=20, hidden=16, batch_size=8, candidates=6)
-    new = relabelled(view, config, tmp_path / "q", seed=0)
+    new = relabel(view, 20, 1.0, tmp_path / "q", seed=0)
     assert new.n_episodes == 3
     before = view.step_values("return_to_go", *view.all_steps())
     after = new.step_values("return_to_go", *new.all_steps())
@@ -185,7 +179,7 @@ def test_relabelling_is_a_store_that_promises_no_less(tmp_path: Path, items: boo
     assert (after > before + 1e-3).any()
     others = np.array([1, 3])
     np.testing.assert_array_equal(store.select(others).returns, store.returns[others])
-    again = relabelled(view, config, tmp_path / "q", seed=0)
+    again = relabel(view, 20, 1.0, tmp_path / "q", seed=0)
     np.testing.assert_array_equal(again.step_values("return_to_go", *new.all_steps()), after)
 
 
@@ -200,11 +194,10 @@ def test_cql_values_the_better_action_and_presses_unseen_ones_down(tmp_path: Pat
     store = EpisodeStore.write(tmp_path / "store", columns, np.ones(600, dtype=np.int64))
     values = {}
     for weight in (0.0, 5.0):
-        config = CQLConfig(steps=200, hidden=32, candidates=16, weight=weight)
         torch.manual_seed(0)
-        network = ConservativeQ(store, config)
+        network = ConservativeQ(store, weight)
         optimizer = torch.optim.Adam(network.network.parameters(), lr=5e-3)
-        for _ in range(config.steps):
+        for _ in range(200):
             batch = store.transitions(*store.draw_steps(rng, 128))
             optimizer.zero_grad()
             network.loss(batch)[0].backward()

@@ -10,7 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from torch import Tensor
 
+from tests.recommending.test_responder import answered
 from tests.support.logs import store_of
 from tests.support.served import (
     FULL,
@@ -20,18 +22,30 @@ from tests.support.served import (
     histories,
     learn_tastes,
     observed_log,
+    requests_of,
+    responder,
     trained_run,
 )
 from tests.support.tagged import tagged_log
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.recommending.export import DESCRIPTION, GRAPH, export
-from ucfrec.recommending.export_graph import _CHUNK, OUTPUTS, _best
+from ucfrec.recommending.export import (
+    _CHUNK,
+    DESCRIPTION,
+    GRAPH,
+    OUTPUTS,
+    export,
+    find_best,
+    measure_magnitude,
+    require_close,
+)
 from ucfrec.recommending.histories import histories_of_frame
 from ucfrec.recommending.recommend import recommend
+from ucfrec.recommending.responder import ONNXRUNTIME, Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -240,9 +254,71 @@ def test_the_best_of_chunks_are_the_best_of_all(n: int) -> None:
     scores = torch.randn(3, n, generator=torch.Generator().manual_seed(0))
     scores[1] = -torch.inf
     scores[2, 5:] = -torch.inf
-    items, values = _best(scores, 9)
+    items, values = find_best(scores, 9)
     expected = scores[0].log_softmax(-1).topk(9)
     assert torch.equal(items[0], expected.indices)
     torch.testing.assert_close(values[0], expected.values)
     assert items[1].tolist() == [-1] * 9
     assert sorted(items[2].tolist()) == [-1] * 4 + [0, 1, 2, 3, 4]
+
+
+# onnxruntime answers a request that comes alone as torch does.
+
+
+@pytest.fixture(scope="module")
+def ending(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    trained = trained_run(tmp_path_factory.mktemp("scores"))
+    learn_tastes(trained)
+    assert trained.reward_model is not None
+    return replace(trained, session_end=boredom(trained.reward_model.likeness))
+
+
+@pytest.fixture(scope="module")
+def fast(ending: TrainedPolicy) -> Responder:
+    return responder(ending, rule=replace(FULL, lookahead=2.0), k=24, engine=ONNXRUNTIME)
+
+
+@pytest.mark.slow
+def test_answers_are_those_of_torch(
+    ending: TrainedPolicy, fast: Responder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = [*requests_of(histories()), {"user_id": "new", "request_id": "1"}]
+    graph, alone = fast._chooser.scorer._engine, []
+
+    def counted(sessions: Sessions, excluded: Tensor) -> Any:
+        alone.append(len(sessions.users))
+        assert graph is not None
+        return graph(sessions, excluded)
+
+    monkeypatch.setattr(fast._chooser.scorer, "_engine", counted)
+    expected = answered(responder(ending, rule=fast.rule, k=24), asked)
+    one_by_one = pd.concat([answered(fast, [each]) for each in asked], ignore_index=True)
+    pd.testing.assert_frame_equal(one_by_one, expected, rtol=1e-5, atol=1e-5)
+    assert alone == [1] * len(asked)
+    pd.testing.assert_frame_equal(answered(fast, asked), expected, rtol=1e-5, atol=1e-5)
+    assert len(alone) == len(asked)
+
+
+@pytest.mark.slow
+def test_the_run_s_own_scorer_stays_as_it_is(ending: TrainedPolicy, fast: Responder) -> None:
+    assert ending.scorer(fast.rule)._engine is None
+
+
+def test_graphs_differ_by_the_rounding_of_what_is_added(ending: TrainedPolicy) -> None:
+    rule = replace(ending.rule, reward_weight=32.0, lookahead=4.8)
+    assert measure_magnitude(ending.scorer(rule)) == pytest.approx(32 * 5.8)
+    assert measure_magnitude(ending.scorer(replace(rule, lookahead=0.0))) == 32.0
+    assert measure_magnitude(ending.scorer(replace(rule, reward_weight=0.0, lookahead=0.0))) == 1.0
+    ours, theirs = torch.tensor([0.0]), np.float32([1.5e-5])
+    assert require_close([(theirs, ours)], "", 185.6) < 1e-6
+    with pytest.raises(InputError, match="differs from torch's"):
+        require_close([(theirs, ours)], "", 1.0)
+
+
+def test_engines_that_are_unknown_or_cannot_score_are_refused(
+    trained: TrainedPolicy, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"item-knn.*use --engine torch"):
+        responder(trained_run(tmp_path, "item-knn"), engine=ONNXRUNTIME)
+    with pytest.raises(InputError, match="give one of torch, onnxruntime"):
+        responder(trained, engine="gpu")

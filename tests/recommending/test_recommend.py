@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,22 @@ import pandas as pd
 import pytest
 import torch
 from scipy.stats import chisquare
+from torch import Tensor
 
 from tests.support.logs import store_of, write
+from tests.support.served import FULL, learn_tastes, trained_run
+from tests.support.served import histories as tagged_histories
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.recommending import histories
+from ucfrec.recommending import recommend as module
 from ucfrec.recommending.histories import histories_of_files
-from ucfrec.recommending.recommend import uniforms
+from ucfrec.recommending.recommend import ItemIndex, uniforms
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=30", "policy.dim=16", "policy.context=4", "augment.copies=0"]
 
@@ -543,3 +550,125 @@ def test_what_is_read_is_not_written_over(
     assert main([name, "run", "log.parquet", *more, "--out", written]) == 2
     assert f"{written} would be written over what is read" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+# Similar items.
+
+
+@pytest.mark.parametrize("kind", ["dt", "item-knn"])
+def test_similar_items_are_other_items_by_cosine(kind: str, tmp_path: Path) -> None:
+    settings = [*SMALL, "rule.choose=false"] if kind == "dt" else []
+    policy = Recommender(kind, settings=settings).fit(random_log(), tmp_path / "run")
+    found = policy.recommend_to_items(k=4)
+    trained = policy.trained
+    vectors = trained.item_states.embeddings.numpy()  # type: ignore[union-attr]
+    if kind == "dt":
+        vectors = trained.scorer().vectors()[:, :-1]
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    cosines = unit @ unit.T
+    np.fill_diagonal(cosines, -np.inf)
+    ids = trained.item_ids
+    assert ids is not None
+    for row, (item, group) in enumerate(found.groupby("item_id", sort=True)):
+        assert item == ids[row]
+        assert group["rank"].tolist() == [1, 2, 3, 4]
+        best = np.sort(cosines[row])[::-1][:4]
+        np.testing.assert_allclose(group.score, best, rtol=1e-4)
+        assert item not in group.similar_item_id.to_numpy()
+    some = policy.recommend_to_items(["7", "3"], k=100)
+    assert some.groupby("item_id", sort=False).size().to_dict() == {7: 29, 3: 29}
+    with pytest.raises(InputError, match="1 of 2 items are not in the training data, such as 99"):
+        policy.recommend_to_items([1, 99])
+    with pytest.raises(InputError, match="items is empty"):
+        policy.recommend_to_items([])
+    with pytest.raises(InputError, match="k is 0"):
+        policy.recommend_to_items(k=0)
+
+
+# The approximate search scores exactly what it finds, and reports how much that is.
+
+needs_faiss = pytest.mark.skipif(find_spec("faiss") is None, reason="needs faiss")
+RULES = [DecisionRule(2.0), FULL, DecisionRule(1.0, reward_weight=3.0, tag_run=1)]
+
+
+@pytest.fixture(scope="module")
+def opinionated(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
+    trained = trained_run(tmp_path_factory.mktemp("index"))
+    with torch.no_grad():  # a policy of 20 steps has hardly any opinion
+        for parameter in trained.policy.parameters():
+            parameter.add_(0.3 * torch.randn(parameter.shape))
+    learn_tastes(trained)
+    return trained
+
+
+def random_sessions(trained: TrainedPolicy, rule: DecisionRule, count: int = 40) -> Sessions:
+    generator, length = torch.Generator().manual_seed(1), trained.scorer(rule).length
+    items = torch.randint(24, (count, length), generator=generator)
+    rewards = torch.randint(2, (count, length), generator=generator).float()
+    steps, users = torch.full((count,), length), torch.arange(count) % 30 - 1
+    return Sessions(items, rewards, steps, rewards.sum(1, dtype=torch.float64), users)
+
+
+def some_left_out(sessions: Sessions) -> tuple[Tensor, Tensor]:
+    rows = torch.arange(len(sessions.users)).repeat_interleave(3)
+    return rows, sessions.actions[:, -3:].flatten()
+
+
+@needs_faiss
+@pytest.mark.parametrize("rule", RULES, ids=["plain", "full", "run"])
+def test_a_search_of_all_lists_is_exact(opinionated: TrainedPolicy, rule: DecisionRule) -> None:
+    asked, scorer = random_sessions(opinionated, rule), opinionated.scorer(rule)
+    left_out, index = some_left_out(asked), ItemIndex(scorer, "ucf")
+    excluded = torch.arange(24) == 7
+    items, values = index.best(asked, left_out, excluded, 6)
+    exact = scorer.scores(asked, left_out, excluded, empty=True)
+    expected = exact.topk(6)
+    torch.testing.assert_close(exact.gather(1, items), expected.values, rtol=1e-5, atol=1e-5)
+    relative = expected.values - expected.values[:, :1]
+    torch.testing.assert_close(values, relative, rtol=1e-4, atol=1e-4)
+    assert index.found == index.wanted > 0
+
+
+@needs_faiss
+def test_what_is_found_has_its_score_and_the_recall_is_told(
+    opinionated: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"_FEWEST": 1, "_AT_LEAST": 1, "_SAMPLE": 1}.items():
+        monkeypatch.setattr(module, name, value)
+    rule = DecisionRule(1.0, reward_weight=3.0)
+    asked, scorer = random_sessions(opinionated, rule), opinionated.scorer(rule)
+    nothing = (torch.empty(0, dtype=torch.int64),) * 2
+    index = ItemIndex(scorer, "ucf")
+    items, values = index.best(asked, nothing, None, 2)
+    exact = scorer.scores(asked)
+    theirs = exact.gather(1, items)
+    torch.testing.assert_close(values, theirs - theirs[:, :1], rtol=1e-4, atol=1e-4)
+    best = exact.topk(2).indices
+    found = sum(len(set(a) & set(b)) for a, b in zip(items.tolist(), best.tolist(), strict=True))
+    assert index.sampled == 40
+    assert index.wanted == 80
+    assert index.found == found < 80
+
+
+@needs_faiss
+def test_the_command_tells_the_recall(
+    opinionated: TrainedPolicy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tagged_histories(users=5).to_parquet(tmp_path / "log.parquet")
+    out = tmp_path / "out.parquet"
+    asked = [str(opinionated.folder), str(tmp_path / "log.parquet"), "--out", str(out), "--k", "4"]
+    assert main(["recommend", *asked, "--approximate", "--temperature", "0"]) == 0
+    assert "recall@4 against the exact search: 1.000 (1 users)" in capsys.readouterr().out
+    assert len(pd.read_parquet(out)) == 20
+    assert main(["recommend", *asked[:-4], "--stream", "--approximate"]) == 2
+    assert "--stream" in capsys.readouterr().err
+
+
+@needs_faiss
+def test_what_needs_all_scores_is_refused(opinionated: TrainedPolicy, tmp_path: Path) -> None:
+    drawn = DecisionRule(1.0, temperature=0.5)
+    with pytest.raises(InputError, match=r"leave --approximate out, or give --temperature 0"):
+        ItemIndex(opinionated.scorer(drawn), "ucf")
+    other = trained_run(tmp_path, "item-knn")
+    with pytest.raises(InputError, match="leave --approximate out"):
+        ItemIndex(other.scorer(), other.name)

@@ -11,11 +11,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
+from tests.support import light_workers
+from tests.test_processes import ended
 from ucfrec.commands.cli import main
+from ucfrec.errors import InputError
+from ucfrec.recommending.server import Workers, listening_socket
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 httpx = pytest.importorskip("httpx")
@@ -230,3 +235,244 @@ def test_a_damaged_run_and_a_taken_port_are_refused(
     assert "items.parquet has another content" in capsys.readouterr().err
     assert main(["serve", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
+
+
+# Several processes on one address: they are replaced, ended in order, and outlive no parent.
+
+looks_into_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
+
+
+def workers_of(parent: int) -> set[int]:
+    """Numbers of the processes that answer, without multiprocessing's tracker of resources."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return {
+        int(child)
+        for child in children
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+    }
+
+
+@contextmanager
+def light(work: str, **environment: str) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+    """A parent of two light workers, and their port."""
+    command = [sys.executable, "-m", "tests.support.light_workers", work]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+        cwd=Path(__file__).parents[2],
+        start_new_session=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process, int(process.stdout.readline().split()[-1])
+        finally:
+            process.kill()
+
+
+def answered_by(port: int) -> int:
+    """Which process answers."""
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
+        return int(client.recv(100))
+
+
+def wait_for(what: Any, seconds: float = 60) -> None:
+    """Return once a function returns something true."""
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+@looks_into_proc
+def test_a_worker_that_ends_is_replaced_and_the_address_stays() -> None:
+    with light("answer") as (process, port):
+        first, other = workers_of(process.pid)
+        os.kill(first, signal.SIGKILL)
+        wait_for(lambda: answered_by(port) not in (first, other))
+        assert other in workers_of(process.pid)
+        process.send_signal(signal.SIGTERM)
+        printed, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert printed.split("\n") == ["in order", "in order", ""]
+    assert (
+        errors == f"ucfrec serve: worker {first} ended with status -9; another worker starts now\n"
+    )
+
+
+@looks_into_proc
+def test_ctrl_c_reaches_workers_by_their_parent_and_a_second_one_hurries_them() -> None:
+    with light("answer") as (process, _):
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        time.sleep(0.3)
+        os.killpg(process.pid, signal.SIGINT)
+        printed, errors = process.communicate(timeout=60)
+    assert (printed, errors) == ("forced\nforced\n", "")
+
+
+@looks_into_proc
+def test_workers_end_in_order_when_their_parent_is_killed(tmp_path: Path) -> None:
+    with light("answer", TMPDIR=str(tmp_path)) as (process, _):  # it leaves a folder there
+        workers = workers_of(process.pid)
+        process.kill()
+        printed, errors = process.communicate(timeout=60)  # the workers hold stdout until they end
+        assert all(ended(worker) for worker in workers)
+    assert (printed, errors) == ("in order\nin order\n", "")
+
+
+@looks_into_proc
+def test_workers_that_cannot_start_are_one_error_and_leave_nothing(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with (
+        pytest.raises(InputError, match="no model"),
+        listening_socket("127.0.0.1", 0) as listening,
+        Workers(light_workers.refuse, listening) as workers,
+    ):
+        workers.start(3)
+    assert capfd.readouterr() == ("", "")
+    assert not workers_of(os.getpid())
+
+
+@looks_into_proc
+def test_others_go_on_without_a_worker_that_cannot_be_replaced(tmp_path: Path) -> None:
+    with light("refuse_later", LIGHT_WORKERS=str(tmp_path)) as (process, port):
+        first, other = workers_of(process.pid)
+        os.kill(first, signal.SIGKILL)
+        assert process.stderr is not None
+        assert "another worker starts now" in process.stderr.readline()
+        assert "no model; another worker starts in 10 s" in process.stderr.readline()
+        assert answered_by(port) == other
+        os.kill(other, signal.SIGKILL)
+        assert "another worker starts now" in process.stderr.readline()
+        assert process.stderr.read().endswith("InputError: no model\n")
+
+
+@pytest.fixture(scope="module")
+def two(
+    trained: TrainedPolicy, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple["subprocess.Popen[str]", str, Path]]:
+    """A server of two workers that follows the promoted run of a folder and writes exposures."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("monday", "tuesday"):
+        shutil.copytree(trained.folder, folder / name)
+    assert main(["promote", str(folder / "monday")]) == 0
+    options = ("--workers", "2", "--temperature", "2", "--exposures", str(folder / "shown"))
+    with served(folder, *options) as (process, address):
+        yield process, address, folder
+
+
+@contextmanager
+def only(worker: int, process: "subprocess.Popen[str]") -> Iterator[None]:
+    """The other workers answer nothing."""
+    others = workers_of(process.pid) - {worker}
+    for other in others:
+        os.kill(other, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for other in others:
+            os.kill(other, signal.SIGCONT)
+
+
+def ask(address: str, user: int) -> dict[str, Any]:
+    """An answer, on a connection of its own."""
+    row = {"item_id": 0, "timestamp": 1_700_000_000_000, "reward": 1.0}
+    body = {"user_id": user, "k": 2, "history": [row]}
+    answer = httpx.post(f"{address}/recommendations", json=body, timeout=60)
+    assert answer.status_code == 200
+    return dict(answer.json())
+
+
+def metrics_of(address: str) -> dict[str, float]:
+    """Values of the metrics by name and labels."""
+    lines = httpx.get(f"{address}/metrics", timeout=60).text.splitlines()
+    pairs = (line.rpartition(" ") for line in lines if not line.startswith("#"))
+    return {name: float(value) for name, _, value in pairs}
+
+
+@looks_into_proc
+def test_metrics_are_totals_of_all_workers_also_of_one_that_was_replaced(
+    two: tuple["subprocess.Popen[str]", str, Path],
+) -> None:
+    process, address, _ = two
+    first, other = workers_of(process.pid)
+    before = metrics_of(address).get('ucfrec_requests_total{status="200"}', 0.0)
+    for worker, users in ((first, [100] * 3), (other, [100_000])):
+        with only(worker, process):
+            for user in users:
+                ask(address, user)
+    for worker in (first, other):
+        with only(worker, process):
+            found = metrics_of(address)
+        assert found['ucfrec_requests_total{status="200"}'] == before + 4
+        assert found["ucfrec_request_seconds_count"] == before + 4
+        assert found["ucfrec_batch_requests_sum"] == before + 4
+        assert found["ucfrec_waiting_requests"] == 0
+        assert found['ucfrec_drift{measure="unknown_users"}'] == 1 / 4
+        assert found['ucfrec_drift{measure="unknown_items"}'] == 0
+        assert found["process_cpu_seconds_total"] > 1
+        assert not any("pid=" in name for name in found)
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: len(workers_of(process.pid) - {first, other}) == 1)
+    (new,) = workers_of(process.pid) - {first, other}
+    with only(new, process):
+        ask(address, 100)
+        found = metrics_of(address)
+    assert found['ucfrec_requests_total{status="200"}'] == before + 5
+    assert found['ucfrec_drift{measure="unknown_users"}'] == 1 / 2  # of the living
+
+
+@looks_into_proc
+def test_every_worker_follows_the_promoted_run(
+    two: tuple["subprocess.Popen[str]", str, Path],
+) -> None:
+    process, address, folder = two
+    assert main(["promote", str(folder / "tuesday"), "--force"]) == 0
+    for worker in workers_of(process.pid):
+        with only(worker, process):
+            wait_for(lambda: httpx.get(f"{address}/health", timeout=60).json()["name"] == "tuesday")
+
+
+@looks_into_proc
+def test_term_ends_every_worker_after_its_requests_and_writes_its_exposures(
+    two: tuple["subprocess.Popen[str]", str, Path],
+) -> None:
+    process, address, folder = two
+    workers = workers_of(process.pid)
+    answers = []
+    for worker in workers:
+        with only(worker, process):
+            answers += [ask(address, user) for user in range(4)]
+    host, port = address.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=60) as slow:
+        body = b'{"user_id": 1, "k": 3}'
+        head = f"POST /recommendations HTTP/1.1\r\nHost: {host}\r\n"
+        slow.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:5])
+        ask(address, 1)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.5)
+        slow.sendall(body[5:])
+        with slow.makefile("rb") as received:
+            assert received.readline() == b"HTTP/1.1 200 OK\r\n"
+        assert process.stderr is not None
+        errors = process.stderr.read()
+        assert process.wait(60) == 0
+    assert errors.endswith("ucfrec serve: stopped\n")
+    assert errors.count("stopped") == 1
+    assert all(ended(worker) for worker in workers)
+    files = list((folder / "shown").iterdir())
+    assert len(files) == len(workers)
+    shown = pd.concat(map(pd.read_parquet, files))
+    assert {answer["request_id"] for answer in answers} <= set(shown["request_id"])
+
+
+@pytest.mark.parametrize("workers", [0, -1, 10_000])
+def test_a_number_of_workers_out_of_range_is_one_line(
+    trained: TrainedPolicy, capfd: pytest.CaptureFixture[str], workers: int
+) -> None:
+    assert main(["serve", str(trained.folder), "--workers", str(workers)]) == 2
+    line = f"ucfrec serve: --workers is {workers}; give a number from 1 to 256\n"
+    assert capfd.readouterr() == ("", line)

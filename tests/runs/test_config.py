@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.policies.edt4rec import CQLConfig
 from ucfrec.policies.registry import BUILT_IN, policy_class
 from ucfrec.runs.config import TABLES, config_from_dict, resolve_config
 from ucfrec.settings import describe
@@ -204,7 +203,7 @@ def test_every_field_means_something_and_is_read(policy: str, read: set[str]) ->
     """A field that nothing reads has no effect."""
     config = resolve_config(policy)
     tables = [(name, getattr(config, name)) for name in TABLES]
-    for name, table in [*tables, ("cql", CQLConfig())]:
+    for name, table in tables:
         listed = list(describe(name, table))
         assert [s.key for s in listed] == [f"{name}.{key}" for key in asdict(table)]
         for setting in listed:

@@ -14,8 +14,8 @@ from tests.support import killed_run
 from tests.support.episodes import random_episodes, some_states, write_store
 from tests.support.killed import kills
 from ucfrec.commands.cli import main
-from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.errors import InputError, InputNote
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs.config import resolve_config

@@ -10,8 +10,8 @@ import torch
 from tests.support.causes import planted_items, planted_vectors
 from ucfrec.commands.cli import main
 from ucfrec.counterfactual.screening import DimensionReport, ScreeningReport
-from ucfrec.episodes.distractor import logged_observations, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, with_observations
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors

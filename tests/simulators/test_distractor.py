@@ -17,8 +17,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, rollout
 from ucfrec.arrays import IntArray
 from ucfrec.commands.cli import main
-from ucfrec.episodes.distractor import reward_bit
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import reward_bit
 from ucfrec.errors import InputError
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment

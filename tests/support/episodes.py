@@ -14,11 +14,13 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.windows import AugmentedEpisodes, Windows
 
 N_ITEMS, DIM, N_USERS = 11, 4, 5
+LENGTHS = [3, 1, 7, 2, 5, 9, 1, 4]
+SHARDS = (2**24, 6, 1)
 
 
 @dataclass
@@ -119,6 +121,14 @@ def write_store(
     if states is not None:
         states.save(path / ITEM_STATES)
     return store
+
+
+def all_windows(store: EpisodeStore, length: int) -> Windows:
+    return store.windows(*store.all_steps(), length)
+
+
+def are_equal(a: Windows, b: Windows) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
 
 
 def state_before(episode: Logged, step: int, states: ItemStates | None) -> Float64Array:

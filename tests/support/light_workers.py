@@ -1,4 +1,4 @@
-"""Workers that import nothing heavy: what `tests/recommending/test_workers.py` starts."""
+"""Workers that import nothing heavy: what `tests/recommending/test_server.py` starts."""
 
 import os
 import socket
@@ -8,8 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ucfrec.processes import Interrupted
-from ucfrec.recommending.server import listening_socket
-from ucfrec.recommending.workers import Parent, Workers
+from ucfrec.recommending.server import Parent, Workers, listening_socket
 
 
 class Ends:

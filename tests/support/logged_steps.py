@@ -1,7 +1,7 @@
 """Random logged steps, and the reference inputs of the Open Bandit Pipeline and SCOPE-RL.
 
 The references are those of sb-obp 0.5.10 and scope-rl 0.2.1;
-`tests/off_policy/fixtures/make_*_fixture.py` made them.
+`tests/off_policy/fixtures/make_obp_fixture.py` made them.
 """
 
 from pathlib import Path

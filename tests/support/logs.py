@@ -3,11 +3,27 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+
+START = 1_700_000_000_000
+"""Time of the first row of `random_log`, in ms."""
+
+
+def random_log(
+    rows: int = 400, users: int = 100, items: int = 20, step: int = 600_000
+) -> pd.DataFrame:
+    """One row every `step` ms, of random users and items; three in ten have the reward 1."""
+    generator = np.random.default_rng(0)
+    log = pd.DataFrame({"user_id": generator.integers(users, size=rows)})
+    log["item_id"] = generator.integers(items, size=rows)
+    log["timestamp"] = START + step * np.arange(rows)
+    log["reward"] = (generator.random(rows) < 0.3) * 1.0
+    return log
 
 
 def write(frame: pd.DataFrame, path: Path) -> Path:

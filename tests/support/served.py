@@ -15,12 +15,13 @@ import torch
 from tests.support.tagged import tagged_log, tagged_store
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.windows import Shown
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.recommending.requests import Limits
 from ucfrec.recommending.responder import Responder
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd
+from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, describe_steps
 
 SETTINGS = [
     *("train.steps=20", "policy.dim=8", "policy.context=4", "augment.copies=0"),
@@ -70,20 +71,17 @@ def learn_tastes(trained: TrainedPolicy) -> None:
 
 def boredom(likeness: Likeness) -> SessionEnd:
     """Sessions end, mostly, with a liked item that is like the last one."""
-    rng, items = np.random.default_rng(0), len(likeness.tags)
-    shown, item = rng.integers(-1, items, (4000, 10)), rng.integers(items, size=4000)
-    rewards = rng.integers(2, size=4000).astype(np.float64)
-    before = Shown(torch.from_numpy(shown), torch.zeros(4000, 10))
-    logged = LoggedEnds(
-        *(before, torch.from_numpy(item), rewards, rng.integers(9, size=4000)),
-        ended=np.zeros(4000, dtype=bool),
-        followed=np.ones(4000, dtype=bool),
-    )
-    alike = likeness.to_candidates(
-        likeness.profile(before.items[:, :1], torch.ones(4000, 1)), logged.items.unsqueeze(1)
-    )
+    rng, n_items = np.random.default_rng(0), len(likeness.tags)
+    earlier = torch.from_numpy(rng.integers(-1, n_items, (4000, 10)))
+    items = torch.from_numpy(rng.integers(n_items, size=4000))
+    rewards, steps = rng.integers(2, size=4000).astype(np.float64), rng.integers(9, size=4000)
+    profile = likeness.profile(earlier[:, :1], torch.ones(4000, 1))
+    alike = likeness.to_candidates(profile, items.unsqueeze(1))
     bored = (alike[:, 0] > 0.3).numpy() & (rewards > 0)
-    logged.ended[:] = rng.random(4000) < np.where(bored, 0.9, 0.02)
+    ended = rng.random(4000) < np.where(bored, 0.9, 0.02)
+    history = Shown(earlier, torch.zeros(4000, 10))
+    inputs = describe_steps(likeness, history, items, rewards, steps)
+    logged = LoggedEnds(inputs, ended, np.ones(4000, dtype=bool))
     end, report = SessionEnd.fit(likeness, logged, logged, 0)
     assert report.kept == "boosted"
     assert end.uses_rewards

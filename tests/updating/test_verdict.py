@@ -10,8 +10,7 @@ import pytest
 from tests.support.logs import store_of
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import _doubt, compare_runs, describe

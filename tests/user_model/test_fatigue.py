@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tests.support.episodes import N_ITEMS, Logged, some_states, write_store
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 
 LAGS = 10
@@ -107,11 +107,9 @@ def shown_of(history: list[tuple[int, float]], reach: int) -> Shown:
 
 def run_by_hand(history: list[tuple[int, float]]) -> int:
     """Length of the run of one main tag that ends with the last step."""
-    tags = [int(TAGS.tags[item]) if reward >= 1.2 else -1 for item, reward in history]
-    length = 0
-    while length < len(tags) and tags[-1] >= 0 and tags[-1 - length] == tags[-1]:
-        length += 1
-    return length
+    tags = np.array([int(TAGS.tags[item]) for item, _ in history])
+    likes = np.array([reward >= 1.2 for _, reward in history], dtype=bool)
+    return on_end(tags, likes & (tags >= 0))
 
 
 @given(steps)

@@ -1,7 +1,5 @@
 """The penalised fit of effects, against independent solutions."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -119,16 +117,3 @@ def test_the_minimum_of_a_quadratic_function_is_found() -> None:
 
     found = minimum(height, torch.zeros(30))
     assert float(height(found)) == pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.slow
-def test_time_grows_no_faster_than_rows() -> None:
-    """A hundred times the rows take well below two hundred times the time."""
-    seconds = []
-    spreads = dict.fromkeys(EFFECTS, 0.3)
-    for rows in (5_000, 500_000):
-        given = design(rows, binary=True, items=rows // 50, users=rows // 10)
-        start = time.process_time()
-        fit_effects(given, {}, spreads)
-        seconds.append(time.process_time() - start)
-    assert seconds[1] < 200 * max(seconds[0], 0.05)

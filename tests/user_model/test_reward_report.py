@@ -132,17 +132,6 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
     )
 
 
-def test_a_fit_repeats_and_is_read_again(tmp_path: Path) -> None:
-    train, _ = log_of_tastes()
-    first = fit_training_users(train, tmp_path / "a", seed=0)
-    again = fit_training_users(train, tmp_path / "b", seed=0)
-    read = fit_training_users(train, tmp_path / "a", seed=0)
-    assert first.report == again.report == read.report
-    for name, value in first.model.state_dict().items():
-        assert torch.equal(value, again.model.state_dict()[name]), name
-        assert torch.equal(value, read.model.state_dict()[name]), name
-
-
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     train, _ = log_of_tastes()
     users = fit_training_users(train, tmp_path, seed=0)

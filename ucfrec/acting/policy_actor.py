@@ -11,8 +11,8 @@ from torch import Tensor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import ItemHead
 from ucfrec.schema import FORBIDDEN, USER_IDS

@@ -17,13 +17,12 @@ from torch.nn import functional as F
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array, IntArray
-from ucfrec.episodes.exposure import Exposed, Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.sessions import Sessions, seen_before
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Sessions, Shown, Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead

@@ -64,17 +64,18 @@ class BenchmarkRequest:
     tables: Sequence[str]
     """Names of the tables to measure."""
     out: Path
-    """Folder for logs, stores and runs."""
+    """Folder for logs, stores, runs and result rows; resumed."""
     results: Path
     """File to which result rows are added."""
     workers: int
-    """Number of parallel processes."""
+    """Parallel processes, one thread each."""
     log_seed: int = 0
-    """Seed of the first simulated log of a task; the others have the seeds after it."""
+    """Seed of the first simulated log of a task; the others follow it."""
     logs: int | None = None
-    """Number of logs of each task; None for the budget's."""
+    """Logs of each task: simulated with as many seeds, or parts of a given log, 1 for all of it;
+    None for the budget's."""
     evaluation_seed: int | None = None
-    """Seed of the evaluation episodes; None stands for the budget's."""
+    """Seed of the evaluated episodes, the same for every training seed; None for the budget's."""
     environment: Environment | None = None
     """An environment that is measured instead of the suite's tasks; None for these."""
     tasks: Sequence[str] = ()
@@ -82,9 +83,9 @@ class BenchmarkRequest:
     methods: Sequence[str] = ()
     """Names of the only methods to measure; empty for all."""
     training_seeds: int | None = None
-    """Number of training seeds of each cell; None for the budget's."""
+    """Training seeds of every method, from 0; None for the budget's."""
     again: bool = False
-    """Whether cells that have rows are measured again."""
+    """Remove the rows and runs of the cells first; resume without it."""
 
 
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:

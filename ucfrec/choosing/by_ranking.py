@@ -19,11 +19,12 @@ from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
-from ucfrec.episodes.sessions import Sessions, seen_before
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.progress import progress
 from ucfrec.results.statistics import effective_number
+from ucfrec.user_model.reward_report import draw_steps
 
 SHOWN = 10
 """Items that a rule shows at a step."""
@@ -163,12 +164,10 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     validation rows, 4,000 to 20,000 are drawn.
     """
     train, validation, scorer = problem.train, problem.validation, problem.scorer
-    n_items, numbers = len(train.item_states.embeddings), np.arange(validation.n_steps)
+    n_items = len(train.item_states.embeddings)
     most = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS))
-    if len(numbers) > most:
-        numbers = np.random.default_rng(problem.seed).choice(len(numbers), most, replace=False)
-        numbers.sort()
-    logged = LoggedScores(scorer, validation, *validation.locate(numbers))
+    episodes, steps = draw_steps(validation, most, problem.seed)
+    logged = LoggedScores(scorer, validation, episodes, steps)
     users, candidates = logged.owners[logged.episodes], list[_Candidate]()
     most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, n_items)).indices.numpy()
     baseline = np.isin(logged.items, most_liked)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -29,9 +30,8 @@ from ucfrec.choosing.choice import (
     SimulatedRule,
     ValueEstimate,
 )
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.progress import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
@@ -65,6 +65,7 @@ _NEAR_THE_LOG: Final = (
     {"temperature": (1.0,), "reward_weight": (0.125, 0.25, 0.5, 1.0), "policy_weight": (0.0,)},
 )
 """Candidates where a rule must leave effective users of a log with propensities."""
+_value = attrgetter("value")
 
 
 @dataclass(frozen=True)
@@ -112,9 +113,9 @@ class _ManyRules(PolicyActor):
             begin, windows = batch[0][1].start, list[Windows]()
             # Windows depend on the rule's targets alone.
             for _, rules in groupby(batch, lambda entry: self._targets(entry[0])):
-                (first, part), *others = rules
-                end = others[-1][1].stop if others else part.stop
-                windows.append(self._scorers[first].windows(sessions.at(slice(part.start, end))))
+                group = list(rules)
+                part = slice(group[0][1].start, group[-1][1].stop)
+                windows.append(self._scorers[group[0][0]].windows(sessions.at(part)))
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
@@ -454,7 +455,7 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         warning=_warning(search, best, estimate),
         estimate=estimate,
         details={
-            **search.users.report(),
+            **search.users.report,
             "least_items": search.least_items,
             "least_users": search.least_users,
             "halves_agree": list(agree),
@@ -616,10 +617,6 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
         *(rule.tag_run > 0, rule.tag_window > 0, rule.lookahead > 0, -rule.temperature),
         *(rule.reward_weight, rule.lookahead, -rule.policy_weight, -rule.tag_run),
     )
-
-
-def _value(candidate: SimulatedRule) -> float:
-    return candidate.value
 
 
 def _mean(values: Float64Array) -> float:

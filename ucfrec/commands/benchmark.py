@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, SEED, Table
+from ucfrec.commands.options import ARGUMENT, SEED, Group, Table
 from ucfrec.commands.shared_options import EnvironmentOptions
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
@@ -17,19 +17,20 @@ if TYPE_CHECKING:
     from ucfrec.benchmark.cells import Cell, Measurement
     from ucfrec.benchmark.suite import Benchmark as Suite
 
+_LOGS = Group("logs and seeds")
+
 
 class GridOptions(Table):
     """Where result rows are, and how they are measured."""
 
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
+
     out: Path = Path("runs/benchmark")
-    """Folder for logs, stores, runs and result rows; resumed."""
     results: Annotated[Path | None, "JSONL"] = None
     """File of result rows; measured cells are read from it, new ones appended to it (default:
     results.jsonl in --out)"""
     workers: int = os.cpu_count() or 1
-    """Parallel processes, one thread each."""
     again: bool = False
-    """Remove the rows and runs of the chosen cells first; resume without it."""
     show_only: bool = False
     """Print the tables from the rows in --results without measuring anything."""
 
@@ -51,9 +52,6 @@ class GridOptions(Table):
 
         Args:
             tables: tables of the suite; empty for all.
-
-        Raises:
-            InputError: the file has no such row, or a line of it is not a result row.
         """
         rows = [row for row in latest(read_rows(self.rows_file)) if row.suite == suite]
         if rows := [row for row in rows if not tables or row.table in tables]:
@@ -91,25 +89,10 @@ class GridOptions(Table):
             return run_grid(list_cells(), how, file, self.workers, describe, self.again)
 
 
-class LoggedOptions(EnvironmentOptions):
-    """The logs and seeds of a benchmark."""
-
-    title = "logs and seeds"
-
-    logs: Annotated[int | None, "N"] = None
-    """Logs of each task; simulated with N seeds, or N parts of a given log, 1 for all of it
-    (default: set by --budget)"""
-    log_seed: int = 0
-    """Seed of the first simulated log; the others follow it."""
-    training_seeds: Annotated[int | None, "N"] = None
-    """Training seeds of every method, from 0 (default: set by --budget)"""
-    evaluation_seed: Annotated[int | None, SEED, "SEED"] = None
-    """Seed of the evaluated episodes; the same for every training seed (default: set by
-    --budget)"""
-
-
-class Benchmark(LoggedOptions, GridOptions):
+class Benchmark(EnvironmentOptions, GridOptions):
     """`ucfrec benchmark`."""
+
+    described_by = "ucfrec.benchmark.suite:BenchmarkRequest"
 
     suite: Annotated[str, ARGUMENT, "SUITE"]
     """recommendation, or a suite of another installed package (entry point ucfrec.benchmarks)"""
@@ -124,6 +107,10 @@ class Benchmark(LoggedOptions, GridOptions):
     env: str | None = None
     """Simulator or gymnasium:ID; its main table is measured instead of the suite's tasks, on logs
     of its mixture or, where it has none, of random actions (default: the suite's tasks)"""
+    logs: Annotated[int | None, _LOGS, "N"] = None
+    log_seed: Annotated[int, _LOGS] = 0
+    training_seeds: Annotated[int | None, _LOGS, "N"] = None
+    evaluation_seed: Annotated[int | None, _LOGS, SEED, "SEED"] = None
 
     def execute(self) -> None:
         """Measure what is missing, then print the tables."""

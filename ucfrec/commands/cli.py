@@ -196,13 +196,13 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
 
     Options of the other commands would need their modules, whose imports take seconds.
     """
-    listed = []
+    lines = [program.summary]
     for name, summary in program.commands.items():
-        listed += [f"\n{program.sections[name]}:"] if name in program.sections else []
-        listed.append(f"  {name:<12}{summary}")
+        lines += [f"\n{program.sections[name]}:"] if name in program.sections else []
+        lines.append(f"  {name:<12}{summary}")
     parser = argparse.ArgumentParser(
         prog=program.name,
-        description="\n".join([program.summary, *listed]),
+        description="\n".join(lines),
         epilog=f"{program.name} COMMAND --help describes a command.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="%(prog)s [options] COMMAND …",

@@ -2,13 +2,13 @@
 policy."""
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import OUTPUT, Table, settings_given
+from ucfrec.commands.options import OUTPUT, Group, settings_given
 from ucfrec.commands.shared_options import (
     LogOptions,
     RuleOptions,
@@ -22,36 +22,19 @@ from ucfrec.files.remote import origin
 if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.off_policy.evaluate import OffPolicyReport
-    from ucfrec.off_policy.score import LoggedSessions
-    from ucfrec.off_policy.selection import Choice
+    from ucfrec.off_policy.selection import Selection
     from ucfrec.off_policy.verdict import Verdict
     from ucfrec.results.rows import ResultRow
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
-class EstimateOptions(Table):
-    """What `ope` estimates."""
-
-    title = "what is estimated"
-    described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
-
-    discount: Annotated[float | None, "DISCOUNT"] = None
-    pages: bool = False
-    reward_range: Annotated[tuple[float, float] | None, "LEAST MOST"] = None
-    filter_seen: bool = False
-    lift: Annotated[float | None, "LIFT"] = None
-    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
-    logged return"""
-    item_groups: Annotated[int | None, "N"] = None
-    estimate_propensities: bool = False
-    anonymous: bool = False
-    """Treat each session as one of another user, for logs without user ids (as in obd)"""
+_ESTIMATED: Final = Group("what is estimated")
 
 
-class Ope(EstimateOptions, RuleOptions, LogOptions):
+class Ope(RuleOptions, LogOptions):
     """`ucfrec ope`."""
 
-    described_by = "ucfrec.python_api.recommender:Recommender.ope"
+    described_by = "ucfrec.off_policy.evaluate:EstimateOptions"
     usage = "%(prog)s RUN... [LOGS...] [options]"
     epilog = (
         "Without LOGS, the estimate is from the test split of the run's store. Several runs, "
@@ -66,11 +49,24 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
     """LOGS are what `ucfrec score` wrote for RUN; with the same decision rule, of any size: one row
     per session is in memory, and there are no reward models (DM, FQE, DR)"""
     seed: int = 0
+    """Of the folds and the bootstrap."""
     json: Path | None = None
     """Write the result rows here."""
+    discount: Annotated[float | None, _ESTIMATED, "DISCOUNT"] = None
+    pages: Annotated[bool, _ESTIMATED] = False
+    reward_range: Annotated[tuple[float, float] | None, _ESTIMATED, "LEAST MOST"] = None
+    filter_seen: Annotated[bool, _ESTIMATED] = False
+    lift: Annotated[float | None, _ESTIMATED, "LIFT"] = None
+    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
+    logged return"""
+    item_groups: Annotated[int | None, _ESTIMATED, "N"] = None
+    estimate_propensities: Annotated[bool, _ESTIMATED] = False
+    anonymous: Annotated[bool, _ESTIMATED] = False
+    """Treat each session as one of another user, for logs without user ids (as in obd)"""
 
     def execute(self) -> None:
         """Print the estimates and the verdict of every candidate."""
+        from ucfrec.logs.summary import format_summary
         from ucfrec.off_policy import evaluate
         from ucfrec.off_policy.selection import choose, names_of
         from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return
@@ -78,10 +74,10 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         runs, logs = find_runs(self.logs)
-        given = settings_given(self, evaluate.EstimateOptions)
+        settings = settings_given(self, evaluate.EstimateOptions)
         if self.lift is not None:
-            given["wanted_lift"] = self.lift
-        options = evaluate.EstimateOptions(users_known=not self.anonymous, **given)
+            settings["wanted_lift"] = self.lift
+        options = evaluate.EstimateOptions(users_known=not self.anonymous, **settings)
         if self.scored and not logs:
             raise InputError("--scored needs what ucfrec score wrote; name it after the run")
         if self.scored and self.filter_seen:
@@ -91,89 +87,63 @@ class Ope(EstimateOptions, RuleOptions, LogOptions):
         # On the test split, the weights that have not learned from it.
         policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
         candidates = [(policy, self._make_rules(policy)) for policy in policies]
+        parts = ("run", "target return", "temperature")
         names = names_of(
             [
-                {
-                    "run": str(policy.folder),
-                    "target return": rule.target,
-                    "temperature": rule.temperature,
-                }
-                for policy, rules in candidates
+                dict(zip(parts, (str(p.folder), rule.target, rule.temperature), strict=True))
+                for p, rules in candidates
                 for rule in rules
             ]
         )
         reports: dict[str, OffPolicyReport] = {}
         for policy, rules in candidates:
-            with self._read_logs(logs, policy) as logged:
+            reading = self.read_sessions([policy], logs, self.json, keep_unknown=True)
+            with nullcontext() if self.scored else reading as logged:
+                if logged is not None and logs:
+                    print(format_summary(logged.report))
+                elif logged is not None:
+                    store = logged.store
+                    sizes = f"{store.n_episodes:,} sessions, {store.n_steps:,} steps"
+                    print(f"test split of {store.path}: {sizes}")
                 for rule in rules:
                     name = names[len(reports)]
                     if len(names) > 1:
                         print(f"\n{name}:")
                     reports[name] = estimate_return(
                         (policy, rule),
-                        logged,
+                        [Path(log) for log in logs] if logged is None else logged,
                         logs or [TEST_SPLIT],
                         options=options,
                         seed=self.seed,
                         checkpoint=self.checkpoint,
                     )
                     print(_describe(reports[name]))
-        choice = choose(reports, self.seed) if len(reports) > 1 else None
-        if choice is not None:
+        columns: dict[str, dict[str, object]] = {name: {"candidate": name} for name in reports}
+        if len(reports) > 1:
+            choice = choose(reports, self.seed)
             print(_describe_choice(choice))
+            columns = {name: {"candidate": name, **choice.columns(name)} for name in reports}
         if self.json is not None:
             rows = [
-                row.extended(
-                    {"candidate": name, **({} if choice is None else choice.columns(name))}
-                )
+                row.extended(columns[name])
                 for name, report in reports.items()
                 for row in (*report.rows, *report.step_rows)
             ]
             write_results(self.json, rows)
 
-    @contextmanager
-    def _read_logs(
-        self, logs: list[str], trained: "TrainedPolicy"
-    ) -> "Iterator[LoggedSessions | Sequence[Path]]":
-        """What the policy is evaluated on: the logs, or else the test split of its store."""
-        from ucfrec.logs.summary import format_summary
-        from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
-
-        if self.scored:
-            yield [Path(log) for log in logs]
-        elif logs:
-            files, mapping = self.find_logs(logs, trained, [self.json])
-            limit = self.memory_limit
-            with read_logged_sessions(trained, files, mapping, True, limit) as logged:
-                print(format_summary(logged.report))
-                yield logged
-        else:
-            logged = held_out_sessions([trained])
-            store = logged.store
-            print(
-                f"test split of {store.path}: {store.n_episodes:,} sessions, "
-                f"{store.n_steps:,} steps"
-            )
-            yield logged
-
     def _make_rules(self, trained: "TrainedPolicy") -> "list[DecisionRule]":
-        """The different rules to evaluate: the run's own with the parts that the options name.
-
-        Raises:
-            InputError: one of --targets is neither a number nor a quantile, or a temperature is no
-                number.
-        """
+        """The different rules to evaluate: the run's own with the parts that the options name."""
         base = self.make_rule(trained)
         targets, temperatures = [base.target], [base.temperature]
         if self.targets is not None:
             targets = [_read_target(part.strip(), trained) for part in self.targets.split(",")]
-        if self.temperatures is not None:
-            try:
+        try:
+            if self.temperatures is not None:
                 temperatures = [float(part) for part in self.temperatures.split(",")]
-            except ValueError:
-                raise InputError(
-                    f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
-                ) from None
+        except ValueError:
+            raise InputError(
+                f"--temperatures {self.temperatures} are not numbers; write e.g. 0,0.5,1"
+            ) from None
         rules = [
             replace(base, target=target, temperature=temperature)
             for target in targets
@@ -208,12 +178,12 @@ def _table(rows: "Sequence[ResultRow]", columns: tuple[str, ...], **more: object
     return format_rows(lines, columns)
 
 
-def _describe_choice(choice: "Choice") -> str:
+def _describe_choice(choice: "Selection") -> str:
     """The candidates in order, and which comes first."""
     from ucfrec.reporting.tables import text_table
 
     lines = []
-    if choice.selection is not None:
+    if choice.standings:
         rows = [
             (
                 standing.name,
@@ -221,7 +191,7 @@ def _describe_choice(choice: "Choice") -> str:
                 f"{standing.probability_best:.2f}",
                 str(standing.rank),
             )
-            for standing in choice.selection.standings
+            for standing in choice.standings
         ]
         lines.append("\nvalue per session, with a 95% band that holds all of them at once:")
         lines.append(text_table(("candidate", "value [band]", "P(best)", "rank"), rows))
@@ -271,15 +241,15 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
         """Write the policy's probability of every logged choice as Parquet."""
         from ucfrec.files.parquet import write_frames
         from ucfrec.logs.summary import format_report
-        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, read_logged_sessions, score
+        from ucfrec.off_policy.score import UNKNOWN_ITEMS, about_scores, score
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         trained = TrainedPolicy.load(self.run, self.checkpoint)
-        files, mapping = self.find_logs(self.logs, trained, [self.out])
-        rule, limit = self.make_rule(trained), self.memory_limit
+        rule = self.make_rule(trained)
         if (master := self.find_spark()) is not None:
             from ucfrec.off_policy.scored import score_with_spark
 
+            files, mapping = self.find_logs(self.logs, trained, [self.out])
             sessions = score_with_spark(
                 trained,
                 files,
@@ -289,11 +259,11 @@ class Score(RuleOptions, SparkOption, LogOptions, RunArgument):
                 checkpoint=self.checkpoint,
                 rule=rule,
                 filter_seen=self.filter_seen,
-                memory_limit=limit,
+                memory_limit=self.memory_limit,
             )
             print(f"{origin(self.out)}: {sessions:,} sessions")
             return
-        with read_logged_sessions(trained, files, mapping, memory_limit=limit) as logged:
+        with self.read_sessions([trained], self.logs, self.out) as logged:
             print(format_report(logged.report))
             frames = score(trained, logged, rule, self.filter_seen)
             unknown = {UNKNOWN_ITEMS: str(logged.report["dropped"].get("unknown_item", 0))}

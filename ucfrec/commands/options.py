@@ -9,10 +9,10 @@ import argparse
 import ast
 import inspect
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache, partial
-from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
 from types import UnionType
@@ -41,6 +41,10 @@ SEED: Final = range(2**32)
 INPUT: Final = uri_or_path(Input, str)
 INPUT_FOLDER: Final = uri_or_path(Input, Path)
 OUTPUT: Final = uri_or_path(Output, Path)
+
+
+class Group(str):
+    """Marks a field of another group than that of its class, by the title; "" for none."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,8 @@ def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
         hint = hints[field.name]
         kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         owner = next(cls for cls in table.__mro__ if field.name in inspect.get_annotations(cls))
-        title, _, more = (vars(owner).get("title") or "").partition("; ")
+        titles = [mark for mark in marks if isinstance(mark, Group)]
+        title, _, more = (titles or [Group(vars(owner).get("title") or "")])[0].partition("; ")
         if title not in groups:
             groups[title] = parser.add_argument_group(title, more or None)
         group = groups[title]
@@ -137,7 +142,7 @@ def _read_words(kind: Any, marks: Sequence[Any], default: Any) -> dict[str, Any]
         return how | {"action": "store_true"}
     if origin is Literal:
         return how | {"choices": get_args(kind)}
-    metavar = next((mark for mark in marks if isinstance(mark, str)), None)
+    metavar = next((mark for mark in marks if type(mark) is str), None)
     if origin is tuple:
         return how | {"type": float, "nargs": 2, "metavar": tuple(str(metavar).split())}
     if several := origin is Sequence:
@@ -192,16 +197,15 @@ def _describe(owner: type[Table], field: "Field[Any]", marks: Sequence[Any]) -> 
 def _read_docstrings(module: str) -> Mapping[str, tuple[str, str]]:
     """`CLASS.FIELD` and `CLASS.METHOD.ARGUMENT` of a module to what its source says of them, on one
     line, and to the default of a field."""
-    spec = find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
+    package, *names = module.split(".")
+    file = Path(sys.modules[package].__path__[0]).joinpath(*names).with_suffix(".py")
     texts = {}
-    for cls in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+    for cls in ast.parse(file.read_text(encoding="utf-8")).body:
         if not isinstance(cls, ast.ClassDef):
             continue
-        for line, after in zip_longest(cls.body, cls.body[1:]):
+        for line, next_line in zip_longest(cls.body, cls.body[1:]):
             if isinstance(line, ast.AnnAssign):
-                text = ast.literal_eval(after.value) if isinstance(after, ast.Expr) else ""
+                text = ast.literal_eval(next_line.value) if isinstance(next_line, ast.Expr) else ""
                 default = "" if line.value is None else ast.unparse(line.value)
                 default = "" if default in ("None", "False") else default.strip("'")
                 texts[f"{cls.name}.{ast.unparse(line.target)}"] = " ".join(text.split()), default

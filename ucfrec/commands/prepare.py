@@ -4,33 +4,13 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, OUTPUT, Table
+from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table
 from ucfrec.commands.shared_options import LogOptions, SparkOption
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import origin
 
 
-class PreparedLogs(LogOptions):
-    """Which rows are prepared."""
-
-    title = "reading logs"
-    described_by = "ucfrec.logs.prepare:PrepareOptions"
-
-    duplicates: Literal["highest", "lowest", "first", "last"] | None = None
-    max_session: Annotated[int | None, "N"] = None
-
-
-class EngineOptions(SparkOption):
-    """What reads the logs, in how much memory."""
-
-    title = "engine"
-    described_by = "ucfrec.logs.prepare:PrepareOptions"
-
-    memory_limit: Annotated[str, "SIZE"] = "2GB"
-    engine: Literal["duckdb", "spark"] = "duckdb"
-
-
-class Prepare(EngineOptions, PreparedLogs):
+class Prepare(LogOptions, SparkOption):
     """`ucfrec prepare`."""
 
     described_by = "ucfrec.logs.prepare:PrepareOptions"
@@ -49,6 +29,11 @@ class Prepare(EngineOptions, PreparedLogs):
     begin (default: 0.8,0.1,0.1)"""
     validate: bool = False
     """Check the logs without writing a store."""
+    duplicates: Annotated[
+        Literal["highest", "lowest", "first", "last"] | None, Group("reading logs")
+    ] = None
+    max_session: Annotated[int | None, Group("reading logs"), "N"] = None
+    engine: Annotated[Literal["duckdb", "spark"], Group("engine")] = "duckdb"
 
     def execute(self) -> None:
         """Print what was read, dropped and kept."""

@@ -1,7 +1,6 @@
 """`ucfrec rank`: how policies rank what users were shown and clicked later."""
 
 import math
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,7 +33,6 @@ class Rank(LogOptions, RuleOptions):
         """Print one row per policy."""
         from ucfrec.evaluation.ranking_table import require_one_catalogue
         from ucfrec.logs.summary import format_summary
-        from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
         from ucfrec.provenance import shorten_paths
         from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
         from ucfrec.runs.trained_policy import TrainedPolicy
@@ -42,16 +40,9 @@ class Rank(LogOptions, RuleOptions):
         runs, logs = find_runs(self.logs)
         policies = [TrainedPolicy.load(run, self.checkpoint, split=not logs) for run in runs]
         require_one_catalogue(policies)
-        with ExitStack() as stack:
+        with self.read_sessions(policies, logs, self.json) as logged:
             if logs:
-                files, mapping = self.find_logs(logs, policies[0], [self.json])
-                reading = read_logged_sessions(
-                    policies[0], files, mapping, memory_limit=self.memory_limit
-                )
-                logged = stack.enter_context(reading)
                 print(format_summary(logged.report), end="\n\n")
-            else:
-                logged = held_out_sessions(policies)
             ranking = rank_policies(
                 [(policy, self.make_rule(policy)) for policy in policies],
                 logged,

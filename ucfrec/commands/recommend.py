@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ucfrec import schema
-from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT
+from ucfrec.commands.options import ARGUMENT, INPUT, OUTPUT, Group
 from ucfrec.commands.shared_options import (
     AnswerOptions,
     LogOptions,
@@ -27,41 +27,11 @@ if TYPE_CHECKING:
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
-class EngineOptions(SparkOption):
-    """What computes."""
-
-    title = "engine"
-
-    engine: Literal["torch", "onnxruntime", "spark"] = "torch"
-    """What computes the network of requests that are not batched; onnxruntime is faster, but needs
-    ucfrec[export] and some 10 seconds at the start; spark: with LOGS, Spark's workers each
-    recommend to some of the users and write the parts of a folder --out"""
-
-
-class LogAnswerOptions(EngineOptions, AnswerOptions):
-    """How the users of a log are answered."""
-
-    title = "answering"
-
-    new_session: bool = False
-    """Recommend for the first step of a new session (default: the latest session of each user goes
-    on)"""
-    approximate: bool = False
-    """Find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule without a
-    temperature; says the recall (default: exactly)"""
-
-
-class Recommend(LogAnswerOptions, LogOptions, RunArgument):
+class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
     """`ucfrec recommend`."""
 
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"] = ()
     """Log files, folders or globs; also at s3://, …"""
-    k: int = 10
-    """Items for each user; if a request does not say how many."""
-    exposures: Annotated[Path | None, "FILE"] = None
-    """Write what was shown, with its probability, as Parquet; see docs/exposures.md"""
-    keep_seen: bool = False
-    """Also recommend items that the user has seen; (default: leave them out)"""
     out: Annotated[Path | None, OUTPUT] = None
     """Parquet file (with --engine spark: folder) to write."""
     stream: bool = False
@@ -69,6 +39,14 @@ class Recommend(LogAnswerOptions, LogOptions, RunArgument):
     stdout; see docs/serving.md"""
     candidates: Annotated[Path | None, "FILE"] = None
     """The only items to recommend; Parquet or CSV with a column item_id (default: all)"""
+    new_session: Annotated[bool, Group("answering")] = False
+    """Recommend for the first step of a new session (default: the user's latest one goes on)"""
+    approximate: Annotated[bool, Group("answering")] = False
+    """Find the items approximately, for large catalogues: needs ucfrec[faiss] and a rule without a
+    temperature; says the recall (default: exactly)"""
+    engine: Annotated[Literal["torch", "onnxruntime", "spark"], Group("engine")] = "torch"
+    """What computes: onnxruntime, with --stream, is faster but needs ucfrec[export] and some 10
+    seconds at the start; with spark, each worker writes a part of the folder --out"""
 
     def execute(self) -> None:
         """Write the recommendations as Parquet, or answer a stream."""
@@ -117,7 +95,7 @@ class Recommend(LogAnswerOptions, LogOptions, RunArgument):
             print(f"{origin(self.out)}: {rows:,} rows")
             return
         if self.approximate:
-            from ucfrec.acting.item_index import ItemIndex
+            from ucfrec.recommending.recommend import ItemIndex
 
             index = ItemIndex(trained.item_scorer(rule), trained.name)
         with progress(None, "recommend", "users") as bar:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, POSITIVE, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, POSITIVE, Group, Table, settings_given
 from ucfrec.commands.shared_options import AnswerOptions
 from ucfrec.errors import InputError, InputNote
 from ucfrec.processes import Interrupted
@@ -19,36 +19,16 @@ if TYPE_CHECKING:
     import uvicorn
 
     from ucfrec.recommending.responder import Responder
-    from ucfrec.recommending.workers import Parent
+    from ucfrec.recommending.server import Parent
 _STOPPED: Final = "ucfrec serve: stopped"
+_SERVER: Final = Group("the server")
 _OWN_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 
 
-class ServerOptions(Table):
-    """What the server takes on."""
-
-    title = "the server"
-    described_by = "ucfrec.recommending.web:ServerLimits"
-    prefix = "max_"
-
-    allowed_hosts: Annotated[str | None, "HOST[,HOST…]"] = None
-    """Answer only requests whose header Host names one of these: names, addresses, *.example.org,
-    or * for any (default: this machine's own names where --host is 127.0.0.1, localhost or ::1,
-    otherwise any)"""
-    engine: Literal["torch", "onnxruntime"] = "torch"
-    """What computes the network of requests that are not batched; onnxruntime is faster, but needs
-    ucfrec[export] and some 10 seconds at the start"""
-    workers: Annotated[int, "N"] = 1
-    """Processes that answer on the address, each with the run in its memory."""
-    threads: Annotated[int | None, POSITIVE, "N"] = None
-    """Threads per forward pass (default: one per core, divided by --workers)"""
-    max_batch: Annotated[int | None, "N"] = None
-    max_queue: Annotated[int | None, "N"] = None
-    timeout: Annotated[float | None, "TIMEOUT"] = None
-
-
-class Serve(ServerOptions, AnswerOptions):
+class Serve(AnswerOptions):
     """`ucfrec serve`."""
+
+    described_by = "ucfrec.recommending.web:ServerLimits"
 
     run: Annotated[Path, ARGUMENT, "RUN"]
     """Run folder of `ucfrec train`; or a folder of runs, of which the one that `ucfrec promote`
@@ -60,16 +40,24 @@ class Serve(ServerOptions, AnswerOptions):
     """Address to listen on; one that is not this machine's own exposes the server to the network"""
     port: int = 8080
     """0 for a free one."""
-    k: int = 10
-    """Items for each user; if a request does not say how many."""
-    exposures: Annotated[Path | None, "DIR"] = None
-    """Write what was shown, with its probability, as Parquet; see docs/exposures.md"""
-    keep_seen: bool = False
-    """Also recommend items that the user has seen; (default: leave them out)"""
+    allowed_hosts: Annotated[str | None, _SERVER, "HOST[,HOST…]"] = None
+    """Answer only requests whose header Host names one of these: names, addresses, *.example.org,
+    or * for any (default: this machine's own names where --host is 127.0.0.1, localhost or ::1,
+    otherwise any)"""
+    engine: Annotated[Literal["torch", "onnxruntime"], _SERVER] = "torch"
+    """What computes the network of requests that are not batched; onnxruntime is faster, but needs
+    ucfrec[export] and some 10 seconds at the start"""
+    workers: Annotated[int, _SERVER, "N"] = 1
+    """Processes that answer on the address, each with the run in its memory."""
+    threads: Annotated[int | None, _SERVER, POSITIVE, "N"] = None
+    """Threads per forward pass (default: one per core, divided by --workers)"""
+    max_batch: Annotated[int | None, _SERVER, "N"] = None
+    max_queue: Annotated[int | None, _SERVER, "N"] = None
+    timeout: Annotated[float | None, _SERVER, "TIMEOUT"] = None
 
     def execute(self) -> None:
         """Answer until Ctrl-C or TERM, after which requests in flight are answered."""
-        from ucfrec.recommending.workers import MOST, Workers
+        from ucfrec.recommending.server import MOST, Workers
 
         if not 1 <= self.workers <= MOST:
             raise InputError(f"--workers is {self.workers}; give a number from 1 to {MOST}")
@@ -100,7 +88,7 @@ class Serve(ServerOptions, AnswerOptions):
         """
         import torch
 
-        from ucfrec.recommending.served import Served, parse_split
+        from ucfrec.recommending.responder import Served, parse_split
         from ucfrec.recommending.server import server_config
         from ucfrec.recommending.web import ServerLimits, application
         from ucfrec.runs.record import RUN, verified

@@ -26,11 +26,7 @@ class Settings(Table):
 
 
 def settings_text(policy: str, width: int) -> str:
-    """Every setting of a training of `policy`, one section per table.
-
-    Raises:
-        InputError: no policy has this name.
-    """
+    """Every setting of a training of `policy`, one section per table."""
     from ucfrec.runs.config import TABLES, resolve_config
     from ucfrec.settings import describe
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Table, settings_given
+from ucfrec.commands.options import ARGUMENT, EXCLUSIVE, INPUT, Group, Table, settings_given
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import require_other_files
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ucfrec.acting.decision import DecisionRule
     from ucfrec.evaluation.simulator import Environment
     from ucfrec.logs.mapping import Dataset, LogMapping
+    from ucfrec.off_policy.score import LoggedSessions
     from ucfrec.recommending.exposures import ExposureLog
     from ucfrec.recommending.responder import Responder
     from ucfrec.runs.trained_policy import TrainedPolicy
@@ -37,27 +38,23 @@ class LogOptions(Table):
     logs: Annotated[Sequence[str], ARGUMENT, INPUT, "LOGS"]
     """Log files (.parquet, .csv, .csv.gz), folders or globs; also at s3://, …"""
     dataset: Annotated[str | None, "NAME"] = None
-    """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, if there is one,
-    else generic)"""
+    """Kind of logs: generic, kuairand, kuairec, obd, … (default: that of the run, else generic)"""
     column: Annotated[Sequence[str], "NAME=COLUMN"] = ()
-    """File column or SQL expression for a log column, e.g. user_id=uid; repeatable (default: as in
-    the logs that the run was trained on, or the column of the same name)"""
+    """File column or SQL expression for a log column, e.g. user_id=uid; repeatable (default: as of
+    the run, or the column of the same name)"""
     mapping: Annotated[Path | None, "TOML"] = None
-    """File with column mapping, reward and feature tables; --column overrides it (default: none; a
-    run remembers the columns of its logs)"""
+    """File with column mapping, reward and feature tables; --column overrides it (default: none)"""
     time_format: Annotated[str | None, "FORMAT"] = None
     """How times are written that are text, e.g. '%d/%m/%Y %H:%M' (default: ISO 8601, and dates
     whose order of day and month the file settles)"""
     earliest: Annotated[str | None, "TIME"] = None
     """ISO time before which times are clock errors (default: 2000-01-01)"""
     where: Annotated[str | None, "SQL"] = None
-    """Condition over the log's columns; rows that do not fulfil it are excluded and counted, e.g.
-    "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
+    """Condition that rows must fulfil, e.g. "user_id NOT IN ('bot-0', 'bot-1')" (default: none)"""
     partitions: bool = False
     """Read names of folders such as country=DE as columns."""
     memory_limit: Annotated[str, "SIZE"] = "2GB"
-    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to a
-    scratch folder"""
+    """Memory of the process while it reads the logs, from 800MB on; beyond it rows spill to disk"""
 
     def find_logs(
         self,
@@ -70,10 +67,6 @@ class LogOptions(Table):
         Args:
             trained: policy that the logs are for, which remembers the dataset of its training logs.
             outputs: files that the command writes.
-
-        Raises:
-            InputError: a file is missing, or would be replaced by an output; or the dataset, a
-                --column or the mapping file is unusable.
         """
         from ucfrec.logs.expressions import Expression
         from ucfrec.logs.mapping import LogMapping, read_columns, read_mapping
@@ -102,6 +95,26 @@ class LogOptions(Table):
         require_other_files((path for path in outputs if path is not None), inputs)
         return files, mapping
 
+    @contextmanager
+    def read_sessions(
+        self,
+        policies: "Sequence[TrainedPolicy]",
+        logs: Sequence[str],
+        output: Path | None,
+        keep_unknown: bool = False,
+    ) -> "Iterator[LoggedSessions]":
+        """Sessions of logs, read as the first policy was trained; those of the test split of the
+        policies' store if no logs are named."""
+        from ucfrec.off_policy.score import held_out_sessions, read_logged_sessions
+
+        if not logs:
+            yield held_out_sessions(policies)
+            return
+        files, mapping = self.find_logs(logs, policies[0], [output])
+        limit = self.memory_limit
+        with read_logged_sessions(policies[0], files, mapping, keep_unknown, limit) as logged:
+            yield logged
+
 
 class SparkOption(Table):
     """Where Spark is, for a field `engine` that has it."""
@@ -110,15 +123,11 @@ class SparkOption(Table):
     engine: str
 
     spark_master: Annotated[str | None, "MASTER"] = None
-    """With --engine spark: its master, e.g. spark://HOST:7077; inputs and output must lie where
-    every worker sees them (default: local[*], this machine)"""
+    """With --engine spark: its master, e.g. spark://HOST:7077, whose workers see all inputs and
+    outputs (default: local[*], this machine)"""
 
     def find_spark(self) -> str | None:
-        """Spark's master, if it is the engine; otherwise None.
-
-        Raises:
-            InputError: there is a master, but another engine.
-        """
+        """Spark's master, if it is the engine; otherwise None."""
         if self.engine == "spark":
             return self.spark_master or "local[*]"
         if self.spark_master:
@@ -138,8 +147,8 @@ class RuleOptions(Table):
     checkpoint: Literal["best", "last"] = "best"
     """Policy weights: of the lowest validation loss, or the last ones."""
     target_return: Annotated[float | None, EXCLUSIVE, "RETURN"] = None
-    """Target return, in units of the reward: of a session, or of every step for returns-to-go of a
-    horizon or discounted ones"""
+    """Target return, in units of the reward, of a session; of every step with a horizon or
+    discount"""
     target_quantile: Annotated[float | None, EXCLUSIVE, "QUANTILE"] = None
     """Target return: this quantile of the training's, 0 to 1; 1 is the largest"""
     max_return: Annotated[bool, EXCLUSIVE] = False
@@ -157,11 +166,7 @@ class RuleOptions(Table):
     tag_run: Annotated[int | None, "N"] = None
 
     def make_rule(self, trained: "TrainedPolicy") -> "DecisionRule":
-        """The run's decision rule with the parts that the command line names.
-
-        Raises:
-            InputError: a value is out of range.
-        """
+        """The run's decision rule with the parts that the command line names."""
         from ucfrec.acting.decision import DecisionRule
 
         parts = settings_given(self, DecisionRule)
@@ -179,13 +184,16 @@ class AnswerOptions(RuleOptions):
     described_by = "ucfrec.recommending.requests:Limits"
     prefix = "max_"
     engine: str
-    k: int
-    keep_seen: bool
-    exposures: Path | None
 
+    k: Annotated[int, Group("")] = 10
+    """Items for each user; if a request does not say how many."""
+    exposures: Annotated[Path | None, Group(""), "PATH"] = None
+    """Write what was shown, with its probability, as Parquet; a folder of files for requests; see
+    docs/exposures.md"""
+    keep_seen: Annotated[bool, Group("")] = False
+    """Also recommend items that the user has seen; (default: leave them out)"""
     skip_unknown: bool = False
-    """Ignore rows with items outside the catalogue of the run, and such candidates (default: an
-    error)"""
+    """Ignore rows and candidates with items outside the run's catalogue (default: an error)"""
     seed: int = 0
     """Of the draws of a rule with --temperature or --explore."""
     max_bytes: Annotated[int | None, "N"] = None
@@ -194,11 +202,7 @@ class AnswerOptions(RuleOptions):
     max_candidates: Annotated[int | None, "N"] = None
 
     def make_responder(self, trained: "TrainedPolicy") -> "Responder":
-        """What answers requests.
-
-        Raises:
-            InputError: a value is out of range, or the policy's actions are vectors.
-        """
+        """What answers requests."""
         from ucfrec.recommending.requests import Limits
         from ucfrec.recommending.responder import Responder
 
@@ -233,9 +237,8 @@ class EnvironmentOptions(Table):
     env_folder: Annotated[Path | None, "FOLDER"] = None
     """Folder with the simulator's files, e.g. its weights (default: none)"""
     observe: Annotated[str, "KEY[,KEY…]"] = ""
-    """Of gymnasium:ID with a dict observation: entries that are observed, one after the other as
-    one vector (default: none, states come from the items shown and their rewards; environments of
-    vector actions need one)"""
+    """Of gymnasium:ID with a dict observation: entries that are observed, as one vector (default:
+    none, states come from the items shown and their rewards)"""
     item_features: Annotated[str | None, "SOURCE"] = None
     """Of gymnasium:ID with items: their features, from an attribute of the environment or a file
     .npy (a row for each item) or .parquet (with a column item_id from 0) (default: none)"""
@@ -249,11 +252,7 @@ class EnvironmentOptions(Table):
 
 
 def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The run folders among files, and the other files.
-
-    Raises:
-        InputError: there is no run.
-    """
+    """The run folders among files, and the other files."""
     from ucfrec.runs.record import RUN
 
     paths = list(dict.fromkeys(map(Path, words)))
@@ -264,11 +263,7 @@ def find_runs(words: Sequence[str]) -> tuple[list[Path], list[str]]:
 
 
 def read_duration(option: str, text: str) -> int:
-    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`.
-
-    Raises:
-        InputError: it is written otherwise, or is 0.
-    """
+    """Milliseconds of a duration such as `90s`, `30m`, `12h` or `60d`."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d+)?)([smhd])", text.strip())
     milliseconds = 0 if match is None else round(float(match[1]) * _UNITS_MS[match[2]])
     if not milliseconds:

@@ -4,23 +4,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from ucfrec.commands.options import ARGUMENT
+from ucfrec.commands.options import ARGUMENT, Group
 from ucfrec.commands.shared_options import EnvironmentOptions, RuleOptions
 from ucfrec.errors import InputError
 
 
-class Evaluate(EnvironmentOptions, RuleOptions):
+class SimulationOptions(EnvironmentOptions):
+    """Sessions in an environment."""
+
+    env: Annotated[str, Group("")]
+    """Simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment
+    (gymnasium:MODULE:ID imports MODULE first)"""
+    seed: Annotated[int, Group("")] = 0
+    """Seed of the sessions."""
+
+
+class Evaluate(SimulationOptions, RuleOptions):
     """`ucfrec evaluate`."""
 
     described_by = "ucfrec.python_api.recommender:Recommender.evaluate"
 
     runs: Annotated[Sequence[Path], ARGUMENT, "RUN"] = ()
     """Run folders of `ucfrec train`."""
-    env: str
-    """Simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment
-    (gymnasium:MODULE:ID imports MODULE first)"""
-    seed: int = 0
-    """Seed of the sessions."""
     episodes: int = 1000
     behavior: Sequence[str] = ()
     """Also evaluate this built-in policy of the simulator, e.g. random; repeatable (default:
@@ -58,14 +63,9 @@ class Evaluate(EnvironmentOptions, RuleOptions):
             print(f"next: ucfrec report {runs} --results {self.json} --out report.html")
 
 
-class Collect(EnvironmentOptions):
+class Collect(SimulationOptions):
     """`ucfrec collect`."""
 
-    env: str
-    """Simulator, e.g. synthetic-taobao, or gymnasium:ID, any Gymnasium environment
-    (gymnasium:MODULE:ID imports MODULE first)"""
-    seed: int = 0
-    """Seed of the sessions."""
     behavior: str | None = None
     """Built-in policy that acts in the sessions (default: mixture if any, else random)"""
     sessions: int = 20_000

@@ -42,11 +42,11 @@ class Train(TrainingOptions):
     """`ucfrec train`."""
 
     refit: Annotated[Path | None, "RUN"] = None
-    """Go on training this finished run on all rows of the store, with its settings and decision
-    rule, in another folder (default: a new training)"""
+    """Go on training this finished run, with its settings and decision rule, on all rows, in --out
+    (default: a new training)"""
     no_refit: bool = False
-    """Keep the weights of the training rows; (default: once everything is chosen, go on learning
-    from all rows; `rank` and `ope` on the test split use the weights before that)"""
+    """Keep the weights of the training rows; (default: go on learning from all rows; `rank` and
+    `ope` on the test split use the weights before that)"""
     evidence: Annotated[int | None, "N"] = None
     """Effective users that the decision rule must leave in the validation sessions; where the log
     has propensities, so that `ope` can estimate its value; 0 for any (default: 200)"""

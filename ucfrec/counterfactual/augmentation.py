@@ -6,7 +6,7 @@ appendix H); an action copy ends with another action and its counterfactual rewa
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
@@ -39,9 +39,8 @@ from ucfrec.counterfactual.reward_model_fit import (
     sample_steps,
     sample_transitions,
 )
-from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Transitions
+from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.processes import random_state_kept
@@ -273,14 +272,41 @@ def edit_states(
         config: numbers of copies and edits, and the gate.
         item_rewards: see `read_transitions`.
     """
-    rng = np.random.default_rng(seed)
-    editor = _Editor(view, crm, generator, config.epsilon_r, seed, item_rewards)
+    rng, random = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    # The gates are evaluated in float64 on the stored float32 values, so that a later check of the
+    # edits confirms every one.
+    exact, moves = copy.deepcopy(crm).double(), MoveStatistics(view.state_size)
+    epsilon_r = 0.1 * float(crm.reward_std) if config.epsilon_r is None else config.epsilon_r
+    rho_high = generator.band[1]
+
+    @torch.no_grad()
+    def edit(episodes: IntArray, steps: IntArray, number: int = 0) -> _Edits:
+        """Propose one edit at each of the given steps; returns the accepted ones, in order."""
+        accepted = np.zeros(len(steps), dtype=bool)
+        states = [np.zeros((0, view.state_size), np.float32)]
+        for start in range(0, len(steps), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            factual = read_transitions(view, episodes[rows], steps[rows], item_rewards)
+            factual = factual.to(crm.device)
+            s, a, r = factual.states, factual.actions, factual.rewards
+            proposed = generator.propose(s, a, crm.abduct(s, a, r), random)
+            s, a, r = s.double(), a.double(), r.double()
+            factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
+            gates = (epsilon_r * (1 - _ROUNDING), rho_high * (1 - _ROUNDING))
+            passed = accept(exact, factual, z, proposed.double(), *gates)
+            moves.add(exact.moves(s[passed], proposed[passed].double()).cpu())
+            accepted[rows] = passed.cpu().numpy()
+            states.append(proposed[passed].cpu().numpy())
+        moves.proposals += len(steps)
+        copies = np.full(int(accepted.sum()), number)
+        return _Edits(episodes[accepted], copies, steps[accepted], np.concatenate(states))
+
     episodes, steps = find_candidates(view, config, rng)
     if config.edits_per_copy:
-        rounds = list(_fill_copies(editor, episodes, steps, config, rng))
+        rounds = list(_fill_copies(edit, episodes, steps, config, rng))
     else:
-        rounds = [editor.edit(episodes, steps, copy=k) for k in range(config.copies)]
-    rounds.append(editor.edit(episodes[:0], steps[:0]))
+        rounds = [edit(episodes, steps, number) for number in range(config.copies)]
+    rounds.append(edit(episodes[:0], steps[:0]))
     edits = _Edits(*(np.concatenate(column) for column in zip(*rounds, strict=True)))
     copies = max(config.copies, 1)
     copy_keys, edit_copy = np.unique(edits.episode * copies + edits.copy, return_inverse=True)
@@ -291,7 +317,8 @@ def edit_states(
         edit_step=edits.step[order],
         edit_state=edits.state[order],
     )
-    return augmented, _report(len(copy_keys), editor, crm_report)
+    report = moves.report(rho_high, int((crm.state_std > 0).sum()))
+    return augmented, _report(len(copy_keys), moves.proposals, report, epsilon_r, crm_report)
 
 
 class _Edits(NamedTuple):
@@ -301,56 +328,6 @@ class _Edits(NamedTuple):
     copy: IntArray
     step: IntArray
     state: Float32Array
-
-
-class _Editor:
-    """Proposes edits, applies the gates chunk by chunk, and collects statistics."""
-
-    def __init__(
-        self,
-        view: EpisodeStore,
-        crm: CausalRewardModel,
-        generator: Generator,
-        epsilon_r: float | None,
-        seed: int,
-        item_rewards: ItemRewardModel | None,
-    ) -> None:
-        self._view, self._crm, self._generator = view, crm, generator
-        self._item_rewards = item_rewards
-        self._random = torch.Generator().manual_seed(seed)
-        # The gates are evaluated in float64 on the stored float32 values, so that a later check
-        # of the edits confirms every one.
-        self._exact = copy.deepcopy(crm).double()
-        self._moves = MoveStatistics(view.state_size)
-        self.epsilon_r = 0.1 * float(crm.reward_std) if epsilon_r is None else epsilon_r
-        self.rho_high = generator.band[1]
-        self.proposals = 0
-
-    @torch.no_grad()
-    def edit(self, episodes: IntArray, steps: IntArray, copy: int = 0) -> _Edits:
-        """Propose one edit at each of the given steps; returns the accepted ones, in order."""
-        accepted = np.zeros(len(steps), dtype=bool)
-        states = [np.zeros((0, self._view.state_size), np.float32)]
-        gates = (self.epsilon_r * (1 - _ROUNDING), self.rho_high * (1 - _ROUNDING))
-        for start in range(0, len(steps), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            factual = read_transitions(self._view, episodes[rows], steps[rows], self._item_rewards)
-            factual = factual.to(self._crm.device)
-            s, a, r = factual.states, factual.actions, factual.rewards
-            proposed = self._generator.propose(s, a, self._crm.abduct(s, a, r), self._random)
-            s, a, r = s.double(), a.double(), r.double()
-            exact = replace(factual, states=s, actions=a, rewards=r)
-            z = self._exact.abduct(s, a, r)
-            passed = accept(self._exact, exact, z, proposed.double(), *gates)
-            self._moves.add(self._exact.moves(s[passed], proposed[passed].double()).cpu())
-            accepted[rows] = passed.cpu().numpy()
-            states.append(proposed[passed].cpu().numpy())
-        self.proposals += len(steps)
-        copies = np.full(int(accepted.sum()), copy)
-        return _Edits(episodes[accepted], copies, steps[accepted], np.concatenate(states))
-
-    def moves(self) -> MoveReport:
-        return self._moves.report(self.rho_high, int((self._crm.state_std > 0).sum()))
 
 
 def accept(
@@ -380,7 +357,7 @@ def accept(
 
 
 def _fill_copies(
-    editor: _Editor,
+    edit: Callable[[IntArray, IntArray], _Edits],
     episodes: IntArray,
     steps: IntArray,
     config: AugmentConfig,
@@ -401,7 +378,7 @@ def _fill_copies(
         if not new_proposals.any():
             return
         rows = order[_ranges(first + proposed, new_proposals)]
-        edits = editor.edit(episodes[rows], steps[rows])
+        edits = edit(episodes[rows], steps[rows])
         index = np.searchsorted(unique_episodes, edits.episode)
         new_edits = np.bincount(index, minlength=len(counts))
         number = _ranges(accepted, new_edits)
@@ -410,12 +387,13 @@ def _fill_copies(
 
 
 class MoveStatistics:
-    """Accumulates statistics of moves (M, S) chunk by chunk, without keeping the moves."""
+    """Counts proposals, and accumulates statistics of moves (M, S) without keeping the moves."""
 
     def __init__(self, size: int) -> None:
         self._total = torch.zeros(size, dtype=torch.float64)
         self._moments = torch.zeros(size, size, dtype=torch.float64)
         self._lengths = [torch.zeros(0, dtype=torch.float64)]
+        self.proposals = 0
 
     def add(self, moves: Tensor) -> None:
         """Add the moves Δ (M, S) of M accepted edits."""
@@ -450,12 +428,31 @@ class MoveStatistics:
         )
 
 
-def _report(copies: int, editor: _Editor, crm_report: CRMReport) -> AugmentationReport:
-    moves = editor.moves()
+def _report(
+    copies: int, proposals: int, moves: MoveReport, epsilon_r: float, crm_report: CRMReport
+) -> AugmentationReport:
     delta = crm_report.delta[_DELTA_LEVEL]
-    bound = delta + editor.epsilon_r
-    model_warnings = (fit_warning(crm_report.r2_without_z), crm_report.warning)
-    warnings = [warning for warning in model_warnings if warning]
+    bound = delta + epsilon_r
+    deviations = bound / crm_report.reward_std
+    if proposals == 0:
+        verdict = "no state is edited"
+    elif moves.edits == 0:
+        verdict = (
+            "no edit was accepted: the reward model's median error on held-out steps is "
+            f"{crm_report.delta['0.5']:.3g}, or the generator changes the predicted reward"
+        )
+    elif deviations >= 1:
+        verdict = (
+            f"the bound means nothing: it allows a change of {bound:.3g}, {deviations:.1f} "
+            "standard deviations of the reward; the reward model is too inaccurate"
+        )
+    else:
+        verdict = (
+            f"an accepted edit changes the true reward by at most {bound:.3g} ({deviations:.2f} "
+            "standard deviations), provided that the reward model is as accurate at edited states "
+            "as on 95% of held-out steps"
+        )
+    warnings = [fit_warning(crm_report.r2_without_z), crm_report.warning]
     if moves.edits and moves.mean_move_ratio > 0.5:
         warnings.append(
             f"edit collapse: {moves.mean_move_ratio:.0%} of the average edit is one shift common "
@@ -463,36 +460,15 @@ def _report(copies: int, editor: _Editor, crm_report: CRMReport) -> Augmentation
         )
     return AugmentationReport(
         copies=copies,
-        proposals=editor.proposals,
-        acceptance=moves.edits / max(1, editor.proposals),
+        proposals=proposals,
+        acceptance=moves.edits / max(1, proposals),
         moves=moves,
-        epsilon_r=editor.epsilon_r,
+        epsilon_r=epsilon_r,
         delta=delta,
         bound=bound,
-        verdict=_verdict(editor.proposals, moves.edits, bound, crm_report),
-        warnings=tuple(warnings),
+        verdict=verdict,
+        warnings=tuple(filter(None, warnings)),
         reward_model=crm_report,
-    )
-
-
-def _verdict(proposals: int, edits: int, bound: float, crm_report: CRMReport) -> str:
-    if proposals == 0:
-        return "no state is edited"
-    if edits == 0:
-        return (
-            "no edit was accepted: the reward model's median error on held-out steps is "
-            f"{crm_report.delta['0.5']:.3g}, or the generator changes the predicted reward"
-        )
-    deviations = bound / crm_report.reward_std
-    if deviations >= 1:
-        return (
-            f"the bound means nothing: it allows a change of {bound:.3g}, {deviations:.1f} "
-            "standard deviations of the reward; the reward model is too inaccurate"
-        )
-    return (
-        f"an accepted edit changes the true reward by at most {bound:.3g} ({deviations:.2f} "
-        "standard deviations), provided that the reward model is as accurate at edited states as "
-        "on 95% of held-out steps"
     )
 
 
@@ -533,22 +509,17 @@ class ActionGenerator:
 
     For a logged step (s, a, r), the disturbance z is abduced and kept; another action a' is the
     action of a random training step whose state lies in the same cluster as s; and its reward is
-    r' = f̂_r(s, a', z), within the range of the logged rewards.
+    r' = f̂_r(s, a', z), within the range of the logged rewards. The model must reproduce the logged
+    reward, |f̂_r(s, a, z) − r| ≤ ε_r, and r' must differ from r by more than δ, the model's error on
+    held-out steps.
     """
 
     view: EpisodeStore
-    """The training episodes."""
     crm: CausalRewardModel
-    """The fitted reward model."""
     clusters: StateClusters
-    """Of the training states."""
     support: ActionSupport
-    """The logged actions of each cluster."""
     epsilon_r: float
-    """ε_r: the model must reproduce the logged reward, |f̂_r(s, a, z) − r| ≤ ε_r."""
     delta: float
-    """δ, the model's error on held-out steps: rewards r' and r that differ by no more
-    cannot be distinguished."""
     item_rewards: ItemRewardModel | None = None
     """See `read_transitions`."""
 
@@ -560,9 +531,7 @@ class ActionGenerator:
         Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
 
         Args:
-            episodes: (M,) positions in the view.
-            steps: (M,) steps of those episodes.
-            count: actions drawn for each step.
+            episodes: (M,) positions in the view; `steps` are steps of them.
         """
         # In float64, so that a later check confirms what passes.
         exact = copy.deepcopy(self.crm).double()
@@ -605,9 +574,8 @@ class ActionGenerator:
     ) -> dict[str, Any]:
         """Draw other actions at each of the given steps, and predict their rewards.
 
-        Returns:
-            Of N actions: `episode`, `step`, `action`, its `reward`, the `logged` reward, and
-            whether the reward model has `reproduced` that.
+        Of each of N actions: `episode`, `step`, `action`, its `reward`, the `logged` reward, and
+        whether the reward model has `reproduced` that.
         """
         factual = read_transitions(self.view, episodes, steps, self.item_rewards)
         factual = factual.to(self.crm.device)

@@ -82,13 +82,7 @@ class StateClusters:
 
     @classmethod
     def of(cls, states: Tensor, most: int, seed: int) -> "StateClusters":
-        """Cluster normalised states; the clusters are on the CPU.
-
-        Args:
-            states: (M, S), on the CPU.
-            most: largest number of clusters; few states make fewer.
-            seed: of the first centres and the batches.
-        """
+        """At most `most` clusters of normalised states (M, S), on the CPU; of few, fewer."""
         # Imported here because it takes a second and 100 MB, and loading a policy does not need it.
         from sklearn.cluster import MiniBatchKMeans
 
@@ -119,26 +113,15 @@ class ActionSupport:
     """The actions that the log took in each cluster of states: what else could have been done."""
 
     def __init__(self, labels: IntArray, actions: Array) -> None:
-        """
-        Args:
-            labels: (M,) cluster of the state of each of M logged steps.
-            actions: (M,) items or (M, A) vectors of these steps.
-        """
+        """Of M logged steps: clusters (M,) of their states, and items (M,) or vectors (M, A)."""
         order = np.argsort(labels, kind="stable")
         self._actions = actions[order]
         self._counts = np.bincount(labels)
         self._starts = np.cumsum(self._counts) - self._counts
 
     def draw(self, labels: IntArray, generator: np.random.Generator) -> tuple[Array, BoolArray]:
-        """The action of a random logged step of the given cluster, for each of B clusters.
-
-        Args:
-            labels: (B,) clusters.
-
-        Returns:
-            Actions, (B,) or (B, A), and (B,) whether the cluster has a logged step at all; where it
-            has none, the action means nothing.
-        """
+        """The action of a random logged step of each of B clusters, (B,) or (B, A); and (B,)
+        whether the cluster has a logged step at all, without which the action means nothing."""
         drawable = labels < len(self._counts)
         clusters = np.where(drawable, labels, 0)
         counts = np.where(drawable, self._counts[clusters], 0)
@@ -152,21 +135,16 @@ class Generator(Protocol):
 
     @property
     def band(self) -> tuple[float, float]:
-        """(ρ_low, ρ_high): shortest and longest move, in standard deviations of the states."""
+        """(ρ_low, ρ_high), see `CSGConfig`."""
 
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
-        """Propose a state s_c for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
+        """A state s_c (M, S) for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
 
         Args:
-            states: (M, S) states s, as logged.
-            actions: (M, A) actions a.
-            z: (M, latent_dim) abduced disturbances.
+            states: (M, S) states s, with actions (M, A) and abduced disturbances (M, latent_dim).
             generator: source of all random numbers, on the CPU.
-
-        Returns:
-            (M, S) counterfactual states s_c, in the units of `states`.
         """
 
 
@@ -181,16 +159,10 @@ class TangentGenerator:
     """
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
-        """
-        Args:
-            clusters: of the states that edits are proposed for.
-        """
-        self._crm = crm
+        self._crm, self._config, self.band = crm, config, config.band
         self._clusters = clusters.to(crm.device)
         values, vectors = torch.linalg.eigh(clusters.covariances)
         self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
-        self._config = config
-        self.band = config.band
 
     @torch.no_grad()
     def propose(
@@ -267,14 +239,10 @@ class CounterfactualStateGenerator(nn.Module):
 
 
 class NoiseGenerator:
-    """A control: moves in random directions, with the lengths of `TangentGenerator`.
-
-    Comparing both shows the effect of preserving the predicted reward.
-    """
+    """A control: moves in random directions, with the lengths of `TangentGenerator`."""
 
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
-        self._std = crm.state_std
-        self.band = config.band
+        self._std, self.band = crm.state_std, config.band
 
     def propose(
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
@@ -317,10 +285,7 @@ def make_generator(
     if config.kind == "tangent":
         clusters = clusters or state_clusters(train, crm, config, seed)
         return TangentGenerator(crm, clusters, config)
-    chosen = _high_rewards(train, config, seed)
-    fields = (train.states, train.actions, train.rewards)
-    s, a, r = (values[chosen].to(crm.device) for values in fields)
-    return _faithful(s, a, r, crm, config, folder, seed)
+    return _fit_faithful(train, crm, config, folder, seed)
 
 
 def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
@@ -331,15 +296,13 @@ def _high_rewards(train: Transitions, config: CSGConfig, seed: int) -> Tensor:
     return torch.from_numpy(shuffled[: config.max_transitions])
 
 
-def _faithful(
-    states: Tensor,
-    actions: Tensor,
-    rewards: Tensor,
-    crm: CausalRewardModel,
-    config: CSGConfig,
-    folder: Path,
-    seed: int,
+def _fit_faithful(
+    train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> CounterfactualStateGenerator:
+    rows = _high_rewards(train, config, seed)
+    states, actions, rewards = (
+        values[rows].to(crm.device) for values in (train.states, train.actions, train.rewards)
+    )
     torch.manual_seed(seed)
     csg = CounterfactualStateGenerator(crm, config).to(crm.device)
     low, high = config.band

@@ -30,12 +30,11 @@ _LOG_2PI = math.log(2 * math.pi)
 class CRMConfig:
     """Architecture and training of the reward model (paper appendix G.1, Table 4).
 
-    `decoder_std` and `mean_first` are not specified in the paper. With the small β of Table 4 the
-    KL term of a plain CVAE is too weak: z encodes the reward itself instead of the disturbance, so
-    every edit seems to keep the reward. Learning E[r | s, a] first and abducing z from the residual
-    prevents this. On synthetic data where the disturbance makes up 3% of the reward's variance, z
-    accounts for 78% without and 5% with `mean_first`; its correlation with the disturbance is 0.25
-    and 0.82.
+    `decoder_std` and `mean_first` are not specified in the paper. With the small β of Table 4, z
+    of a plain CVAE encodes the reward itself instead of the disturbance, so every edit seems to
+    keep the reward. Learning E[r | s, a] first and abducing z from the residual prevents this: on
+    synthetic data whose disturbance makes up 3% of the reward's variance, z accounts for 78%
+    without and 5% with `mean_first`.
     """
 
     latent_dim: Annotated[int, Field(ge=1, le=4096)] = 16
@@ -45,29 +44,24 @@ class CRMConfig:
     beta: Weight = 0.1
     """β, weight of the KL divergence of z from its prior (Eq. 2)."""
     decoder_std: Annotated[float, Field(gt=0, le=1000)] = 0.1
-    """Standard deviation of p(r | s, a, z), in standard deviations of the reward.
-
-    A disturbance below β × decoder_std² of the reward's variance is not abduced. The default equals
-    the tolerance of the acceptance gate, so that disturbances that matter to the gate are abduced.
-    """
+    """Standard deviation of p(r | s, a, z), in those of the reward. A disturbance below
+    β × decoder_std² of the reward's variance is not abduced; the default is that of the gate."""
     mean_first: bool = True
     """Fit E[r | s, a] by regression, freeze it, then train the CVAE on top; false: Eq. 2 alone."""
     mean: Literal["network", "effects"] = "network"
-    """What E[r | s, a] is: `network`, a network of state and action; `effects`, where actions are
-    items, additive effects of item, user, what was shown before and the state. Action vectors
-    always have the network."""
+    """What E[r | s, a] is: a `network` of state and action; or, where actions are items, additive
+    `effects` of item, user, what was shown before and the state."""
     learning_rate: LearningRate = 4e-3
-    """Highest learning rate of the CVAE, half of which is the regression's: it rises over the first
-    twentieth of the updates, and falls to 0 along a cosine."""
+    """Highest learning rate of the CVAE, half of which is the regression's; it falls to 0 along a
+    cosine."""
     weight_decay: WeightDecay = 1e-4
     """Weight decay of AdamW."""
     batch_size: BatchSize = 256
     """Transitions per update."""
     epochs: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Maximum number of passes over the transitions, for regression and CVAE each; 0 selects 5, or
-    from few transitions as many as take 800 updates. The regression, which overfits rewards that
-    are mostly noise within a pass, is fitted by a sixth and a third of them first, and by all only
-    if more has helped."""
+    from few transitions as many as take 800 updates. The regression is fitted by a sixth and a
+    third of them first, and by all only if more has helped."""
     patience: Annotated[int, Field(ge=0, le=100_000)] = 5
     """Passes without a better validation loss before the CVAE stops early; 0 never stops early."""
     max_transitions: Annotated[int, Field(ge=100, le=10**9)] = 200_000
@@ -88,13 +82,6 @@ class Posterior(NamedTuple):
 
     mean: Tensor
     log_variance: Tensor
-
-
-class ELBO(NamedTuple):
-    """The two terms of Eq. 2, each (...), in nats."""
-
-    log_likelihood: Tensor
-    kl: Tensor
 
 
 class EffectsMean(nn.Module):
@@ -132,9 +119,9 @@ class EffectsMean(nn.Module):
 class CausalRewardModel(nn.Module):
     """Conditional variational autoencoder of the reward (paper Eq. 2, Algorithm 2).
 
-    All methods take states (..., S), actions (..., A) and rewards (...) in their original units and
-    normalise them internally. The decoder is E[r | s, a] plus a term that depends on z; the
-    encoder's input is the residual r − E[r | s, a]. Without `mean_first`, that mean is 0.
+    Methods take states (..., S), actions (..., A) and rewards (...) in their original units. The
+    decoder is E[r | s, a] plus a term that depends on z; the encoder's input is the residual
+    r − E[r | s, a]. Without `mean_first`, that mean is 0.
     """
 
     state_mean: Tensor
@@ -155,10 +142,8 @@ class CausalRewardModel(nn.Module):
         mean: EffectsMean | None = None,
     ) -> None:
         """Args:
-        state_size: S.
         action_size: A, the size of an action vector or of an item's embedding; with `mean`, of
             the actions that it reads.
-        config: settings.
         mean: E[r | s, a]; None for a network that is yet to be trained.
         """
         super().__init__()
@@ -178,7 +163,7 @@ class CausalRewardModel(nn.Module):
         return self.state_mean.device
 
     def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
-        """The posterior q_ϕ(z | s, a, r), both fields (..., latent_dim)."""
+        """The posterior q_ϕ(z | s, a, r)."""
         return self._encode(self.given(states, actions), self.residual(states, actions, rewards))
 
     def _encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
@@ -192,22 +177,19 @@ class CausalRewardModel(nn.Module):
 
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
-        inputs = self.given(states, actions)
-        decoded = self.expected_reward(states, actions) + self._disturbance(inputs, z)
+        disturbance = self._disturbance(self.given(states, actions), z)
+        decoded = self.expected_reward(states, actions) + disturbance
         return self.reward_mean + self.reward_std * decoded
 
-    def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> ELBO:
-        """Both terms of Eq. 2 at z = μ + σ·noise, noise (..., latent_dim) standard normal.
-
-        `given` (..., S + A) and `residual` (...) are those of the methods; they stay while encoder
-        and decoder are trained.
-        """
+    def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Log likelihood and KL of Eq. 2, each (...) in nats, at z = μ + σ·noise, with standard
+        normal noise (..., latent_dim). Inputs are what `given`, residuals what `residual` gives."""
         q = self._encode(inputs, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
         error = self._disturbance(inputs, z) - residual
         scale = self.config.decoder_std
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
-        return ELBO(log_likelihood, kl_to_prior(q).sum(-1))
+        return log_likelihood, kl_to_prior(q).sum(-1)
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
@@ -233,13 +215,8 @@ class CausalRewardModel(nn.Module):
 
     def given(self, states: Tensor, actions: Tensor) -> Tensor:
         """Normalised states and actions, concatenated, (..., S + A)."""
-        return torch.cat(
-            [
-                self.normalised_states(states),
-                _normalise(actions, self.action_mean, self.action_std),
-            ],
-            dim=-1,
-        )
+        actions = _normalise(actions, self.action_mean, self.action_std)
+        return torch.cat([self.normalised_states(states), actions], dim=-1)
 
     def normalised_states(self, states: Tensor) -> Tensor:
         """States (..., S), standardised; 0 in dimensions that never vary in training."""

@@ -21,7 +21,6 @@ from ucfrec.counterfactual.reward_model import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
-from ucfrec.errors import InputError
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_trained, load_weights
 from ucfrec.fitting.loop import LoopConfig, fit
@@ -54,11 +53,9 @@ class CRMReport:
     """Quality of the reward model, measured on held-out steps."""
 
     train_transitions: int
-    """Number of transitions trained on."""
     validation_transitions: int
-    """Number of held-out transitions."""
     reward_std: float
-    """Standard deviation of the training rewards, in reward units."""
+    """Of the training rewards, in reward units."""
     r2: Undefinable
     """R² of f̂_r(s, a, z) with the abduced z, which is computed from the reward itself."""
     r2_without_z: Undefinable
@@ -68,7 +65,6 @@ class CRMReport:
     z_leak: float
     """Largest |correlation| of an active z_i with f̂_r(s, a, 0); 0 for a true disturbance."""
     latent_dim: int
-    """Number of latent dimensions."""
     active_dimensions: int
     """Number of latent dimensions with a mean KL above 0.01 nats."""
     kl: tuple[float, ...]
@@ -89,58 +85,52 @@ def fit_crm(
     mean: EffectsMean | None = None,
     device: torch.device = _CPU,
 ) -> tuple[CausalRewardModel, CRMReport]:
-    """Train the reward model (Algorithm 2) with early stopping on held-out steps.
+    """Train the reward model (Algorithm 2) with early stopping on held-out steps; the model with
+    the lowest validation loss, in evaluation mode, and its quality.
 
     Args:
-        validation: held-out transitions, never trained on.
         folder: of the checkpoints, which training resumes from; with the file `INITIAL` in it, of
             weights and scales that training begins with.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
-
-    Returns:
-        The model with the lowest validation loss, in evaluation mode, and its quality.
-
-    Raises:
-        InputError: all training rewards are equal, or one of the two sets is empty.
     """
     rng = np.random.default_rng(seed)
-    train = _at_most(train, config.max_transitions, rng).to(device)
-    held_out = _at_most(validation, _VALIDATION_LIMIT, rng).to(device)
+    train = _sample(train, config.max_transitions, rng).to(device)
+    held_out = _sample(validation, _VALIDATION_LIMIT, rng).to(device)
     torch.manual_seed(seed)
     model = CausalRewardModel(train.states.shape[1], train.actions.shape[1], config, mean)
     model = model.to(device)
-    _set_statistics(model, train, held_out)
+    _set_statistics(model, train)
     if mean is None and (folder / INITIAL).exists():
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
+    inputs = _read_inputs(model, train)
     if config.mean_first:
         model.expected.requires_grad_(False)
-        model.surprise_std.fill_(_residual_deviation(model, train))
-    _fit_elbo(model, train, held_out, folder / "cvae", seed)
+        variance = float(inputs[1].double().square().mean())
+        model.surprise_std.fill_(max(variance, 1e-8) ** 0.5)
+    _fit_elbo(model, inputs, _read_inputs(model, held_out), folder / "cvae", seed)
     return model, _report(model, len(train.rewards), held_out)
 
 
 def _fit_mean(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    inputs, rewards = (
-        model.given(train.states, train.actions),
-        model.normalised_rewards(train.rewards),
+    (inputs, rewards), held_out_rows = (
+        (model.given(steps.states, steps.actions), model.normalised_rewards(steps.rewards))
+        for steps in (train, held_out)
     )
-    held_out_given = model.given(held_out.states, held_out.actions)
-    held_out_rewards = model.normalised_rewards(held_out.rewards)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-        rows = _rows(generator, len(rewards), model.config.batch_size, model.device)
+        rows = _draw_rows(generator, len(rewards), model)
         return inputs[rows], rewards[rows]
 
     def loss(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
         return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
 
     def validate() -> float:
-        return _mean_over_chunks(loss, (held_out_given, held_out_rewards))
+        return _mean_over_chunks(loss, held_out_rows)
 
     first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rewards))
     best, weights = math.inf, first
@@ -165,52 +155,38 @@ def _fit_mean(
 
 
 @torch.no_grad()
-def _inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Tensor, Tensor]:
+def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Tensor, Tensor]:
     """What the CVAE sees of the steps: normalised inputs (M, S + A) and residuals (M,)."""
-    fields = (transitions.states, transitions.actions, transitions.rewards)
-    chunks = (torch.split(values, _CHUNK) for values in fields)
-    parts = [
-        (model.given(states, actions), model.residual(states, actions, rewards))
-        for states, actions, rewards in zip(*chunks, strict=True)
-    ]
-    inputs, residuals = zip(*parts, strict=True)
-    return torch.cat(inputs), torch.cat(residuals)
-
-
-@torch.no_grad()
-def _residual_deviation(model: CausalRewardModel, train: Transitions) -> float:
-    """Root of the mean squared residual of the training steps."""
-    total = 0.0
-    for start in range(0, len(train.rewards), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        residual = model.residual(train.states[part], train.actions[part], train.rewards[part])
-        total += float(residual.double().square().sum())
-    return float(max(total / len(train.rewards), 1e-8) ** 0.5)
+    s, a, r = transitions.states, transitions.actions, transitions.rewards
+    parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
+    inputs = torch.cat([model.given(s[part], a[part]) for part in parts])
+    return inputs, torch.cat([model.residual(s[part], a[part], r[part]) for part in parts])
 
 
 def _fit_elbo(
-    model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
+    model: CausalRewardModel,
+    train: tuple[Tensor, Tensor],
+    held_out: tuple[Tensor, Tensor],
+    folder: Path,
+    seed: int,
 ) -> None:
-    config, (inputs, residuals) = model.config, _inputs(model, train)
+    config, (inputs, residuals) = model.config, train
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        rows = _rows(generator, len(residuals), config.batch_size, model.device)
-        noise = _noise(generator, config.batch_size, config.latent_dim).to(model.device)
-        return inputs[rows], residuals[rows], noise
+        rows = _draw_rows(generator, len(residuals), model)
+        return inputs[rows], residuals[rows], _draw_noise(generator, config.batch_size, model)
 
     def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
         log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
         parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
         return config.beta * kl - log_likelihood, parts
 
-    fixed = _noise(np.random.default_rng(seed), len(held_out.rewards), config.latent_dim)
-    fixed = fixed.to(model.device)
-    held_out_inputs = _inputs(model, held_out)
+    fixed = _draw_noise(np.random.default_rng(seed), len(held_out[1]), model)
 
     def validate() -> float:
-        return _mean_over_chunks(loss, (*held_out_inputs, fixed))
+        return _mean_over_chunks(loss, (*held_out, fixed))
 
-    loop = _loop(config, len(train.rewards))
+    loop = _loop(config, len(residuals))
     fit(model, draw, loss, loop, folder, seed=seed, validate=validate, describe="reward model")
 
 
@@ -225,19 +201,30 @@ def _mean_over_chunks(
 
 def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
     epoch = max(1, transitions // config.batch_size)
-    epochs = config.epochs or max(_EPOCHS, math.ceil(_LEAST_UPDATES / epoch))
+    steps = epoch * (config.epochs or max(_EPOCHS, math.ceil(_LEAST_UPDATES / epoch)))
     return LoopConfig(
-        steps=epochs * epoch,
+        steps=steps,
         batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
-        warmup_steps=epochs * epoch // 20,
+        warmup_steps=steps // 20,
         cosine=True,
         clip_norm=0.0,
-        validate_every=max(epoch, epochs * epoch // _MOST_VALIDATIONS),
+        validate_every=max(epoch, steps // _MOST_VALIDATIONS),
         patience=config.patience,
         average=0.0,
     )
+
+
+def _draw_rows(generator: np.random.Generator, most: int, model: CausalRewardModel) -> Tensor:
+    rows = generator.integers(most, size=model.config.batch_size)
+    return torch.from_numpy(rows).to(model.device)
+
+
+def _draw_noise(generator: np.random.Generator, rows: int, model: CausalRewardModel) -> Tensor:
+    size = (rows, model.config.latent_dim)
+    values: Float32Array = generator.standard_normal(size, dtype=np.float32)
+    return torch.from_numpy(values).to(model.device)
 
 
 @torch.no_grad()
@@ -272,11 +259,8 @@ def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CR
 
 
 def fit_warning(r2_without_z: float) -> str:
-    """A warning if the reward model predicts nothing, i.e. R² ≤ 0.02 or NaN; otherwise empty.
-
-    Args:
-        r2_without_z: `CRMReport.r2_without_z`.
-    """
+    """A warning if the reward model predicts nothing, i.e. its `CRMReport.r2_without_z` is at most
+    0.02 or NaN; otherwise empty."""
     if r2_without_z > _PREDICTS_NOTHING:
         return ""
     return (
@@ -306,40 +290,19 @@ def _warning(report: CRMReport) -> str:
     return ""
 
 
-def _set_statistics(model: CausalRewardModel, train: Transitions, held_out: Transitions) -> None:
-    for name, transitions in (("training", train), ("held-out", held_out)):
-        if len(transitions.rewards) == 0:
-            raise InputError(f"the reward model has no {name} transitions; check the store's split")
+def _set_statistics(model: CausalRewardModel, train: Transitions) -> None:
+    """Means and standard deviations, in float64; of the latter, rounding errors become 0."""
     for name in ("state", "action", "reward"):
-        mean, std = _statistics(getattr(train, f"{name}s"))
+        values = getattr(train, f"{name}s").double()
+        mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
+        std = torch.where(std > _CONSTANT * mean.abs().clamp(min=1.0), std, 0.0)
         model.get_buffer(f"{name}_mean").copy_(mean)
         model.get_buffer(f"{name}_std").copy_(std)
-    if float(model.reward_std) == 0:
-        raise InputError(
-            f"all {len(train.rewards)} training rewards equal {float(train.rewards[0]):g}: there "
-            "is nothing to model; check the reward expression"
-        )
 
 
-def _statistics(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation over rows, in float64; rounding errors in the latter become 0."""
-    values = values.double()
-    mean, std = values.mean(dim=0), values.std(dim=0, correction=0)
-    return mean, torch.where(std > _CONSTANT * mean.abs().clamp(min=1.0), std, 0.0)
-
-
-def _at_most(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:
+def _sample(transitions: Transitions, limit: int, rng: np.random.Generator) -> Transitions:
     rows = torch.from_numpy(rng.permutation(len(transitions.rewards))[:limit])
-    return Transitions(*(getattr(transitions, field.name)[rows] for field in fields(transitions)))
-
-
-def _rows(generator: np.random.Generator, most: int, rows: int, device: torch.device) -> Tensor:
-    return torch.from_numpy(generator.integers(most, size=rows)).to(device)
-
-
-def _noise(generator: np.random.Generator, rows: int, size: int) -> Tensor:
-    values: Float32Array = generator.standard_normal((rows, size), dtype=np.float32)
-    return torch.from_numpy(values)
+    return Transitions(**{f.name: getattr(transitions, f.name)[rows] for f in fields(transitions)})
 
 
 def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:

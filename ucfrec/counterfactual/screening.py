@@ -164,7 +164,7 @@ def find_measurements(
     """
     if dimensions is not None and not len(dimensions):
         return {}
-    data = _Steps.of(train, most, seed)
+    data = _Steps(train, most, seed)
     all_dimensions = range(data.columns.shape[1])
     tested = all_dimensions if dimensions is None else dimensions
     verdicts: dict[int, bool] = {}
@@ -183,34 +183,19 @@ def find_measurements(
     }
 
 
-@dataclass(frozen=True)
 class _Steps:
-    """Standardised steps that have a successor."""
+    """Standardised steps that have a successor: N logged observations (N, O), the `rest` of the
+    state, the action and the next one (N, R), and rewards of the step and the next one (N, 2)."""
 
-    columns: Float32Array
-    """(N, O) logged observations."""
-    rest: Float32Array
-    """(N, R) the rest of the state, the action and the next one."""
-    rewards: Float32Array
-    """(N, 2) of the step and of the next one."""
-    episodes: IntArray
-    held_out: BoolArray
-    """(N,)."""
-
-    @classmethod
-    def of(cls, view: EpisodeStore, most: int, seed: int) -> "_Steps":
-        episodes, steps = steps_with_successor(view, most, seed)
-        now = view.transitions(episodes, steps)
-        then = view.transitions(episodes, steps + 1)
-        size = view.observation_size
-        others = now.states[:, : now.states.shape[1] - size]
-        return cls(
-            columns=standardise(now.states[:, -size:]).numpy(),
-            rest=standardise(torch.cat([others, now.actions, then.actions], dim=1)).numpy(),
-            rewards=standardise(torch.stack([now.rewards, then.rewards], dim=1)).numpy(),
-            episodes=episodes,
-            held_out=held_out_steps(view, episodes),
-        )
+    def __init__(self, view: EpisodeStore, most: int, seed: int) -> None:
+        self.episodes, steps = steps_with_successor(view, most, seed)
+        now = view.transitions(self.episodes, steps)
+        then = view.transitions(self.episodes, steps + 1)
+        others, observed = now.states.tensor_split([-view.observation_size], dim=1)
+        self.columns = standardise(observed).numpy()
+        self.rest = standardise(torch.cat([others, now.actions, then.actions], dim=1)).numpy()
+        self.rewards = standardise(torch.stack([now.rewards, then.rewards], dim=1)).numpy()
+        self.held_out = held_out_steps(view, self.episodes)
 
 
 def _measures(

@@ -1,19 +1,14 @@
-"""What a session was shown lately, as terms added to the logits of the items that resemble it."""
+"""Terms added to the logits of items that resemble what a session was shown lately."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ucfrec import schema
-from ucfrec.arrays import Float32Array, Float64Array, IntArray
+from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.windows import Windows
-
-if TYPE_CHECKING:
-    from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Exposed
 
 GAIN = 10.0
 """Factor on the learned weights: thousands of small updates must be able to rule an item out."""
@@ -21,93 +16,6 @@ _DENSE = 2**24
 """Entries of the largest matrix of items and tags that is kept dense, which is faster."""
 _FEW_TAGS = 256
 """Tags up to which a dense matrix of the tags of some items is faster than a sparse one."""
-
-
-class Shown(NamedTuple):
-    """What B sessions showed before a step."""
-
-    items: Tensor
-    """(B, N) int64, most recent first; −1 before the session or window began."""
-    rewards: Tensor
-    """(B, N) in reward units; 0 where there is no item."""
-
-    @classmethod
-    def before_last(cls, windows: Windows) -> "Shown":
-        """What windows of K steps show before their last one, N = K − 1."""
-        items = windows.actions.masked_fill(~windows.mask, -1)
-        return cls(items[:, :-1].flip(1), windows.rewards[:, :-1].flip(1))
-
-    @classmethod
-    def before(
-        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, length: int
-    ) -> "Shown":
-        """What sessions of a store showed in the `length` steps before the given ones.
-
-        Args:
-            store: of items; an unknown item (−1) counts as the first.
-            episodes: (B,) sessions.
-            steps: (B,) steps of them, from 0.
-            length: N.
-        """
-        earlier = steps[:, None] - np.arange(1, length + 1)
-        missing, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
-        items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
-        rewards = store.step_values(schema.REWARD, *places)
-        return cls(
-            torch.from_numpy(np.where(missing, -1, items)),
-            torch.from_numpy(np.where(missing, np.float32(0), rewards)),
-        )
-
-    def at(self, rows: slice | int | Tensor) -> "Shown":
-        """The sessions with the given numbers."""
-        return Shown(self.items[rows], self.rewards[rows])
-
-    def latest(self, steps: int) -> "Shown":
-        """What was shown in the latest `steps` of these."""
-        return Shown(self.items[:, :steps], self.rewards[:, :steps])
-
-
-@dataclass(frozen=True)
-class Exposed:
-    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
-
-    items: Tensor
-    """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
-    rewards: Tensor
-    """(M, N) their rewards, in reward units."""
-    returns: Tensor
-    """(M,) returns-to-go in units of the policy's return scale."""
-
-    @classmethod
-    def before(cls, windows: Windows, lags: int) -> "Exposed":
-        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
-
-        Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
-        """
-        items = windows.actions.masked_fill(~windows.mask, -1)
-        returns = windows.returns_to_go.flatten()
-        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
-
-    @classmethod
-    def before_last(cls, windows: Windows, lags: int) -> "Exposed":
-        """For the last step of B windows, as `before`, (B, lags)."""
-        recent = Shown.before_last(windows.last(lags + 1))
-        missing = lags - recent.items.shape[1]
-        return cls(
-            nn.functional.pad(recent.items, (0, missing), value=-1),
-            nn.functional.pad(recent.rewards, (0, missing)),
-            windows.returns_to_go[:, -1],
-        )
-
-    def select(self, rows: Tensor) -> "Exposed":
-        """The steps with the given indices, or where a bool mask of the M steps is true."""
-        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
-
-
-def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
-    """Values (B·K, lags) of the steps before each of (B, K), most recent first."""
-    padded = nn.functional.pad(values, (lags, 0), value=padding)[:, :-1]
-    return padded.unfold(1, lags, 1).flip(-1).flatten(0, 1)
 
 
 class Likeness(nn.Module):

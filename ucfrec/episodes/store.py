@@ -1,6 +1,8 @@
-"""EpisodeStore: memory-mapped episodes, gathered as windows or single transitions."""
+"""EpisodeStore: memory-mapped episodes, gathered as windows or single transitions; and the rows
+of the users of a later store in both."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -11,21 +13,26 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
-from ucfrec.episodes.writer import require_finite, require_steps, write_arrays
+from ucfrec.episodes.writer import StoreWriter, require_finite, require_steps
 from ucfrec.errors import InputError
+from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import read_ids
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-__all__ = ["ITEM_STATES", "EpisodeStore", "store_frame"]
+__all__ = ["ITEM_STATES", "EpisodeStore"]
 
+LONG: Final = 100
+"""Times the median from which on a session is hardly a person's."""
+LONGEST_HISTORY: Final = 1000
+"""Most recent rows of a user that are read; older ones only count as seen."""
 _STATISTICS_STEPS = 100_000
 _FILES: Final = {schema.ITEM_ID: "items.parquet", schema.USER_ID: "users.parquet"}
 _PLAIN: Final = (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY, schema.IS_RANDOM)
@@ -74,8 +81,15 @@ class EpisodeStore(EpisodeView):
             InputError: `path` exists already, an episode has no steps, columns differ in length, or
                 rewards are not finite.
         """
-        values = _with_split(episodes, lengths)
-        write_arrays(path, steps, lengths, values, reward, source or {}, shard_steps)
+        lengths = require_steps(path, lengths)
+        first = np.zeros(int(np.sum(lengths)), dtype=bool)
+        first[np.cumsum(lengths) - lengths] = True
+        columns = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+        repeated = {name: np.repeat(values, lengths) for name, values in columns.items()}
+        with atomic_folder(path) as scratch:
+            writer = StoreWriter(scratch, shard_steps)
+            writer.append(steps, first, repeated)
+            writer.finish(reward=reward, source=source or {})
         return cls.open(path)
 
     @classmethod
@@ -89,26 +103,64 @@ class EpisodeStore(EpisodeView):
         """Make a store in memory, without files.
 
         Args:
-            steps: step columns of `ucfrec.schema`, each (N,) or (N, size).
-            lengths: (E,) number of steps of each episode, at least 1, with sum N.
-            episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
-                are in the training split.
+            steps, lengths, episodes: as of `write`.
             item_states: builds states from items; required if actions are items.
 
         Raises:
-            InputError: an episode has no steps, columns differ in length, or rewards are not
-                finite.
+            InputError: as `write`.
         """
         lengths = require_steps("a store in memory", lengths)
         require_finite(steps[schema.REWARD])
-        values = _with_split(episodes, lengths)
-        return cls(Columns.from_arrays(steps, lengths, values, item_states))
+        columns = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+        return cls(Columns.from_arrays(steps, lengths, columns, item_states))
 
     # For notebooks.
 
     def to_frame(self) -> "pd.DataFrame":
-        """One row per step, with the identifiers of the logs; see `store_frame`."""
-        return store_frame(self)
+        """One row per step, session by session: `user_id`, `session_id` (the number of the session
+        in the store; one for all episodes of a session that a split boundary cuts), `item_id` or
+        `action`, the other columns of the log that the store has, and `split`.
+
+        Raises:
+            InputError: a file of the store is damaged.
+        """
+        import pandas as pd  # most stores are never shown
+
+        episodes, steps = self.all_steps()
+        columns: dict[str, Any] = {}
+        if self.has_users:
+            users = self.episode_values(schema.USER)[episodes]
+            columns[schema.USER_ID] = self._read_ids(schema.USER_ID, users)
+        columns[schema.SESSION_ID] = self._number_sessions()[episodes]
+        if self.has_items:
+            items = self.step_values(schema.ITEM, episodes, steps)
+            columns[schema.ITEM_ID] = self._read_ids(schema.ITEM_ID, items)
+        for name in (*_PLAIN, *_LISTS):
+            if name in self.record.columns:
+                values = self.step_values(name, episodes, steps)
+                columns[name] = list(values) if name in _LISTS else values
+        splits = self.episode_values(schema.SPLIT)[episodes]
+        columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
+        return pd.DataFrame(columns)
+
+    def _number_sessions(self) -> IntArray:
+        """(E,) number of each episode's session, which is that of its first episode."""
+        numbers = self.episode_ids
+        has_ends = self.has_episode_values(schema.TERMINATED)
+        if not (self.has_users and has_ends) or len(self) < 2:
+            return numbers
+        users, splits, ended = (
+            self.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
+        )
+        goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
+        goes_on &= np.diff(numbers) == 1
+        first = np.concatenate([[True], ~goes_on])
+        return np.asarray(numbers[first][np.cumsum(first) - 1])
+
+    def _read_ids(self, column: str, numbers: IntArray) -> Array:
+        """Identifiers of the logs; the numbers themselves in a store without their table."""
+        path = self.path / _FILES[column]
+        return read_ids(path, column)[numbers] if path.exists() else numbers
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """Histogram of the episodes' returns on matplotlib axes."""
@@ -135,11 +187,7 @@ class EpisodeStore(EpisodeView):
     # Views.
 
     def select(self, episodes: IntArray) -> "EpisodeStore":
-        """A view of the episodes at the given positions of this view, in the given order.
-
-        Args:
-            episodes: positions, 0 to E − 1, of any number.
-        """
+        """A view of the episodes at the given positions of this view, in the given order."""
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
@@ -155,6 +203,15 @@ class EpisodeStore(EpisodeView):
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
         in_split = self.episode_values(schema.SPLIT) == schema.SPLITS.index(name)
         return self.select(np.flatnonzero(in_split))
+
+    def without_long_sessions(self) -> "EpisodeStore":
+        """The view without sessions of more than `LONG` times the median number of steps.
+
+        One session of thousands of steps would otherwise set the largest target return, be a good
+        part of the rows that the user model is fitted to, and let simulated sessions go on as long.
+        """
+        usual = self.lengths <= LONG * np.median(self.lengths) if len(self) else np.array([True])
+        return self if usual.all() else self.select(np.flatnonzero(usual))
 
     @cached_property
     def whole(self) -> "EpisodeStore":
@@ -184,11 +241,7 @@ class EpisodeStore(EpisodeView):
         return self.with_returns_to_go(definition.of_logs(rewards, offsets), definition)
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
-        """A view of the same episodes without some dimensions of the observations.
-
-        Args:
-            dimensions: to remove, each 0 to O − 1.
-        """
+        """A view of the same episodes without some dimensions of the observations, 0 to O − 1."""
         rest = np.setdiff1d(np.arange(self.observation_size), dimensions)
         column = self._columns.step_column(schema.OBSERVATION).select_dimensions(rest)
         columns = self._columns.replace(schema.OBSERVATION, column, (len(rest),), None)
@@ -213,56 +266,192 @@ class EpisodeStore(EpisodeView):
         return mean.float(), variance.sqrt().float()
 
 
-def _with_split(episodes: Mapping[str, Array] | None, lengths: IntArray) -> dict[str, Array]:
-    return {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
+# Two stores.
 
 
-def store_frame(store: EpisodeStore) -> "pd.DataFrame":
-    """One row per step, session by session: `user_id`, `session_id` (the number of the session in
-    the store; one for all episodes of a session that a split boundary cuts), `item_id` or `action`,
-    the other columns of the log that the store has, and `split`.
+@dataclass(frozen=True)
+class UserRows:
+    """R rows of the users of a later log, earlier rows too, by user and time."""
 
-    Raises:
-        InputError: a file of the store is damaged.
+    later: EpisodeStore
+    """The later log, with N steps."""
+    earlier: EpisodeStore | None
+    source: IntArray
+    """(R,) index of each row among the steps of `later`, or −1 less its index among those of
+    `earlier`."""
+    first: IntArray
+    """(N,) first row of the user of each later step."""
+    place: IntArray
+    """(N,) row of each later step."""
+
+    @classmethod
+    def of(cls, later: EpisodeStore, users: Array, earlier: EpisodeStore | None) -> "UserRows":
+        """Collect the rows.
+
+        Args:
+            users: (E,) identifier of the user of each of its episodes.
+            earlier: a store with the same numbers of users and items; rows that are not before the
+                user's first later row are left out. None for none.
+        """
+        owners = np.unique(users, return_inverse=True)[1]
+        episodes, steps = later.all_steps()
+        owner, source = owners[episodes], np.arange(len(steps))
+        times = _times(later, episodes, steps)
+        if earlier is not None and later.has_users and earlier.has_users:
+            begins = np.full(len(users), np.iinfo(np.int64).max)
+            np.minimum.at(begins, owner, times)
+            users_earlier = later.episode_values(schema.USER).astype(np.int64)
+            more = _earlier_rows(earlier, users_earlier, owners, begins)
+            owner, times, source = (
+                np.concatenate(pair) for pair in zip(more, (owner, times, source), strict=True)
+            )
+        order = np.lexsort((times, owner))
+        place = np.empty(len(steps), dtype=np.int64)
+        rows = np.flatnonzero(source[order] >= 0)
+        place[source[order][rows]] = rows
+        first = np.searchsorted(owner[order], owner[order][place])
+        return cls(later, earlier, source[order], first, place)
+
+    def values(self, name: str, rows: IntArray) -> Array:
+        """Values of a step column at rows of any shape."""
+        return _join(name, self.later, self.earlier, self.source[rows])
+
+    def recent(self, steps: IntArray, count: int) -> tuple[IntArray, Float32Array]:
+        """The items and rewards (B, count) of the user's latest rows before later steps (B,),
+        most recent first; −1 and 0 where there are fewer."""
+        rows = self.place[steps][:, None] - np.arange(1, count + 1)
+        missing = rows < self.first[steps][:, None]
+        rows = np.maximum(rows, 0)
+        items = np.where(missing, -1, self.values(schema.ITEM, rows)).astype(np.int64)
+        rewards = np.where(missing, 0, self.values(schema.REWARD, rows)).astype(np.float32)
+        return items, rewards
+
+    def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
+        """(rows, items), each (M,): the known items in all rows of the user before later steps
+        (B,); `rows` are indices into the B."""
+        first, counts = self.first[steps], self.place[steps] - self.first[steps]
+        owner = np.repeat(np.arange(len(steps)), counts)
+        inside = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+        items = self.values(schema.ITEM, first[owner] + inside).astype(np.int64)
+        return owner[items >= 0], items[items >= 0]
+
+    def continued(self, gap_ms: float | None) -> EpisodeStore:
+        """The later log, with the rows before it in the sessions that go on in it.
+
+        These rows are known but are not steps of the view: `all_steps` leaves them out.
+
+        Args:
+            gap_ms: pause (ms) that ends a session; None if a session is all of a user.
+        """
+        if self.earlier is None:
+            return self.later
+        begin = self.place[np.cumsum(self.later.lengths) - self.later.lengths]
+        counts = np.minimum(begin - self._begins(begin, gap_ms), LONGEST_HISTORY)
+        if not counts.any():
+            return self.later
+        return EpisodeStore(_ContinuedColumns(self, begin, counts))
+
+    def _begins(self, begin: IntArray, gap_ms: float | None) -> IntArray:
+        """(E,) row at which the session of each later episode begins, whose first row is `begin`:
+        an earlier row, or the same."""
+        breaks = np.ones(len(self.source), dtype=bool)
+        inside = np.arange(1, len(self.source))
+        times = self.values(schema.TIMESTAMP, np.arange(len(self.source))).astype(np.int64)
+        pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
+        breaks[1:] = pause | (self.source[inside - 1] >= 0)
+        breaks[np.unique(self.first)] = True
+        starts = np.flatnonzero(breaks)
+        return np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
+
+
+def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray:
+    if schema.TIMESTAMP not in store.record.columns:
+        return np.arange(len(steps))
+    return store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
+
+
+def _earlier_rows(
+    earlier: EpisodeStore, users_earlier: IntArray, owners: IntArray, begins: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Owner, time (ms) and source of the earlier rows of users, in the order of the store.
+
+    Args:
+        users_earlier: (E,) its number of the user of each later episode; −1 for others.
+        owners: (E,) that user's number among the later ones.
+        begins: (U,) time at which the user's later rows begin.
     """
-    import pandas as pd  # most stores are never shown
-
-    episodes, steps = store.all_steps()
-    columns: dict[str, Any] = {}
-    if store.has_users:
-        users = store.episode_values(schema.USER)[episodes]
-        columns[schema.USER_ID] = _named(store, schema.USER_ID, users)
-    columns[schema.SESSION_ID] = _sessions(store)[episodes]
-    if store.has_items:
-        items = store.step_values(schema.ITEM, episodes, steps)
-        columns[schema.ITEM_ID] = _named(store, schema.ITEM_ID, items)
-    for name in _PLAIN:
-        if name in store.record.columns:
-            columns[name] = store.step_values(name, episodes, steps)
-    for name in _LISTS:
-        if name in store.record.columns:
-            columns[name] = list(store.step_values(name, episodes, steps))
-    splits = store.episode_values(schema.SPLIT)[episodes]
-    columns[schema.SPLIT] = np.asarray(schema.SPLITS, dtype=object)[splits]
-    return pd.DataFrame(columns)
+    numbers = np.full(max(int(users_earlier.max(initial=-1)), 0) + 2, -1)
+    numbers[users_earlier[users_earlier >= 0]] = owners[users_earlier >= 0]
+    users = earlier.episode_values(schema.USER).astype(np.int64)
+    owner_of = numbers[np.where((users >= 0) & (users < len(numbers) - 1), users, -1)]
+    parts = []
+    taken = 0
+    for episodes, steps in earlier.step_batches():
+        owner = owner_of[episodes]
+        candidates = np.flatnonzero(owner >= 0)
+        times = _times(earlier, episodes[candidates], steps[candidates])
+        is_earlier = times < begins[owner[candidates]]
+        rows = candidates[is_earlier]
+        parts.append((owner[rows], times[is_earlier], -1 - (taken + rows)))
+        taken += len(steps)
+    owner, times, source = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return owner, times, source
 
 
-def _sessions(store: EpisodeStore) -> IntArray:
-    """(E,) number of each episode's session, which is that of its first episode."""
-    numbers = store.episode_ids
-    has_ends = store._columns.has_episode_column(schema.TERMINATED)
-    if not (store.has_users and has_ends) or len(store) < 2:
-        return numbers
-    users, splits, ended = (
-        store.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
-    )
-    goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
-    goes_on &= np.diff(numbers) == 1
-    first = np.concatenate([[True], ~goes_on])
-    return np.asarray(numbers[first][np.cumsum(first) - 1])
+def _join(name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray) -> Array:
+    """Values of a step column at sources of any shape; see `UserRows.source`."""
+    values = later.step_values(name, *later.locate(np.maximum(source, 0)))
+    is_earlier: BoolArray = source < 0
+    if earlier is not None and is_earlier.any():
+        values[is_earlier] = earlier.step_values(name, *earlier.locate(-1 - source[is_earlier]))
+    return values
 
 
-def _named(store: EpisodeStore, column: str, numbers: IntArray) -> Array:
-    """Identifiers of the logs; the numbers themselves in a store without their table."""
-    path = store.path / _FILES[column]
-    return read_ids(path, column)[numbers] if path.exists() else numbers
+class _JoinedColumn(StepColumn):
+    """A step column of rows that lie in two stores."""
+
+    def __init__(self, rows: UserRows, name: str, source: IntArray) -> None:
+        super().__init__([])
+        self._rows, self._name, self._source = rows, name, source
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def take(self, index: IntArray) -> Array:
+        """A copy of the values at the indices `index`, of any shape."""
+        return _join(self._name, self._rows.later, self._rows.earlier, self._source[index])
+
+    def between(self, begin: int, end: int) -> Array:
+        """The values from index `begin` to before `end`."""
+        return self.take(np.arange(begin, end))
+
+
+class _ContinuedColumns(Columns):
+    """The columns of later episodes, each with the earlier rows of its session before it."""
+
+    def __init__(self, rows: UserRows, begin: IntArray, counts: IntArray) -> None:
+        """
+        Args:
+            begin: (E,) row of the first step of each later episode.
+            counts: (E,) rows before it that belong to the session.
+        """
+        later = rows.later
+        lengths = later.lengths + counts
+        offsets = np.concatenate([[0], np.cumsum(lengths)])
+        inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
+        numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
+        source = np.where(
+            inside >= 0, numbers, rows.source[np.repeat(begin, lengths) + inside.clip(max=0)]
+        )
+        rewards = _join(schema.REWARD, later, rows.earlier, source)
+        arrays = {
+            name: later.episode_values(name)
+            for name in schema.EPISODE_DTYPES
+            if later.has_episode_values(name)
+        }
+        arrays |= {schema.OFFSETS: offsets, schema.RETURN_TO_GO: returns_to_go(rewards, offsets)}
+        sizes = {"n_steps": len(source), "n_episodes": len(lengths), "n_shards": 0}
+        record = later.record.copy_with(**sizes)
+        super().__init__(later.path, record, arrays, later.item_states)
+        self.skipped = counts
+        self._steps = {name: _JoinedColumn(rows, name, source) for name in record.columns}

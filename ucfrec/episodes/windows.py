@@ -1,10 +1,26 @@
-"""Batches gathered from a store: windows and transitions."""
+"""What policies read: windows of a store, of running sessions and of augmented episodes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from ucfrec import schema
+from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.episodes.states import ItemStates
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import load_tensors, save_tensors
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
+
+AUGMENTED: Final = "augmented.safetensors"
+"""Name of the file of a run."""
 
 
 @dataclass(frozen=True)
@@ -104,3 +120,432 @@ class Transitions:
     def __repr__(self) -> str:
         (steps, size), action = self.states.shape, self.actions.shape[1]
         return f"Transitions({steps:,} steps, states of {size}, actions of {action})"
+
+
+class Shown(NamedTuple):
+    """What B sessions showed before a step."""
+
+    items: Tensor
+    """(B, N) int64, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(B, N) in reward units; 0 where there is no item."""
+
+    @classmethod
+    def before_last(cls, windows: Windows) -> "Shown":
+        """What windows of K steps show before their last one, N = K − 1."""
+        items = windows.actions.masked_fill(~windows.mask, -1)
+        return cls(items[:, :-1].flip(1), windows.rewards[:, :-1].flip(1))
+
+    @classmethod
+    def before(
+        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, length: int
+    ) -> "Shown":
+        """What sessions of a store showed in the `length` steps before the given ones.
+
+        Args:
+            store: of items; an unknown item (−1) counts as the first.
+            episodes: (B,) sessions.
+            steps: (B,) steps of them, from 0.
+            length: N.
+        """
+        earlier = steps[:, None] - np.arange(1, length + 1)
+        missing, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
+        items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
+        rewards = store.step_values(schema.REWARD, *places)
+        return cls(
+            torch.from_numpy(np.where(missing, -1, items)),
+            torch.from_numpy(np.where(missing, np.float32(0), rewards)),
+        )
+
+    def at(self, rows: slice | int | Tensor) -> "Shown":
+        """The sessions with the given numbers."""
+        return Shown(self.items[rows], self.rewards[rows])
+
+    def latest(self, steps: int) -> "Shown":
+        """What was shown in the latest `steps` of these."""
+        return Shown(self.items[:, :steps], self.rewards[:, :steps])
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """The items shown before each of M steps with their rewards, and the step's return-to-go."""
+
+    items: Tensor
+    """(M, N) int64 items shown, most recent first; −1 before the session or window began."""
+    rewards: Tensor
+    """(M, N) their rewards, in reward units."""
+    returns: Tensor
+    """(M,) returns-to-go in units of the policy's return scale."""
+
+    @classmethod
+    def before(cls, windows: Windows, lags: int) -> "Exposed":
+        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
+
+        Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
+        """
+        items = windows.actions.masked_fill(~windows.mask, -1)
+        returns = windows.returns_to_go.flatten()
+        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+
+    @classmethod
+    def before_last(cls, windows: Windows, lags: int) -> "Exposed":
+        """For the last step of B windows, as `before`, (B, lags)."""
+        recent = Shown.before_last(windows.last(lags + 1))
+        missing = lags - recent.items.shape[1]
+        return cls(
+            nn.functional.pad(recent.items, (0, missing), value=-1),
+            nn.functional.pad(recent.rewards, (0, missing)),
+            windows.returns_to_go[:, -1],
+        )
+
+    def select(self, rows: Tensor) -> "Exposed":
+        """The steps with the given indices, or where a bool mask of the M steps is true."""
+        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
+
+
+def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
+    """Values (B·K, lags) of the steps before each of (B, K), most recent first."""
+    padded = nn.functional.pad(values, (lags, 0), value=padding)[:, :-1]
+    return padded.unfold(1, lags, 1).flip(-1).flatten(0, 1)
+
+
+@dataclass(frozen=True)
+class Sessions:
+    """B sessions, each before the step to decide."""
+
+    actions: Tensor
+    """(B, L) int64 items shown, the latest last, −1 before the session began; or (B, L, A) float32
+    vectors."""
+    rewards: Tensor
+    """(B, L) float32 their rewards, in reward units; 0 before the session began."""
+    steps: Tensor
+    """(B,) int64 number of steps that the session has had, which may be more than L."""
+    collected: Tensor
+    """(B,) float64 sum of all rewards of the session."""
+    users: Tensor
+    """(B,) int64 numbers of the users in the training logs, −1 for others."""
+    observations: Tensor | None = None
+    """(B, K, O) float32 of the last K steps or more, the one to decide included; None without
+    any."""
+    states: Tensor | None = None
+    """(B, K, S) float32 of the last K steps or more, where they are known; None to build them."""
+
+    @classmethod
+    def begun(cls, count: int, length: int, vector_size: int = 0) -> "Sessions":
+        """Sessions of unknown users without a step.
+
+        Args:
+            count: B.
+            length: L.
+            vector_size: A; 0 for items.
+        """
+        actions = torch.full((count, length), -1)
+        if vector_size:
+            actions = torch.zeros(count, length, vector_size)
+        steps = torch.zeros(count, dtype=torch.int64)
+        return cls(actions, torch.zeros(count, length), steps, steps.double(), steps - 1)
+
+    @classmethod
+    def from_rows(
+        cls,
+        owner: IntArray,
+        items: IntArray,
+        rewards: Float32Array,
+        users: IntArray,
+        length: int,
+        observations: Tensor | None = None,
+    ) -> "Sessions":
+        """The sessions with the given N rows.
+
+        Args:
+            owner: (N,) session of each row, 0 to B − 1; sorted.
+            items: (N,) items shown, in order.
+            rewards: (N,) their rewards.
+            users: (B,) see above.
+            length: L, items of a session that are kept.
+            observations: (B, K, O) see above.
+        """
+        counts = np.bincount(owner, minlength=len(users))
+        # Places from the end: the latest row is the last column.
+        places = np.arange(len(owner)) - np.cumsum(counts)[owner] + length
+        recent = places >= 0
+        at = owner[recent], places[recent]
+        recent_items = np.full((len(users), length), -1)
+        received = np.zeros((len(users), length), dtype=np.float32)
+        recent_items[at], received[at] = items[recent], rewards[recent]
+        collected = np.bincount(owner, rewards, minlength=len(users)).astype(np.float64)
+        return cls(
+            torch.from_numpy(recent_items),
+            torch.from_numpy(received),
+            torch.from_numpy(counts),
+            torch.from_numpy(collected),
+            torch.from_numpy(users),
+            observations,
+        )
+
+    @classmethod
+    def from_store(
+        cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, context: int, length: int
+    ) -> "Sessions":
+        """What was known before steps of a store of items.
+
+        Args:
+            store: the logs, with the training's items. An item −1 is unknown; any known item can
+                replace it, because steps after it have weight 0 in all estimates.
+            episodes: (B,) sessions.
+            steps: (B,) steps of those sessions, from 0.
+            context: K, most states that are read.
+            length: L, items that are read one by one; as many as the context has in any case.
+        """
+        context = min(context, int(steps.max(initial=0)) + 1)
+        recent = Shown.before(store, episodes, steps, max(length, context - 1))
+        users = np.full(len(steps), -1)
+        if store.has_users:
+            users = store.episode_values(schema.USER).astype(np.int64)[episodes]
+        return cls(
+            recent.items.flip(1),
+            recent.rewards.flip(1),
+            torch.from_numpy(steps),
+            torch.from_numpy(store.rewards_before(episodes, steps)),
+            torch.from_numpy(users),
+            states=store.windows(episodes, steps, context).states,
+        )
+
+    def at(self, rows: slice | IntArray | Tensor) -> "Sessions":
+        """The sessions with the given numbers."""
+        values = (getattr(self, part.name) for part in fields(self))
+        return Sessions(*(None if value is None else value[rows] for value in values))  # type: ignore[arg-type]
+
+    def begin(self, rows: IntArray) -> None:
+        """Let new sessions begin at the positions `rows`, of whichever users there are."""
+        self.actions[rows] = -1
+        for values in (self.rewards, self.steps, self.collected):
+            values[rows] = 0
+
+    def with_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
+        """The sessions after one more step: actions (B,) or (B, A), and their rewards (B,)."""
+        received = rewards.float()  # rounded like the store's, for bit-identical states
+        return replace(
+            self,
+            actions=torch.cat([self.actions[:, 1:], actions.unsqueeze(1)], dim=1),
+            rewards=torch.cat([self.rewards[:, 1:], received.unsqueeze(1)], dim=1),
+            steps=self.steps + 1,
+            collected=self.collected + received,
+        )
+
+    @cached_property
+    def shown(self) -> Shown:
+        """The items shown, the latest first."""
+        return Shown(self.actions.flip(1), self.rewards.flip(1))
+
+    def latest_states(self, states: ItemStates, observations: Tensor) -> Tensor:
+        """States (B, S) before the steps to decide, whose observations are (B, O)."""
+        recent = self.actions[:, -states.window :], self.rewards[:, -states.window :]
+        steps = self.steps.unsqueeze(1)
+        return states.build(*recent, steps, self.users, observations.unsqueeze(1))[:, 0]
+
+    def windows(self, states: ItemStates | None, context: int) -> Windows:
+        """What policies read: windows of at most `context` = K steps that end with the step to
+        decide, which has neither an action nor a reward yet, nor returns-to-go.
+
+        Args:
+            states: builds the states of items, where they are not known; L must then be at least
+                K − 1 + its window.
+            context: K; L must be at least K − 1.
+        """
+        vectors = self.actions.ndim == 3
+        if not (vectors or torch.compiler.is_exporting()):
+            # No policy's outputs depend on how much padding is before a session.
+            context = min(context, int(self.steps.max()) + 1)
+        numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
+        if self.states is None:
+            assert states is not None
+            window_states = self._build_states(states, numbers.clamp(min=0))
+        else:
+            window_states = self.states[:, -context:]
+        first = self.actions.shape[1] - context + 1
+        return Windows.of(
+            numbers,
+            window_states,
+            nn.functional.pad(self.actions[:, first:], (0, 0, 0, 1) if vectors else (0, 1)),
+            nn.functional.pad(self.rewards[:, first:], (0, 1)),
+        )
+
+    def _build_states(self, states: ItemStates, steps: Tensor) -> Tensor:
+        """States (B, K, S) of steps (B, K), the last ones."""
+        context = steps.shape[1]
+        reach = context - 1 + states.window
+        items, rewards = self.actions[:, -reach:], self.rewards[:, -reach:]
+        if self.observations is None:
+            observations = rewards.new_zeros(items.shape[0], context, 0)
+        else:
+            observations = self.observations[:, -context:]
+        return states.build(items, rewards, steps, self.users, observations)
+
+
+def seen_before(store: "EpisodeStore", episodes: IntArray, steps: IntArray) -> Tensor:
+    """(B, n_items) bool: the known items that sessions (B,) showed before steps (B,)."""
+    rows, items = store.items_before(episodes, steps)
+    seen = torch.zeros(len(steps), len(store.item_states.embeddings), dtype=torch.bool)
+    seen[torch.from_numpy(rows[items >= 0]), torch.from_numpy(items[items >= 0])] = True
+    return seen
+
+
+def _no_integers() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class AugmentedEpisodes:
+    """Counterfactual episodes of a store, kept as what differs from the logged ones.
+
+    C copies have other states at some steps: rewards, actions, returns-to-go and next states are
+    those of the source (paper appendix H). N action copies end with another action: the source up
+    to some step, at which another action had another reward. Kept whole, the states of a copy
+    would take S times the memory of its log, and an action copy K states for its one step.
+    """
+
+    copy_source: IntArray
+    """(C,) number in the store of the episode that was copied."""
+    edit_copy: IntArray
+    """(M,) number of the copy, 0 to C − 1, that each edit belongs to."""
+    edit_step: IntArray
+    """(M,) step of the episode that each edit changes; (copy, step) is strictly increasing."""
+    edit_state: Float32Array
+    """(M, S) counterfactual states."""
+    action_source: IntArray = field(default_factory=_no_integers)
+    """(N,) number in the store of the episode that an action copy is of."""
+    action_step: IntArray = field(default_factory=_no_integers)
+    """(N,) step of the episode with the other action, the last of the copy."""
+    action: Array = field(default_factory=_no_integers)
+    """(N,) int64 items or (N, A) float32 vectors: the other actions."""
+    action_reward: Float32Array = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
+    """(N,) their rewards, in reward units."""
+
+    def __repr__(self) -> str:
+        edits, size = self.edit_state.shape
+        return (
+            f"AugmentedEpisodes({len(self.copy_source):,} copies, {edits:,} edited states of "
+            f"{size}, {len(self.action_source):,} action copies)"
+        )
+
+    def join(self, other: "AugmentedEpisodes") -> "AugmentedEpisodes":
+        """These episodes, followed by those of `other`."""
+        renumbered = replace(other, edit_copy=other.edit_copy + len(self.copy_source))
+        values = {}
+        for name in (column.name for column in fields(self)):
+            parts = [getattr(self, name), getattr(renumbered, name)]
+            # Without action copies, the size of an action is not known.
+            values[name] = np.concatenate([part for part in parts if len(part)] or parts[:1])
+        return AugmentedEpisodes(**values)
+
+    def save(self, path: Path) -> None:
+        """Write to one safetensors file, atomically."""
+        arrays = {f.name: torch.from_numpy(getattr(self, f.name)) for f in fields(self)}
+        save_tensors(path, arrays, {})
+
+    @classmethod
+    def load(cls, path: Path, store: "EpisodeStore") -> "AugmentedEpisodes":
+        """Read a file that `save` wrote, of episodes of `store` or the store that it is a view of.
+
+        Raises:
+            InputError: the file is missing or damaged, or the episodes are of another store.
+        """
+        tensors, _ = load_tensors(path)
+        with damage_explained(path, f"train again with {store.path}, or the store it was made of"):
+            episodes = cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
+            episodes._require_of(store)
+        return episodes
+
+    def _require_of(self, store: "EpisodeStore") -> None:
+        """Raise ValueError for arrays whose types, shapes and numbers are not of one store."""
+        numbers = {
+            **{"copy_source": self.copy_source, "edit_copy": self.edit_copy},
+            **{"edit_step": self.edit_step, "action_source": self.action_source},
+            "action_step": self.action_step,
+        }
+        for name, values in numbers.items():
+            if values.dtype != np.int64 or values.ndim != 1:
+                raise ValueError(f"{name} is no list of int64")
+        edits, copies = len(self.edit_copy), len(self.action_source)
+        if len(self.edit_step) != edits or self.edit_state.shape != (edits, store.state_size):
+            raise ValueError("its edits differ in number, or its states in size")
+        if len(self.action_step) != copies or self.action_reward.shape != (copies,):
+            raise ValueError("its action copies differ in number")
+        if {self.edit_state.dtype, self.action_reward.dtype} != {np.dtype(np.float32)}:
+            raise ValueError("its states or rewards are not float32")
+        _require_below(self.copy_source, store.record.n_episodes, "an episode")
+        _require_below(self.action_source, store.record.n_episodes, "an episode")
+        _require_below(self.edit_copy, len(self.copy_source), "a copy")
+        lengths = store.whole.lengths
+        _require_below(self.edit_step, lengths[self.copy_source[self.edit_copy]], "a step")
+        _require_below(self.action_step, lengths[self.action_source], "a step")
+        shape = () if store.has_items else tuple(store.record.columns[schema.ACTION])
+        kind = np.int64 if store.has_items else np.float32
+        if copies and (self.action.dtype != kind or self.action.shape != (copies, *shape)):
+            raise ValueError("its actions have another type or size")
+        if store.has_items:
+            _require_below(self.action, len(store.item_states.embeddings), "an item")
+
+
+def _require_below(numbers: Array, ends: IntArray | int, what: str) -> None:
+    if ((numbers < 0) | (numbers >= ends)).any():
+        raise ValueError(f"it names {what} that there is not")
+
+
+class TrainingEpisodes:
+    """E logged episodes, then C augmented ones with other states, then N action copies.
+
+    Only the last step of an action copy is drawn: those before it are its source's.
+    """
+
+    def __init__(self, logged: "EpisodeStore", augmented: AugmentedEpisodes) -> None:
+        self._augmented, self._n_logged = augmented, logged.n_episodes
+        self._sources = logged.whole.select(
+            np.concatenate([logged.episode_ids, augmented.copy_source, augmented.action_source])
+        )
+        self._first_action_copy = self._n_logged + len(augmented.copy_source)
+        lengths, counts = self._sources.lengths.copy(), self._sources.lengths.copy()
+        lengths[self._first_action_copy :] = augmented.action_step + 1
+        counts[self._first_action_copy :] = 1
+        self._ends = np.cumsum(counts)
+        # The step at which an episode ends, less the number of its last drawn step.
+        self._begins = self._ends - lengths
+        self._stride = int(augmented.edit_step.max(initial=0)) + 1
+        keys = augmented.edit_copy * self._stride + augmented.edit_step
+        # A sentinel, so that every search ends inside.
+        self._keys = np.append(keys, np.iinfo(np.int64).max)
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps that are drawn."""
+        return int(self._ends[-1])
+
+    def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
+        """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""
+        numbers = generator.integers(self.n_steps, size=count)
+        episodes = np.searchsorted(self._ends, numbers, side="right")
+        return episodes, numbers - self._begins[episodes]
+
+    def windows(self, episodes: IntArray, ends: IntArray, length: int) -> Windows:
+        """Windows as `EpisodeStore.windows`; those of action copies end with their last step."""
+        windows, augmented = self._sources.windows(episodes, ends, length), self._augmented
+        steps = ends[:, None] + np.arange(1 - length, 1)
+        copies = episodes[:, None] - self._n_logged
+        possible = (copies >= 0) & (steps >= 0) & (steps < self._stride)
+        keys = np.where(possible, copies * self._stride + steps, -1)
+        places = np.searchsorted(self._keys, keys)
+        edited = np.nonzero(self._keys[places] == keys)
+        windows.states[edited] = torch.from_numpy(augmented.edit_state[places[edited]])
+        rows = np.flatnonzero(episodes >= self._first_action_copy)
+        if len(rows):
+            numbers = episodes[rows] - self._first_action_copy
+            rewards = torch.from_numpy(augmented.action_reward[numbers])
+            change = rewards.double() - windows.rewards[rows, -1].double()
+            ahead = np.arange(length - 1, -1, -1)
+            weights = torch.from_numpy(self._sources.return_to_go.weights(ahead))
+            added = weights * change.unsqueeze(1) * windows.mask[rows]
+            windows.returns_to_go[rows] = (windows.returns_to_go[rows].double() + added).float()
+            windows.actions[rows, -1] = torch.from_numpy(augmented.action[numbers])
+            windows.rewards[rows, -1] = rewards
+        return windows

@@ -1,18 +1,22 @@
 """Writing an episode store incrementally, in bounded memory."""
 
 import hashlib
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.episodes.returns import returns_in_parts
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
+
+if TYPE_CHECKING:
+    from ucfrec.episodes.store import EpisodeStore
 
 _PART_STEPS = 2**20
 
@@ -75,23 +79,23 @@ class StoreWriter:
             return
         if self._n_steps == 0 and not first[0]:
             raise ValueError("the first step of a store must begin an episode")
-        starts, begin = np.flatnonzero(first), 0
-        while True:
+        starts, begin, end = np.flatnonzero(first), 0, 0
+        while begin < len(first):
             full = begin + self._shard_steps - self._steps_in_shard
-            next_start = int(np.searchsorted(starts, full))
-            if next_start == len(starts):
-                break
-            cut = int(starts[next_start])
-            self._append(*_rows(steps, first, episodes, slice(begin, cut)))
-            self._close_shard()
-            begin = cut
-        self._append(*_rows(steps, first, episodes, slice(begin, None)))
+            later = starts[np.searchsorted(starts, full) :]
+            end = int(later[0]) if len(later) else len(first)
+            rows = slice(begin, end)
+            self._append(
+                {name: values[rows] for name, values in steps.items()},
+                first[rows],
+                {name: values[rows] for name, values in episodes.items()},
+            )
+            if len(later):
+                self._close_shard()
+            begin = end
 
     def _append(
-        self,
-        steps: Mapping[str, Array],
-        first: BoolArray,
-        episodes: Mapping[str, Array],
+        self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
     ) -> None:
         starts = np.flatnonzero(first)
         for name, values in steps.items():
@@ -183,33 +187,85 @@ class StoreWriter:
         return record.seal(self._folder)
 
 
-def write_arrays(
-    path: Path,
-    steps: Mapping[str, Array],
-    lengths: IntArray,
-    episodes: Mapping[str, Array],
-    reward: str,
+def reward_bit(
+    store: "EpisodeStore", flip: float = 0.0, seed: int = 0, early: bool = False
+) -> Float32Array:
+    """The distractor d_t = I{r_t is high} ⊕ Bernoulli(flip) of every step (paper appendix G.4),
+    (n_steps,) float32, 0 or 1, in the order of `all_steps`.
+
+    A reward is high if it exceeds the median of all rewards; if the median equals the largest
+    reward (more than half of all steps are clicks), a reward is high if it equals the median. The
+    paper's deterministic distractor has `flip` 0, the stochastic one 0.15.
+
+    Args:
+        early: shift the bit one step ahead, d_t = I{r_{t+1} is high}; the last step of an episode,
+            which has no next reward, uses its own reward.
+
+    Raises:
+        InputError: `flip` is not a probability, or all rewards are equal.
+    """
+    if not 0 <= flip <= 1:
+        raise InputError(f"flip, the probability of a wrong bit, is {flip}; it must be in [0, 1]")
+    episodes, steps = store.all_steps()
+    rewards = store.step_values(schema.REWARD, episodes, steps)
+    if rewards.min() == rewards.max():
+        raise InputError(
+            f"all rewards of {store.path} are {rewards[0]:g}, so no distractor can correlate with "
+            "them; check the reward expression"
+        )
+    median = np.median(rewards)
+    revealed_steps = np.minimum(steps + 1, store.lengths[episodes] - 1) if early else steps
+    revealed = store.step_values(schema.REWARD, episodes, revealed_steps)
+    high = revealed > median if median < rewards.max() else revealed >= median
+    flipped = np.random.default_rng(seed).random(len(rewards)) < flip
+    return np.asarray(high ^ flipped, dtype=np.float32)
+
+
+def with_observations(
+    store: "EpisodeStore",
+    out: Path,
+    observations: Float32Array,
     source: Mapping[str, Any],
-    shard_steps: int,
-) -> None:
-    """See `EpisodeStore.write`."""
-    lengths = require_steps(path, lengths)
-    first = np.zeros(int(np.sum(lengths)), dtype=bool)
-    first[np.cumsum(lengths) - lengths] = True
-    with atomic_folder(path) as scratch:
-        writer = StoreWriter(scratch, shard_steps)
-        writer.append(steps, first, {k: np.repeat(v, lengths) for k, v in episodes.items()})
-        writer.finish(reward=reward, source=source)
+) -> "EpisodeStore":
+    """Write a copy of `store` with other observations, atomically.
+
+    Args:
+        store: a whole store in a folder, not a view of some episodes.
+        observations: (n_steps, O) in the order of `all_steps`.
+        source: added to `source` in `meta.json`, the record of what the store was made from.
+
+    Raises:
+        InputError: `out` exists already.
+    """
+    values = np.ascontiguousarray(observations, dtype=schema.STEP_DTYPES[schema.OBSERVATION])
+    digest = hashlib.sha256(store.record.fingerprint.encode() + values.tobytes()).hexdigest()
+    with atomic_folder(out) as scratch:
+        shutil.copytree(store.path, scratch, dirs_exist_ok=True)
+        begin = 0
+        for shard in sorted(scratch.glob("shard-*")):
+            end = begin + int(np.load(shard / "offsets.npy")[-1])
+            np.save(shard / f"{schema.OBSERVATION}.npy", values[begin:end])
+            begin = end
+        changed = f"{schema.OBSERVATION}.npy"
+        files = store.record.files.items()
+        store.record.copy_with(
+            files={name: entry for name, entry in files if not name.endswith(f"/{changed}")},
+            columns={**store.record.columns, schema.OBSERVATION: [values.shape[1]]},
+            fingerprint=digest,
+            source=Source.model_validate({**store.record.source.model_dump(), **source}),
+        ).seal(scratch)
+    return type(store).open(out)
+
+
+def logged_observations(store: "EpisodeStore") -> Float32Array:
+    """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
+    if not store.observation_size:
+        return np.zeros((store.n_steps, 0), dtype=np.float32)
+    return np.asarray(store.step_values(schema.OBSERVATION, *store.all_steps()))
 
 
 def require_steps(path: Path | str, lengths: Array) -> IntArray:
-    """Check that every episode has at least one step.
-
-    Args:
-        lengths: (E,) number of steps of each episode.
-
-    Returns:
-        `lengths` as an array.
+    """The numbers of steps (E,) of episodes as an array.
 
     Raises:
         InputError: an episode has no steps.
@@ -240,16 +296,6 @@ def require_finite(rewards: Array) -> None:
             f"{large} of {len(stored)} rewards are beyond ±{schema.LARGEST_REWARD:g}, too large to "
             "train with in float32; divide them"
         )
-
-
-def _rows(
-    steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array], rows: slice
-) -> tuple[dict[str, Array], BoolArray, dict[str, Array]]:
-    return (
-        {name: values[rows] for name, values in steps.items()},
-        first[rows],
-        {name: values[rows] for name, values in episodes.items()},
-    )
 
 
 class _NpyFile:

@@ -1,7 +1,5 @@
 """Simulate a behavior policy in a simulator and write its sessions as Parquet logs."""
 
-from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -17,6 +15,7 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec.files.atomic import atomic_folder, write_json
 from ucfrec.processes import random_state_kept
+from ucfrec.provenance import versions
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000
@@ -68,13 +67,9 @@ def collect(
     1 s apart. Memory is bounded, because rows are written one row group at a time.
 
     Args:
-        env: an environment made by `simulator`.
-        actor: a behavior policy for `env`.
-        sessions: number of sessions, at least 1.
-        seed: environment i is seeded with `seed` + i.
-        out: new folder.
-        env_name: name of the environment in the record.
-        behavior: name of the behavior policy in the record.
+        env: made by `simulator`; environment i is seeded with `seed` + i.
+        sessions: at least 1.
+        env_name, behavior: names in the record.
 
     Returns:
         Returns and lengths of the sessions, ordered by session id.
@@ -91,7 +86,17 @@ def collect(
         environment = env.unwrapped
         if isinstance(environment, Catalog):
             pq.write_table(environment.item_features(), folder / "items.parquet")
-        write_json(folder / "collect.json", _run_record(played, env_name, behavior, seed))
+        record = {
+            "env": env_name,
+            "behavior": behavior,
+            "seed": seed,
+            "sessions": len(played.returns),
+            "steps": int(played.lengths.sum()),
+            "mean_return": float(played.returns.mean()),
+            "mean_length": float(played.lengths.mean()),
+            "versions": versions(),
+        }
+        write_json(folder / "collect.json", record)
     return played
 
 
@@ -164,35 +169,14 @@ def _lists(rows: Array) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, rows.astype(np.float32).ravel())
 
 
-def _run_record(played: Episodes, env_name: str, behavior: str, seed: int) -> Mapping[str, Any]:
-    return {
-        "env": env_name,
-        "behavior": behavior,
-        "seed": seed,
-        "sessions": len(played.returns),
-        "steps": int(played.lengths.sum()),
-        "mean_return": float(played.returns.mean()),
-        "mean_length": float(played.lengths.mean()),
-        "versions": {name: _version(name) for name in ("ucfrec", "gymnasium", "numpy", "torch")},
-    }
-
-
-def _version(distribution: str) -> str:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return "run from a source tree"
-
-
 def collect_store(
     environment: Environment, folder: Path, sessions: int, seed: int, behavior: str | None = None
 ) -> Path:
     """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
 
     Args:
-        seed: seed of the environments and of the behavior policy.
-        behavior: name of one of the simulator's built-in policies; None for its
-            `logging_behavior`.
+        seed: of the environments and of the behavior policy.
+        behavior: one of the simulator's built-in policies; None for its `logging_behavior`.
     """
     logs, store = folder / "logs", folder / "store"
     simulator = environment.simulator()

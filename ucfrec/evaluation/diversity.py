@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Step
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.evaluation.collect import Catalog, environment_items
 
 Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]

@@ -11,8 +11,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Actor, Episodes, rollout
 from ucfrec.arrays import IntArray
-from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.diversity import Recommended, variety_columns

@@ -135,7 +135,7 @@ class _Session(gymnasium.Wrapper[Float32Array, Any, Any, Any]):
             ) from None
         self.action_space, self._to_action = _actions(self.env.action_space, env_id)
         vectors = isinstance(self.action_space, spaces.Box)
-        self._observed = _observed(self.env.observation_space, observe, vectors, env_id)
+        self._observed = _select_observed(self.env.observation_space, observe, vectors, env_id)
         size = sum(spaces.flatdim(space) for _, space in self._observed)
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
 
@@ -185,7 +185,7 @@ def _actions(
     )
 
 
-def _observed(
+def _select_observed(
     space: spaces.Space[Any], keys: tuple[str, ...], vectors: bool, env_id: str
 ) -> _Observed:
     entries = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
@@ -233,7 +233,7 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
         require_regular(Path(source))
     try:
         if source.endswith(".parquet"):
-            return _ordered(pq.read_table(source), source, n_items)
+            return _order_rows(pq.read_table(source), source, n_items)
         if source.endswith(".npy"):
             return _table(np.load(source, allow_pickle=False), source, n_items)
     except (OSError, ValueError) as error:
@@ -266,7 +266,7 @@ def _table(values: Array, source: str, n_items: int) -> pa.Table:
     return pa.table({ITEM_ID: ids, FEATURES: pa.array(column)})
 
 
-def _ordered(table: pa.Table, source: str, n_items: int) -> pa.Table:
+def _order_rows(table: pa.Table, source: str, n_items: int) -> pa.Table:
     """The rows of a Parquet file, in the order of the actions."""
     if ITEM_ID not in table.column_names or not pa.types.is_integer(table[ITEM_ID].type):
         raise InputError(

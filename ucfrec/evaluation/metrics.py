@@ -7,7 +7,7 @@ that numbers can be compared. Means are over the users of `relevant` (a user wit
 counts 0), or over those of `recommended` where nothing relevant is asked for.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -91,7 +91,7 @@ def gauc(scored: pd.DataFrame) -> float:
         InputError: a column is missing, there are no rows, a score is missing, or `liked` is
             something else.
     """
-    _require(scored, "scored", USER_ID, "score", "liked")
+    _require(scored, "scored", [USER_ID, "score", "liked"])
     if other := (~scored["liked"].isin([0, 1])).sum():
         raise InputError(
             f"scored: liked is neither true nor false in {other:,} rows; give true and false, or 1 "
@@ -112,7 +112,7 @@ def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10)
         InputError: the catalogue is empty or lacks a recommended item.
     """
     top = _top(recommended, k)
-    return float(top[ITEM_ID].nunique() / _size(catalogue, top))
+    return float(top[ITEM_ID].nunique() / _count_items(catalogue, top))
 
 
 def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> float:
@@ -123,7 +123,7 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
         history: pairs `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
     """
     top = _top(recommended, k)
-    _require(history, "history", *_PAIR)
+    _require(history, "history", _PAIR)
     _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
     users = history.groupby(ITEM_ID)[USER_ID].nunique()
     share = top[ITEM_ID].map(users).fillna(1) / history[USER_ID].nunique()
@@ -142,13 +142,20 @@ def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) ->
         InputError: an item has no features or two rows of them, or a feature is a list.
     """
     top = _top(recommended, k)
-    _require_features(features)
+    if not features.shape[1]:
+        raise InputError("features has no columns; give one per feature, item_id being the index")
+    if not features.index.is_unique:
+        twice = features.index[features.index.duplicated()][0]
+        raise InputError(f"features has several rows of item {twice}; give one row per item")
+    for name in features:
+        if any(map(is_list_like, features[name])):
+            raise InputError(f"features: {name} holds lists; give one column per value of them")
     places = features.index.get_indexer(pd.Index(top[ITEM_ID]))
     if (places < 0).any():
-        lacking = top[ITEM_ID][places < 0]
+        absent = top[ITEM_ID][places < 0]
         raise InputError(
-            f"features: {lacking.nunique():,} recommended items have no row, such as "
-            f"{lacking.iloc[0]}; add them, item_id being the index"
+            f"features: {absent.nunique():,} recommended items have no row, such as "
+            f"{absent.iloc[0]}; add them, item_id being the index"
         )
     numbered = pd.DataFrame({USER_ID: top[USER_ID], _RANK: top[_RANK], "place": places})
     pairs = numbered.merge(numbered, on=USER_ID)
@@ -180,9 +187,9 @@ def serendipity(
         InputError: the catalogue is empty or lacks a recommended item.
     """
     top = _top(recommended, k)
-    n = _size(catalogue, top)
-    _require(relevant, "relevant", *_PAIR)
-    _require(history, "history", ITEM_ID)
+    n = _count_items(catalogue, top)
+    _require(relevant, "relevant", _PAIR)
+    _require(history, "history", [ITEM_ID])
     _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
     for name in _PAIR:
         _require_comparable(top[name], relevant[name], "relevant")
@@ -196,7 +203,7 @@ def serendipity(
 
 def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
     """The rows among the `k` best of each user."""
-    _require(recommended, "recommended", *_PAIR, _RANK)
+    _require(recommended, "recommended", [*_PAIR, _RANK])
     k, ranks = require_whole("k", k), recommended[_RANK]
     if not is_numeric_dtype(ranks) or not (ranks >= 1).all():
         lowest = ranks.min() if is_numeric_dtype(ranks) else ranks.iloc[0]
@@ -211,43 +218,33 @@ def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
 
 def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataFrame:
     """One row per relevant pair, with its `rank` if it is among the `k` best, else NaN."""
-    _require(relevant, "relevant", *_PAIR)
+    _require(relevant, "relevant", _PAIR)
     top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
     for name in _PAIR:
         _require_comparable(recommended[name], relevant[name], "relevant")
     return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
 
 
-def _size(catalogue: Collection[Any], top: pd.DataFrame) -> int:
+def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
     """Number of distinct items of a catalogue that has all the recommended ones."""
     items = pd.Series(list(catalogue), dtype=None if len(catalogue) else object).drop_duplicates()
     if items.empty:
         raise InputError("catalogue is empty; give the item_ids of all items")
     _require_comparable(top[ITEM_ID], items, "catalogue")
-    lacking = top[ITEM_ID][~top[ITEM_ID].isin(items)]
-    if len(lacking):
+    absent = top[ITEM_ID][~top[ITEM_ID].isin(items)]
+    if len(absent):
         raise InputError(
-            f"catalogue lacks {lacking.nunique():,} recommended items, such as {lacking.iloc[0]}; "
+            f"catalogue lacks {absent.nunique():,} recommended items, such as {absent.iloc[0]}; "
             "give the item_ids of all items"
         )
     return len(items)
 
 
-def _require_features(features: pd.DataFrame) -> None:
-    """Check that features are a table with one row per item, of values that can be compared."""
-    if not features.shape[1]:
-        raise InputError("features has no columns; give one per feature, item_id being the index")
-    if not features.index.is_unique:
-        twice = features.index[features.index.duplicated()][0]
-        raise InputError(f"features has several rows of item {twice}; give one row per item")
-    for name in features:
-        if any(map(is_list_like, features[name])):
-            raise InputError(f"features: {name} holds lists; give one column per value of them")
-
-
 def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> None:
     """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
-    kinds = [_KINDS.get(infer_dtype(np.asarray(each), skipna=True), "") for each in (ids, others)]
+    kinds = [
+        _KINDS.get(infer_dtype(np.asarray(column), skipna=True), "") for column in (ids, others)
+    ]
     if {*kinds} == {"numbers", "text"}:
         raise InputError(
             f"{ids.name} holds {kinds[0]} in recommended, but {kinds[1]} in {of_others}; convert "
@@ -255,9 +252,9 @@ def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> No
         )
 
 
-def _require(frame: pd.DataFrame, name: str, *columns: str) -> None:
-    lacking = [column for column in columns if column not in frame]
-    if lacking:
-        raise InputError(f"{name} has no column {', '.join(lacking)}; rename the one that it is in")
+def _require(frame: pd.DataFrame, name: str, columns: Sequence[str]) -> None:
+    absent = [column for column in columns if column not in frame]
+    if absent:
+        raise InputError(f"{name} has no column {', '.join(absent)}; rename the one that it is in")
     if frame.empty:
         raise InputError(f"{name} has no rows")

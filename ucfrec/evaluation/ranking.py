@@ -18,13 +18,11 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import LIKED, least_liked, liked_rewards
-from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
-from ucfrec.logs.engine import bind, engine_in_memory, explain_errors
+from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.histories import FrameTable
 from ucfrec.results.statistics import group_auc, resampled_ratios
@@ -48,7 +46,7 @@ class LikedByRange:
         self._low, self._high = float(states.reward_low), float(states.reward_high)
 
     def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        """(N,) of N steps of `store`, given their rewards (N,)."""
+        """See `Liked`."""
         return liked_rewards(store, rewards)
 
     def __str__(self) -> str:
@@ -74,22 +72,22 @@ class LikedExpression:
         self._names = {schema.REWARD.casefold(): schema.REWARD}
         if reward.isidentifier():
             self._names.setdefault(reward.casefold(), reward)
-        self._of(np.zeros(1))  # so that an unusable expression is refused at once
+        self._evaluate(np.zeros(1))  # so that an unusable expression is refused at once
 
     def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        """(N,) of N steps of `store`, given their rewards (N,)."""
+        """See `Liked`."""
         values, places = np.unique(rewards, return_inverse=True)
         # The shortest decimals: as float64, 0.7 of float32 would be less than 0.7.
-        return self._of(values.astype(str).astype(np.float64))[places]
+        return self._evaluate(values.astype(str).astype(np.float64))[places]
 
     def __str__(self) -> str:
         return str(self._expression)
 
-    def _of(self, rewards: Array) -> BoolArray:
+    def _evaluate(self, rewards: Array) -> BoolArray:
         source = Path(_ROWS)
         types = tuple((name, "DOUBLE") for name in self._names.values())
         table = FrameTable((source,), types)
-        with engine_in_memory() as connection, explain_errors(connection, (table,), source):
+        with engine((), None) as connection, explain_errors(connection, (table,), source):
             connection.register(_ROWS, pa.table({name: rewards for name, _ in types}))
             sql, kind, *_ = bind(connection, table, "for --liked", self._expression)
             if kind != "BOOLEAN":
@@ -190,8 +188,6 @@ class Ranked:
 @torch.no_grad()
 def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
     """Rank every step of a later log.
-
-    An item that is left out has no place in `top`, which has −1 where too few items are left.
 
     Args:
         k: number of recommended items per step, at most n_items.
@@ -294,21 +290,21 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
     hit = shown.any(axis=1)
     gain = (shown / np.log2(2 + np.arange(shown.shape[1]))).sum(axis=1)
 
-    def by_user(values: Array) -> Float64Array:
+    def sum_by_user(values: Array) -> Float64Array:
         return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
 
     every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
     rates = np.append(period.item_rates, np.nan)[ranked.top]  # −1: no item
     listed_items = ~np.isnan(rates)
     return {
-        "hit_rate_shown": (by_user(hit), by_user(every)),
-        "ndcg_shown": (by_user(gain), by_user(every)),
-        "hit_rate_liked": (by_user(hit * liked), by_user(liked)),
-        "ndcg_liked": (by_user(gain * liked), by_user(liked)),
+        "hit_rate_shown": (sum_by_user(hit), sum_by_user(every)),
+        "ndcg_shown": (sum_by_user(gain), sum_by_user(every)),
+        "hit_rate_liked": (sum_by_user(hit * liked), sum_by_user(liked)),
+        "ndcg_liked": (sum_by_user(gain * liked), sum_by_user(liked)),
         "recall_liked": _recall(period, ranked, owner, len(users)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
-        "item_rate": (by_user(np.nansum(rates, axis=1)), by_user(listed_items.sum(1))),
-        "known": (by_user(listed_items.sum(1)), by_user((ranked.top >= 0).sum(1))),
+        "item_rate": (sum_by_user(np.nansum(rates, axis=1)), sum_by_user(listed_items.sum(1))),
+        "known": (sum_by_user(listed_items.sum(1)), sum_by_user((ranked.top >= 0).sum(1))),
     }
 
 
@@ -344,14 +340,8 @@ class Compared:
 def compare(
     period: Period, ranked: Mapping[str, Ranked], reference: str, seed: int
 ) -> list[Compared]:
-    """Measures of every ranker, with intervals over users and differences from `reference`.
-
-    Args:
-        ranked: results by the ranker's name.
-        seed: of the bootstrap, whose resampled users are the same for all rankers.
-
-    Returns:
-        One entry per ranker, in the order of `ranked`.
+    """Measures of every ranker (name: results), with intervals over users and differences from
+    `reference`, by a bootstrap that draws the same users for all rankers.
     """
     measured = [measure(period, entry) for entry in ranked.values()]
     # (U, rankers, measures), so that one draw of users serves all rankers.
@@ -361,13 +351,15 @@ def compare(
         )
         for part in (0, 1)
     )
-    resampled = resampled_ratios(_flat(above), _flat(below), seed).reshape(-1, *above.shape[1:])
+    n_users, n_rankers, n_measures = above.shape
+    ratios = resampled_ratios(above.reshape(n_users, -1), below.reshape(n_users, -1), seed)
+    resampled = ratios.reshape(-1, n_rankers, n_measures)
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
     column = list(ranked).index(reference)
-    ends = _ends(resampled)
+    ends = _find_ends(resampled)
     differences = np.stack(
-        [values - values[column], *_ends(resampled - resampled[:, column : column + 1])]
+        [values - values[column], *_find_ends(resampled - resampled[:, column : column + 1])]
     )
     return [
         Compared(
@@ -381,18 +373,14 @@ def compare(
     ]
 
 
-def _flat(values: Float64Array) -> Float64Array:
-    return values.reshape(len(values), -1)
-
-
-def _ends(resampled: Float64Array) -> Float64Array:
+def _find_ends(resampled: Float64Array) -> Float64Array:
     """Ends (2, rankers, measures) of the 95% intervals; NaN if all resampled ratios are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.nanquantile(resampled, [0.025, 0.975], axis=0))
 
 
-def rankers_named(rankers: Sequence[Ranker]) -> dict[str, Ranker]:
+def name_rankers(rankers: Sequence[Ranker]) -> dict[str, Ranker]:
     """The rankers by name; of equal names, the second and later ones get a suffix -2, -3, …"""
     by_name: dict[str, Ranker] = {}
     for ranker in rankers:

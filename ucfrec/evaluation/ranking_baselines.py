@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
-from ucfrec.episodes.item_counts import TrainingCounts, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.ranking import Liked, Ranker, Steps
 from ucfrec.policies.baselines import (
@@ -43,8 +43,9 @@ class PolicyRanker:
 
     def scores(self, steps: Steps) -> Tensor:
         """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
-        at = steps.store, steps.episodes, steps.steps
-        scores = logged_scores(self._scorer, *at, steps.left_out)
+        scores = logged_scores(
+            self._scorer, steps.store, steps.episodes, steps.steps, steps.left_out
+        )
         return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
 
 
@@ -102,8 +103,8 @@ class ItemNeighbours:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        recent = steps.rows.recent(steps.numbers, _KNN_HISTORY)
-        return self._knn.similarity(*map(torch.from_numpy, recent)) + self._tie_break
+        items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
+        return self._knn.similarity(items, rewards) + self._tie_break
 
 
 class BoostedClicks:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import Array
-from ucfrec.episodes.item_counts import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import (
@@ -19,8 +19,8 @@ from ucfrec.evaluation.ranking import (
     Period,
     Ranker,
     compare,
+    name_rankers,
     rank_steps,
-    rankers_named,
 )
 from ucfrec.evaluation.ranking_baselines import (
     PolicyRanker,
@@ -135,7 +135,7 @@ def _rankers(
     others = baselines(counts, fitted_on, seed, liked)
     if train is not None and fitted_on is not None:
         others += recent_rankers(fitted_on, train, liked)
-    return rankers_named([*policies, *model, *others]), liked
+    return name_rankers([*policies, *model, *others]), liked
 
 
 def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import RANK, recommend, sessions_of

@@ -12,16 +12,16 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 from fastapi import FastAPI, Request, Response
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
-from ucfrec.exploring.explain import PARTS, Explained, explain, read_pasted
+from ucfrec.exploring.explain import PARTS, explain, read_pasted
 from ucfrec.files.record import CARD
 from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
-from ucfrec.recommending.server import AllowedHosts
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report
 from ucfrec.reporting.results import find_quoted, read_evidence
@@ -89,10 +89,15 @@ class Explorer:
         Args:
             fields: of the form, by name; unknown ones are ignored.
         """
+        cards = [run.folder / CARD for run in self.runs]
+        texts = [
+            card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
+            for card in cards
+        ]
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
             given=fields,
-            runs=[(run.folder.name, run, self._card(run)) for run in self.runs],
+            runs=[(r.folder.name, r, text) for r, text in zip(self.runs, texts, strict=True)],
             sliders=self._sliders(fields),
             values=self.values,
             chart=self.values_chart,
@@ -121,8 +126,8 @@ class Explorer:
             curves.setdefault(row.policy, {})[target] = row.value
         if max(map(len, curves.values()), default=0) < 2:
             return None
-        styled = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
-        return line_chart("Off-policy value against the target return", "target return", styled)
+        lines = [(name, style, curve) for style, (name, curve) in enumerate(curves.items())]
+        return line_chart("Off-policy value against the target return", "target return", lines)
 
     @cached_property
     def reports(self) -> list[str]:
@@ -137,38 +142,28 @@ class Explorer:
 
     def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
-        lists: list[tuple[str, str, Explained]] = []
-        error = ""
+        lists, error = [], ""
         try:
             if fields.get("user", "").strip() or fields.get("history", "").strip():
-                lists = [self._recommend(trained, fields) for trained in self.runs]
+                k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
+                for trained in self.runs:
+                    history, rule = _read_history(trained, fields), _read_rule(trained, fields)
+                    filter_seen = fields.get("keep_seen") is None
+                    explained = explain(trained, rule, history, k, filter_seen)
+                    lists.append((trained.folder.name, str(rule), explained))
         except InputError as fault:
             lists, error = [], str(fault)
-        ids = [{str(card.item_id) for card in explained.cards} for _, _, explained in lists]
-        common = set.intersection(*ids) if len(ids) == 2 else None
-        widths = [
-            abs(v)
-            for _, _, explained in lists
-            for card in explained.cards
-            for v in card.parts.values()
-        ]
+        cards = [explained.cards for _, _, explained in lists]
+        ids = [{str(card.item_id) for card in row} for row in cards]
+        widths = [abs(part) for row in cards for card in row for part in card.parts.values()]
         return {
             "lists": lists,
             "error": error,
-            "common": common,
+            "common": ids[0] & ids[1] if len(ids) == 2 else None,
             "parts": PARTS,
             "widest": max(widths, default=0.0) or 1.0,
             "item": self._item,
         }
-
-    def _recommend(
-        self, trained: TrainedPolicy, fields: Mapping[str, str]
-    ) -> tuple[str, str, Explained]:
-        history = _read_history(trained, fields)
-        rule = _read_rule(trained, fields)
-        k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
-        filter_seen = fields.get("keep_seen") is None
-        return trained.folder.name, str(rule), explain(trained, rule, history, k, filter_seen)
 
     def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
         trained = self.runs[0]
@@ -187,15 +182,12 @@ class Explorer:
         states = trained.item_states
         if states is None or not bool((states.tags >= 0).any()):
             sliders.pop()
-        if fields.get("custom") is None:
-            return sliders
-        # Where a number is wrong, the list says so.
-        return [
-            replace(slider, value=float(fields[slider.name]))
-            if _NUMBER.fullmatch(fields.get(slider.name, ""))
-            else slider
-            for slider in sliders
-        ]
+        for n, slider in enumerate(sliders):
+            text = fields.get(slider.name, "")
+            # Where a number is wrong, the list says so.
+            if fields.get("custom") is not None and _NUMBER.fullmatch(text):
+                sliders[n] = replace(slider, value=float(text))
+        return sliders
 
     def _item(self, item_id: Any) -> dict[str, Any]:
         """Title, picture and other features of an item."""
@@ -209,11 +201,6 @@ class Explorer:
             "image": image if image.startswith(("http://", "https://")) else "",
             "features": features[:200],
         }
-
-    @staticmethod
-    def _card(trained: TrainedPolicy) -> str:
-        card = trained.folder / CARD
-        return card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
 
 
 def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
@@ -249,14 +236,13 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
 
 def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRule:
     """The run's own rule, or that of the sliders."""
-    rule = trained.rule
     if fields.get("custom") is None:
-        return rule
+        return trained.rule
     names = [name for name in ("target", "reward_weight", "temperature") if name in fields]
     changes: dict[str, Any] = {name: _read_number(fields, name, 0.0, -1e12, 1e12) for name in names}
     if "tag_window" in fields:
         changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 0, 10))
-    return replace(rule, **changes)
+    return replace(trained.rule, **changes)
 
 
 def _read_number(
@@ -281,8 +267,7 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
         allowed_hosts: values of the header `Host` that are answered.
     """
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
-    remedy = "open the address that `ucfrec explore` printed"
-    app.add_middleware(AllowedHosts, allowed=allowed_hosts, remedy=remedy)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")
 
     def html(text: str) -> Response:

@@ -7,6 +7,7 @@ follow. All old rows become training rows, and the newest of the new rows valida
 import hashlib
 import os
 import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -20,7 +21,7 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, InputNote
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
@@ -36,15 +37,6 @@ SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
 _FILL: Final = {schema.PROPENSITY: np.nan, schema.IS_RANDOM: 0}
 """Step columns that some logs of a store may lack, and what their steps have instead."""
-_PARTS: Final = {
-    "onto": "another run's store",
-    "logs": "other logs",
-    "mapping": "other columns or conditions in the mapping",
-    "features": "other feature tables in the mapping",
-    "window_ms": "another window",
-    "split": "another split",
-}
-"""What a grown store depends on, and how a message names it where it differs."""
 
 
 @dataclass(frozen=True)
@@ -126,16 +118,18 @@ def append_logs(
 def _describe_inputs(
     old: StoreRecord, files: Sequence[Path], mapping: LogMapping, options: AppendOptions
 ) -> dict[str, Any]:
-    """What the grown store depends on, to know it again."""
+    """What the grown store depends on, to know it again; the keys name it where it differs."""
     tables = (*mapping.item_features, *mapping.user_features)
     columns = {**mapping.columns, "where": mapping.where, "time_format": mapping.time_format}
+    texts = {name: str(text) for name, text in columns.items() if text is not None}
+    feature_files = (file for table in tables for file in log_files(table.files))
     return {
-        "onto": old.fingerprint,
-        "logs": [file_checksum(file) for file in files],
-        "mapping": {name: str(text) for name, text in columns.items() if text is not None},
-        "features": [file_checksum(file) for table in tables for file in log_files(table.files)],
-        "window_ms": options.window_ms,
-        "split": list(options.split),
+        "another run's store": old.fingerprint,
+        "other logs": [file_checksum(file) for file in files],
+        "other columns or conditions in the mapping": texts,
+        "other feature tables in the mapping": [file_checksum(file) for file in feature_files],
+        "another window": options.window_ms,
+        "another split": list(options.split),
     }
 
 
@@ -144,9 +138,7 @@ def _read_report(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
     remembered = StoreRecord.read(out).source.others
     if "made_of" not in remembered:
         raise InputError(f"{out} is a store that no update made; name another folder")
-    differences = [
-        name for key, name in _PARTS.items() if remembered["made_of"].get(key) != made_of[key]
-    ]
+    differences = [key for key in made_of if remembered["made_of"].get(key) != made_of[key]]
     if differences:
         raise InputError(
             f"{out} is a store of {' and of '.join(differences)}; give the same as before, or name "
@@ -185,14 +177,16 @@ def _survey_ids(
         # New ids are usual here; only logs without any old one may be written in another way.
         if new == ids:
             note_unknown(typed.name, name, new, ids, f"of {store}")
-        note_lacking(
-            typed.connection,
-            feature_tables(mapping)[name],
-            log.features[name],
-            name,
-            f"SELECT {name} FROM {used} WHERE {is_new}",
-            str(store) if name in old.source.features else "",
-        )
+        tables, whose = feature_tables(mapping)[name], name.removesuffix("_id")
+        rows = f"(SELECT {name} FROM {used} WHERE {is_new})"
+        note_lacking(typed.connection, tables, log.features[name], name, rows, f"new {whose}s")
+        if new and not tables and name in old.source.features:
+            warnings.warn(
+                f"{store} was prepared with {whose} features and none are given now: all {new:,} "
+                f"new {whose}s begin at the mean; give a current table with --mapping",
+                InputNote,
+                stacklevel=3,
+            )
         counts[f"new_{table}"] = typed.one(f"SELECT count(*) FROM {table}")[0] - old_count
         counts[f"new_{table.removesuffix('s')}_steps"] = steps
     return counts

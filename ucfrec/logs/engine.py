@@ -9,7 +9,7 @@ import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -24,14 +24,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.expressions import NotScalarError, cast_truth_values, columns_of, refusal
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
-from ucfrec.logs.tables import (
-    Table,
-    fault_of_line,
-    first_line,
-    glob_pattern,
-    quote,
-    quote_name,
-)
+from ucfrec.logs.tables import Table, fault_of_line, first_line, glob_pattern, quote, quote_name
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -49,31 +42,26 @@ _CLOSED: Final = {
     "python_enable_replacements": False,
 }
 _NAME: Final = re.compile(r"[^\W\d]\w*")
-_DISK_FULL: Final = (
-    "No space left",
-    "quota exceeded",
-    "max_temp_directory_size",
-    "requested and",
-)
+_DISK_FULL: Final = ("No space left", "quota exceeded", "max_temp_directory_size", "requested and")
 """In messages of the system, of safetensors, of DuckDB's own disk limit, and of numpy."""
 
 
 @contextmanager
 def engine(
     inputs: Iterable[Path],
-    folder: Path,
+    folder: Path | None,
     memory_limit: str | None = None,
     shared: bool = False,
     threads: int | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB connection with a database on disk.
+    """A DuckDB connection that can open only the inputs and files in its scratch folder.
 
-    It can open only the inputs and files in its scratch folder, loads no extension, and its
-    configuration is locked. Every DuckDB connection of ucfrec is made in this module.
+    It loads no extension, and its configuration is locked. Every DuckDB connection of ucfrec is
+    made here.
 
     Args:
         folder: parent of the scratch folder, which is removed at the end; so is the scratch of
-            killed processes in it.
+            killed processes in it. None for a database in memory that never uses the disk.
         memory_limit: size such as "2GB", of the engine or with `shared` of the process, beyond
             which rows spill to disk; None for DuckDB's default.
         shared: whether the rest of the process keeps to the limit too, with at most half of it.
@@ -82,11 +70,10 @@ def engine(
     Raises:
         InputError: `memory_limit` is not a size.
     """
-    with scratch_folder(folder, "rows") as work:
-        spill = str(work / "spill")
-        connection = duckdb.connect(
-            str(work / "rows.duckdb"), config={**_CLOSED, "temp_directory": spill}
-        )
+    with scratch_folder(folder, "rows") if folder else nullcontext() as work:
+        spill = str(work / "spill") if work else ""
+        database = str(work / "rows.duckdb") if work else ":memory:"
+        connection = duckdb.connect(database, config={**_CLOSED, "temp_directory": spill})
         try:
             if memory_limit is not None:
                 _set_memory_limit(connection, memory_limit)
@@ -96,25 +83,18 @@ def engine(
             if threads is not None:
                 connection.execute("SET threads = ?", [threads])
             _set_semantics(connection)
-            _close(connection, inputs, work)
+            # Other files are forbidden and the settings locked, after every other setting. DuckDB
+            # first looks a path up as a glob pattern, then opens the file that it matches.
+            allowed = {path for file in inputs for path in (str(file), glob_pattern(file))}
+            if work:
+                paths = ", ".join(map(quote, sorted(allowed)))
+                connection.execute(f"SET allowed_directories = [{quote(str(work))}]")
+                connection.execute(f"SET allowed_paths = [{paths}]")
+            connection.execute("SET enable_external_access = false")
+            connection.execute("SET lock_configuration = true")
             yield connection
         finally:
             connection.close()
-
-
-@contextmanager
-def engine_in_memory(memory_limit: str | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A DuckDB connection for registered tables only: it opens no file and never uses the disk.
-    `memory_limit` such as "256MB" is that of the engine; None for DuckDB's default."""
-    connection = duckdb.connect(":memory:", config={**_CLOSED, "temp_directory": ""})
-    try:
-        if memory_limit is not None:
-            _set_memory_limit(connection, memory_limit)
-        _set_semantics(connection)
-        _close(connection, (), None)
-        yield connection
-    finally:
-        connection.close()
 
 
 def _set_memory_limit(connection: duckdb.DuckDBPyConnection, size: str) -> None:
@@ -147,19 +127,6 @@ def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
         )
     # Tables read NaN as missing (`ucfrec.logs.tables.Table`).
     connection.execute("CREATE TEMP MACRO isnan(a) AS coalesce(system.main.isnan(a), true)")
-
-
-def _close(
-    connection: duckdb.DuckDBPyConnection, inputs: Iterable[Path], work: Path | None
-) -> None:
-    """Forbid access to other files and lock the settings; must come after every other setting."""
-    # DuckDB first looks a path up as a glob pattern, then opens the file that it matches.
-    allowed = {path for file in inputs for path in (str(file), glob_pattern(file))}
-    if work is not None:
-        connection.execute(f"SET allowed_directories = [{quote(str(work))}]")
-        connection.execute(f"SET allowed_paths = [{', '.join(map(quote, sorted(allowed)))}]")
-    connection.execute("SET enable_external_access = false")
-    connection.execute("SET lock_configuration = true")
 
 
 def anonymous_bytes(process: int | None = None) -> int:
@@ -313,10 +280,7 @@ def _find_fault(
 
 
 def settle_mapping(
-    connection: duckdb.DuckDBPyConnection,
-    tables: Sequence[Table],
-    mapping: LogMapping,
-    reward: str,
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], mapping: LogMapping, reward: str
 ) -> tuple[LogMapping, str]:
     """The mapping and the reward of a log, with the names of a run's training log or plain ones.
 

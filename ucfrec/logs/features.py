@@ -55,10 +55,7 @@ class _Part:
 
 
 def load_features(
-    connection: duckdb.DuckDBPyConnection,
-    tables: Sequence[FeatureTable],
-    kind: str,
-    id_type: str,
+    connection: duckdb.DuckDBPyConnection, tables: Sequence[FeatureTable], kind: str, id_type: str
 ) -> list[str]:
     """Read feature tables into DuckDB tables, whose names are returned, with columns `id`, `f0`, ….
 
@@ -215,29 +212,23 @@ def require_known_ids(
 ) -> None:
     """Raise InputError if a feature table has no row of an id of the log; if `noted`, warn if many
     ids have none. `names` are those of `load_features`, `kind` as there."""
-    used = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
+    used_ids = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
     for table, name in zip(tables, names, strict=True):
-        count = _count(connection, used)
-        without_row = _count(connection, f"{used} ANTI JOIN {name} ON id = {kind}")
-        files = ", ".join(map(str, table.files))
-        if without_row == count:
+        if not _count(connection, f"{used_ids} SEMI JOIN {name} ON id = {kind}"):
             ids, log_ids = (
                 connection.sql(f"SELECT {column} FROM {rows} ORDER BY 1 LIMIT 3").fetchall()
-                for column, rows in (("id", name), (kind, used))
+                for column, rows in (("id", name), (kind, used_ids))
             )
             keys = f"is {_list_values(ids)}" if ids else "is never such an id"
             raise InputError(
-                f"{files}: no row belongs to a {kind} of the log, which "
+                f"{', '.join(map(str, table.files))}: no row belongs to a {kind} of the log, which "
                 f"are {_list_values(log_ids)}, and {table.key} {keys}; let the key be an "
                 "expression that gives the same ids, or leave the file out"
             )
-        if noted and without_row > _MANY_LACKING * count:
-            warnings.warn(
-                f"{files}: {without_row:,} of {count:,} {kind}s of the log have no row; their "
-                "features count as missing",
-                InputNote,
-                stacklevel=3,
-            )
+    if noted:
+        note_lacking(
+            connection, tables, names, kind, used_ids, f"{kind}s of the log", _MANY_LACKING
+        )
 
 
 def note_lacking(
@@ -245,31 +236,22 @@ def note_lacking(
     tables: Sequence[FeatureTable],
     names: Sequence[str],
     kind: str,
-    new: str,
-    lost: str,
+    rows: str,
+    which: str,
+    share: float = 0,
 ) -> None:
-    """Note the `new` ids (SQL) of a store that grows which feature tables say nothing of.
-
-    `names` and `kind` are as of `require_known_ids`; `lost` is the store, if it was made with such
-    tables, or empty.
-    """
-    count, ids = _count(connection, f"({new})"), kind.removesuffix("_id")
-    what = "embeddings" if ids == "item" else "features"
-    notes = []
-    if lost and count and not tables:
-        notes.append(
-            f"{lost} was prepared with {ids} features and none are given now: the {what} of all "
-            f"{count:,} new {ids}s begin at the mean"
-        )
+    """Warn of ids in some rows (SQL), `which` in words, if more than a share have no row in a
+    feature table."""
+    count = _count(connection, rows)
     for table, name in zip(tables, names, strict=True):
-        without_row = _count(connection, f"({new}) ANTI JOIN {name} ON id = {kind}")
-        if without_row:
-            notes.append(
-                f"{', '.join(map(str, table.files))}: {without_row:,} of {count:,} new {ids}s have "
-                f"no row in the {ids} features; their {what} say nothing of them"
+        without_row = _count(connection, f"{rows} ANTI JOIN {name} ON id = {kind}")
+        if without_row > share * count:
+            warnings.warn(
+                f"{', '.join(map(str, table.files))}: {without_row:,} of {count:,} {which} have "
+                "no row; their features count as missing",
+                InputNote,
+                stacklevel=3,
             )
-    for note in notes:
-        warnings.warn(f"{note}; give a current table with --mapping", InputNote, stacklevel=3)
 
 
 def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:

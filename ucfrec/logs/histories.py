@@ -16,7 +16,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.locks import scratch_folder
-from ucfrec.logs.engine import engine, engine_in_memory, explain_errors, settle_mapping, to_arrow
+from ucfrec.logs.engine import engine, explain_errors, settle_mapping, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
@@ -97,7 +97,7 @@ def frame_histories(
     """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
     too."""
     columns = log_table(frame, HISTORIES)
-    with engine_in_memory() as connection:
+    with engine((), None) as connection:
         connection.register(HISTORIES, columns)
         described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
         table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
@@ -129,7 +129,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
     columns = {}
     for column in frame.columns:
         try:
-            columns[str(column)] = _to_array(frame[column])
+            columns[str(column)] = _convert_column(frame[column])
         except _UnusableError as error:
             if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
                 raise InputError(f"{name}: {column} {error}") from None
@@ -143,7 +143,7 @@ class _UnusableError(Exception):
     """A column cannot be read; the message says why, and what to do."""
 
 
-def _to_array(values: "pd.Series[Any]") -> pa.Array:
+def _convert_column(values: "pd.Series[Any]") -> pa.Array:
     """A column of a data frame, or _UnusableError."""
     import pandas as pd
 
@@ -217,24 +217,24 @@ def _gather_histories(
     bounds = np.searchsorted(seen, np.arange(len(first) + 1) * len(items))
     columns = {
         schema.USER_ID: users.take(to_arrow(codes[first].astype(np.int64) - codes[0])),
-        "item_ids": _to_lists(offsets, items.take(to_arrow(rows[ITEM][recent]))),
-        "rewards": _to_lists(offsets, _to_floats(rows[schema.REWARD][recent])),
-        "timestamps": _to_lists(offsets, to_arrow(rows[schema.TIMESTAMP][recent])),
-        "seen": _to_lists(bounds, items.take(to_arrow(seen % len(items)))),
+        "item_ids": _make_lists(offsets, items.take(to_arrow(rows[ITEM][recent]))),
+        "rewards": _make_lists(offsets, _make_floats(rows[schema.REWARD][recent])),
+        "timestamps": _make_lists(offsets, to_arrow(rows[schema.TIMESTAMP][recent])),
+        "seen": _make_lists(bounds, items.take(to_arrow(seen % len(items)))),
     }
     if log.session_by == schema.SESSION_ID:
-        columns["session_ids"] = _to_lists(offsets, to_arrow(rows[SESSION][recent]))
+        columns["session_ids"] = _make_lists(offsets, to_arrow(rows[SESSION][recent]))
     if sorted_rows.observations is not None:
         observations = sorted_rows.observations.of_rows(rows["row"][ends - 1])
         bounds = np.arange(len(first) + 1) * observations.shape[1]
-        columns[schema.OBSERVATION] = _to_lists(bounds, _to_floats(observations.ravel()))
+        columns[schema.OBSERVATION] = _make_lists(bounds, _make_floats(observations.ravel()))
     return pa.record_batch(columns)
 
 
-def _to_lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
+def _make_lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
     return pa.ListArray.from_arrays(to_arrow(offsets).cast(pa.int32()), values)
 
 
-def _to_floats(values: Array) -> pa.Array:
+def _make_floats(values: Array) -> pa.Array:
     buffer = pa.py_buffer(np.ascontiguousarray(values, dtype=np.float32))
     return pa.Array.from_buffers(pa.float32(), len(values), [None, buffer])

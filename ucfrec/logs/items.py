@@ -65,7 +65,7 @@ def read_training_steps(folder: Path, shards: Iterable[int]) -> Iterator[dict[st
             begin = end
 
 
-def write_item_states(folder: Path, scratch: Path, known: EncodedFeatures, size: int) -> None:
+def write_item_states(folder: Path, scratch: Path, encoded: EncodedFeatures, size: int) -> None:
     """Learn the item embeddings (at most `size` dimensions) and user features of the store at
     `folder` and write them there. Raises InputError if all rewards of the training split are equal.
     """
@@ -81,18 +81,18 @@ def write_item_states(folder: Path, scratch: Path, known: EncodedFeatures, size:
         raise InputError(
             f"all {moments.count} rewards of the training split equal {low}; choose another reward"
         )
-    matrix = Exposure(scratch / "exposure.bin", known.item_counts)
+    matrix = Exposure(scratch / "exposure.bin", encoded.item_counts)
     for batch in keep_users_whole(read_training_steps(folder, shards), schema.USER):
         liking = np.clip((batch[schema.REWARD] - low) / (high - low), 0, 1)
         matrix.add(batch[schema.USER], batch[schema.ITEM], EXPOSURE + liking)
-    embeddings = item_embeddings(matrix, known.items, size)
-    user_vectors = np.zeros((len(known.user_counts), 0), dtype=np.float32)
-    if known.users is not None:
-        trained_rows = np.flatnonzero(known.user_counts)
-        user_vectors = _reduce(known.users, trained_rows, USER_SIZE)
+    embeddings = item_embeddings(matrix, encoded.items, size)
+    user_vectors = np.zeros((len(encoded.user_counts), 0), dtype=np.float32)
+    if encoded.users is not None:
+        trained_rows = np.flatnonzero(encoded.user_counts)
+        user_vectors = _reduce(encoded.users, trained_rows, USER_SIZE)
         spread = user_vectors[trained_rows].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
-    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, known.tags)
+    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, encoded.tags)
 
 
 class Exposure:
@@ -164,10 +164,7 @@ def item_embeddings(
 
 
 def predict_from_features(
-    features: sparse.csr_matrix,
-    trained: IntArray,
-    cooccurrence: Float64Array,
-    counts: IntArray,
+    features: sparse.csr_matrix, trained: IntArray, cooccurrence: Float64Array, counts: IntArray
 ) -> Float64Array:
     """(n_items, size) co-occurrence part predicted from features, by ridge regression."""
     axes = _axes(features[trained], CONTENT_RANK)
@@ -315,7 +312,7 @@ def _there_and_back(
 
 
 def write_grown_states(
-    store: Path, folder: Path, new_shards: Iterable[int], known: EncodedFeatures
+    store: Path, folder: Path, new_shards: Iterable[int], encoded: EncodedFeatures
 ) -> None:
     """Write the item states of the store at `folder`, grown from `store` by `new_shards`.
 
@@ -331,23 +328,23 @@ def write_grown_states(
         np.concatenate([batch[name] for batch in batches])
         for name in (schema.USER, schema.ITEM, schema.REWARD)
     )
-    step_counts = np.bincount(items, minlength=len(known.item_counts))
-    old_counts = np.maximum(known.item_counts - step_counts, 0)
-    vectors = _extend_rows(old.embeddings.numpy(), known.items, old_counts)
-    if known.items is None and step_counts.any():
+    step_counts = np.bincount(items, minlength=len(encoded.item_counts))
+    old_counts = np.maximum(encoded.item_counts - step_counts, 0)
+    vectors = _extend_rows(old.embeddings.numpy(), encoded.items, old_counts)
+    if encoded.items is None and step_counts.any():
         liking = np.clip((rewards - old.reward_low) / (old.reward_high - old.reward_low), 0, 1)
         _, rows = np.unique(users, return_inverse=True)
         shape = (int(rows.max()) + 1, len(vectors))
         shown = sparse.csr_matrix((EXPOSURE + liking, (rows, items)), shape=shape)
         vectors = _fold_in(vectors, shown, old_counts, step_counts)
-    features = _extend_rows(old.user_features.numpy(), known.users, known.user_counts)
+    features = _extend_rows(old.user_features.numpy(), encoded.users, encoded.user_counts)
     write_item_table(
         folder / ITEM_STATES,
         vectors.astype(np.float32),
         features.astype(np.float32),
         old.reward_low,
         old.reward_high,
-        _number_tags(old.tags.numpy(), known.tags, len(vectors)),
+        _number_tags(old.tags.numpy(), encoded.tags, len(vectors)),
     )
 
 

@@ -179,8 +179,8 @@ def prepare(
             elif typed.key == schema.ITEM_ID:
                 from ucfrec.logs.items import write_item_states  # imports scipy
 
-                known = encode_ids(typed.connection, log.features)
-                write_item_states(folder, log.scratch, known, options.embedding_size)
+                encoded = encode_ids(typed.connection, log.features)
+                write_item_states(folder, log.scratch, encoded, options.embedding_size)
             if like is not None:
                 sessions.write_episode_users(typed, folder / sessions.EPISODE_USERS)
             record.seal(folder)

@@ -261,7 +261,7 @@ def keep_users_whole(batches: Iterable[dict[str, Array]], user: str) -> Iterator
         yield pending
 
 
-def _to_columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
+def _read_columns(batch: pa.RecordBatch, log: TypedLog) -> dict[str, Array]:
     columns = {}
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
         size = log.vector_size.get(name)
@@ -400,7 +400,7 @@ def check_sorted(
         {reason: fault_counts.get(number, 0) for number, reason in enumerate(REASONS, 1)},
         sum(fault_counts.values()),
     )
-    for columns in keep_users_whole((_to_columns(batch, log) for batch in batches), USER):
+    for columns in keep_users_whole((_read_columns(batch, log) for batch in batches), USER):
         rows.add(columns, duplicates, by_session)
     if rows.large:
         raise InputError(

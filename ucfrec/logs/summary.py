@@ -12,7 +12,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.long_sessions import LONG
+from ucfrec.episodes.store import LONG
 from ucfrec.errors import InputError, InputNote, one_line
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind
@@ -187,11 +187,7 @@ def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution
     edges = np.linspace(low, high, FEW_VALUES + 1)
     within = np.array([-np.inf, *edges[1:-1], np.inf])
     filled = sum(np.histogram(e.rows[schema.REWARD], within)[0] for e in read_episodes(rows, cut))
-    return {
-        "edges": edges.tolist(),
-        "counts": np.asarray(filled).tolist(),
-        "quantiles": quantiles,
-    }
+    return {"edges": edges.tolist(), "counts": np.asarray(filled).tolist(), "quantiles": quantiles}
 
 
 def _weigh_quantiles(values: Array, counts: IntArray) -> dict[str, Any]:

@@ -24,11 +24,7 @@ _INTEGER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?")
 _REAL = re.compile(r"FLOAT|DOUBLE|DECIMAL.*")
 _NARROW = re.compile(r"(U?(?:TINY|SMALL)INT|U?INTEGER)((?:\[\d*\])*)")
 _NUMBERS = re.compile(r"(U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|DECIMAL\(.*\))\[\d*\]")
-_EXACT = {
-    "BIGINT": "DOUBLE",
-    "DATE": "TIMESTAMP",
-    "TIMESTAMP": "TIMESTAMP WITH TIME ZONE",
-}
+_EXACT = {"BIGINT": "DOUBLE", "DATE": "TIMESTAMP", "TIMESTAMP": "TIMESTAMP WITH TIME ZONE"}
 """DuckDB type of a CSV column to the type that keeps what a cast to it would cut off."""
 _CSV_FAULT = re.compile(
     r"CSV Error on Line: (\d+)(?:\nOriginal Line: .*)?\n(.*)(?:.|\n)*?\n\s*file = (.+)"

@@ -17,7 +17,7 @@ from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files
-from ucfrec.logs.tables import Table, first_and_more, is_number, open_tables, quote_name
+from ucfrec.logs.tables import first_and_more, is_number, open_tables, quote_name
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_mean
 
 _NORMAL: Final = 1.959964
@@ -37,15 +37,14 @@ class Comparison:
     values: tuple[float, float]
     users: tuple[int, int]
     rows: tuple[int, int]
-    """Rows with a value, which count."""
+    """Rows with a value, which count; what follows is left out."""
     without_value: tuple[int, int]
-    """Rows of these arms without a value, which are left out."""
+    """Rows of these arms without a value."""
     without_user: int
-    """Rows without a user, which are left out."""
     without_arm: int
-    """Rows of a user without an arm, which are left out."""
+    """Rows of a user without an arm."""
     in_several: int
-    """Users who were in more than one arm; their rows are left out."""
+    """Users who were in more than one arm."""
     difference: float
     """Of the second arm less the first."""
     error: float
@@ -65,16 +64,15 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
-        for count, name in ((self.without_user, schema.USER_ID), (self.without_arm, schema.ARM)):
-            if count:
-                lines.append(f"{count:,} rows have no {name}; they are left out")
-        if self.in_several:
-            lines.append(
-                f"{self.in_several:,} users were in more than one arm; their rows are left out"
-            )
-        ends = self.low, self.high, self.always_low, self.always_high
+        for count, text in (
+            (self.without_user, f"rows have no {schema.USER_ID}; they are left out"),
+            (self.without_arm, f"rows have no {schema.ARM}; they are left out"),
+            (self.in_several, "users were in more than one arm; their rows are left out"),
+        ):
+            lines += [f"{count:,} {text}"] * (count > 0)
         low, high, always_low, always_high = (
-            "unknown" if end is None else f"{end:+.4g}" for end in ends
+            "unknown" if end is None else f"{end:+.4g}"
+            for end in (self.low, self.high, self.always_low, self.always_high)
         )
         lines.append(
             f"{' − '.join(reversed(self.arms))}: {self.difference:+.4g} [{low}, {high}] at a "
@@ -127,13 +125,10 @@ def compare_arms(
     """Compare two arms in logs of `ucfrec join`. Users are drawn into arms, so they are clusters.
 
     Args:
-        paths: logs, with the column `arm`.
         arms: names of the first arm and the other; None for the two that there are, the one with
             more users first.
         expected: difference that the always-valid interval is tuned for, fixed beforehand; None for
             5% of the first arm's value.
-
-    An `InputNote` says how many rows have no value in the column; they are left out.
 
     Raises:
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
@@ -141,7 +136,7 @@ def compare_arms(
     """
     files = log_files(paths)
     name = first_and_more(files)
-    groups, in_several = _sum_by_user(files, column, memory_limit)
+    groups = _sum_by_user(files, column, memory_limit)
     has_user, has_arm = groups["who"].astype(bool), groups[schema.ARM] != ""
     if beyond := int(groups["beyond"].sum()):
         raise InputError(
@@ -152,12 +147,10 @@ def compare_arms(
     sums: dict[str, Float64Array] = {}
     without_value: dict[str, int] = {}
     for arm in map(str, np.unique(groups[schema.ARM][counts])):
-        values, counted, rows = (
-            groups[part][counts & (groups[schema.ARM] == arm)]
-            for part in ("value", "shown", "rows")
-        )
-        sums[arm] = np.stack([values, counted.astype(np.float64)])[:, counted > 0]
-        without_value[arm] = int((rows - counted).sum())
+        inside = counts & (groups[schema.ARM] == arm)
+        values, shown, rows = (groups[part][inside] for part in ("value", "shown", "rows"))
+        sums[arm] = np.stack([values, shown.astype(np.float64)])[:, shown > 0]
+        without_value[arm] = int((rows - shown).sum())
     users = {arm: values.shape[1] for arm, values in sums.items()}
     names = arms or tuple(sorted(users, key=lambda arm: -users[arm])[:2])
     if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
@@ -197,7 +190,7 @@ def compare_arms(
         without_value=(without_value[first], without_value[second]),
         without_user=int(groups["rows"][~has_user].sum()),
         without_arm=int(groups["rows"][has_user & ~has_arm].sum()),
-        in_several=in_several,
+        in_several=int((has_user & (groups["arms"] > 1) & groups["last"]).sum()),
         difference=difference,
         error=error,
         low=ends[0],
@@ -207,21 +200,23 @@ def compare_arms(
     )
 
 
-def _sum_by_user(
-    files: Sequence[Path], column: str, memory_limit: str
-) -> tuple[dict[str, Array], int]:
-    """The sum of the values, numbers of values and rows of each user in each arm; "" for no arm.
-
-    Returns:
-        Columns of (user, arm), and the number of users in several arms.
-    """
+def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[str, Array]:
+    """Sum of the values, numbers of values and rows of each user in each arm; "" for no arm."""
     with (
         scratch_folder(Path(gettempdir()), "compare") as folder,
         engine(files, folder, memory_limit, shared=True) as connection,
     ):
         tables = tuple(open_tables(connection, files))
         for table in tables:
-            _require_columns(table, column)
+            kinds = table.columns
+            numbers = [name for name, kind in kinds.items() if is_number(kind) or kind == "BOOLEAN"]
+            missing = [name for name in (schema.USER_ID, schema.ARM, column) if name not in kinds]
+            if missing or column not in numbers:
+                fault = f" has no column {', '.join(missing)}"
+                raise InputError(
+                    f"{table.files[0]}{fault if missing else f': {column} is not a number'}; give "
+                    f"the log of ucfrec join; its columns of numbers are {', '.join(numbers)}"
+                )
         rows = " UNION ALL BY NAME ".join(
             f"SELECT nullif({table.text_of(schema.USER_ID)}, '') AS who, "
             f"nullif({table.text_of(schema.ARM)}, '') AS arm, "
@@ -234,28 +229,12 @@ def _sum_by_user(
                 "CREATE TABLE groups AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
                 f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
-                f"count(arm) OVER (PARTITION BY who) AS arms FROM ({rows}) GROUP BY who, arm"
+                "count(arm) OVER (PARTITION BY who) AS arms, "
+                "coalesce(arm = max(arm) OVER (PARTITION BY who), false) AS last "
+                f"FROM ({rows}) GROUP BY who, arm"
             )
             groups: dict[str, Any] = connection.sql(
-                "SELECT who IS NOT NULL AS who, coalesce(arm, '') AS arm, value, shown, rows, "
-                "beyond, arms FROM groups ORDER BY groups.arm, groups.who"
+                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM groups "
+                "ORDER BY groups.arm, groups.who"
             ).fetchnumpy()
-            ((in_several,),) = connection.sql(
-                "SELECT count(DISTINCT who) FILTER (arms > 1) FROM groups"
-            ).fetchall()
-    return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}, int(in_several)
-
-
-def _require_columns(table: Table, column: str) -> None:
-    file, kinds = table.files[0], table.columns
-    numbers = [name for name, kind in kinds.items() if is_number(kind) or kind == "BOOLEAN"]
-    if missing := [name for name in (schema.USER_ID, schema.ARM, column) if name not in kinds]:
-        fault = f" has no column {', '.join(missing)}"
-    elif column not in numbers:
-        fault = f": {column} is not a number"
-    else:
-        return
-    raise InputError(
-        f"{file}{fault}; give the log of ucfrec join; its columns of numbers are "
-        f"{', '.join(numbers)}"
-    )
+    return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}

@@ -129,20 +129,13 @@ def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
 
 
 def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> dict[str, Estimate]:
-    """Estimates with intervals, of terms of S units by name of the estimator.
-
-    Args:
-        user: (S,) whose they are; None where each is of another user.
-        seed: draws the bootstrap's resamples.
-    """
+    """Estimates with intervals, of terms of S units, each of a user (S,), by estimator."""
     above = np.stack([term.above for term in terms.values()], axis=1)
     below = np.stack([term.below for term in terms.values()], axis=1)
     estimates = {}
     intervals = cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
-        if term.biased:
-            interval = None
-        weights = term.weights
+        interval, weights = None if term.biased else interval, term.weights
         estimates[name] = Estimate(
             value=float(term.above.sum() / term.below.sum()),
             low=None if interval is None else interval.low,
@@ -184,21 +177,15 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         terms["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
-    return terms | _shrunk_terms(steps)
-
-
-def _shrunk_terms(steps: LoggedSteps) -> dict[str, Terms]:
-    weights, zeros = steps.session_weights, np.zeros(len(steps.first))
-    kinds = {name: (*kind, steps.returns, zeros) for name, kind in IPS_KINDS.items()}
+    kinds = {name: (*kind, steps.returns, 0 * ones) for name, kind in IPS_KINDS.items()}
     if steps.model is not None and len(steps.session) == len(steps.first):
         left, value = steps.reward - steps.model.q, steps.model.v
         kinds |= {name: (*kind, left, value) for name, kind in DR_KINDS.items()}
-    terms = {}
     for name, (shrink, parameters, left, value) in kinds.items():
-        parameter = tune(shrink, parameters, weights, left, value)
-        shrunk = shrink(weights, parameter)
-        biased = bool((shrunk != weights).any())
-        terms[name] = Terms(value + shrunk * left, np.ones(len(weights)), shrunk, parameter, biased)
+        parameter = tune(shrink, parameters, last, left, value)
+        shrunk = shrink(last, parameter)
+        biased = bool((shrunk != last).any())
+        terms[name] = Terms(value + shrunk * left, ones, shrunk, parameter, biased)
     return terms
 
 
@@ -236,13 +223,8 @@ def tune(
     left: Float64Array,
     value: Float64Array,
 ) -> float:
-    """The parameter of least estimated mean squared error, the first of equals (Su et al. 2020).
-
-    Args:
-        weights: (S,) unshrunk.
-        left: (S,) r − q.
-        value: (S,) v.
-    """
+    """The parameter of least estimated mean squared error, the first of equals (Su et al. 2020), of
+    unshrunk weights, r − q and v (S,)."""
     errors = [
         mean_squared_error(weights, shrink(weights, parameter), left, value)
         for parameter in parameters
@@ -296,8 +278,7 @@ def normalise_by_step(
     bootstrap, which then needs one number per session rather than one per step.
 
     Args:
-        left: (N,) reward, or what the model leaves of it.
-        v: (N,) modelled values, or None.
+        left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
         sums: of all sessions; where there are more than those of `steps`, without modelled values.
     """
     weights, step, sessions, totals = steps.weights, steps.step, sums.sessions, sums.totals
@@ -334,7 +315,7 @@ _USABLE = 0.9
 
 @dataclass(frozen=True)
 class Interval:
-    """What resampling says of one number."""
+    """What resampling says of a number."""
 
     low: float
     high: float
@@ -358,8 +339,7 @@ def cluster_intervals(
     value and error rise and fall together, which percentiles of the value alone miss.
 
     Args:
-        above: (S, K), one row per session, one column per estimate.
-        below: (S, K).
+        above: (S, K), one row per session, one column per estimate; as `below`.
         cluster: (S,) of each session, any integers; None where each session is its own.
 
     Returns:
@@ -367,10 +347,9 @@ def cluster_intervals(
         differ that more than a tenth of the resamples have no spread.
     """
     resamples = resample(above, below, cluster, seed)
-    usable = resamples.usable
     intervals: list[Interval | None] = []
     for k, (value, error) in enumerate(zip(resamples.value, resamples.error, strict=True)):
-        rows = usable[:, k]
+        rows = resamples.usable[:, k]
         if not resamples.spreads[k] or rows.mean() < _USABLE:
             intervals.append(None)
             continue
@@ -396,10 +375,8 @@ class Resamples:
     spreads: BoolArray
     """(K,) whether clusters differ at all."""
 
-    @property
-    def usable(self) -> BoolArray:
-        """(B, K) whether the resample has a spread of its own."""
-        return np.asarray(np.isfinite(self.shift) & (self.errors > 1e-9 * self.error))
+    usable: BoolArray
+    """(B, K) whether the resample has a spread of its own."""
 
 
 def resample(
@@ -425,9 +402,24 @@ def resample(
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
     moments = np.stack([e, b, e * e, e * b, b * b])
-    shift, errors = _draw_resamples(moments, correction, seed)
-    spreads = (error > 1e-12) & (clusters > 1)
-    return Resamples(value, error * unit, shift * unit, errors * unit, spreads)
+    flat, at_once = (
+        np.moveaxis(moments, 1, 0).reshape(clusters, -1),
+        max(1, _COUNTS_AT_ONCE // clusters),
+    )
+    counts, shifts, spreads = _draw_counts(clusters, seed), [], []
+    for begin in range(0, RESAMPLES, at_once):
+        # How often each cluster is drawn stands for the resampled rows.
+        times = counts[begin : begin + at_once].astype(np.float64)
+        e, b, ee, eb, bb = (times @ flat).reshape(-1, 5, len(value)).swapaxes(0, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shift = np.where(b > 0, e / b, np.nan)
+            spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
+            spreads.append(correction * np.sqrt(spread) / b * unit)
+        shifts.append(shift * unit)
+    shift, errors, error_in_units = np.concatenate(shifts), np.concatenate(spreads), error * unit
+    usable = np.isfinite(shift) & (errors > 1e-9 * error_in_units)
+    differ = (error > 1e-12) & (clusters > 1)
+    return Resamples(value, error_in_units, shift, errors, differ, usable)
 
 
 def cluster_mean(
@@ -448,27 +440,6 @@ def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray,
         return np.arange(sessions), sessions
     names = np.unique(cluster, return_inverse=True)[1]
     return names, int(names.max()) + 1
-
-
-def _draw_resamples(
-    moments: Float64Array, correction: float, seed: int
-) -> tuple[Float64Array, Float64Array]:
-    """Deviation from the estimate (B, K) in each resample, and the resample's standard error, of
-    moments (5, C, K) of clusters: e, b, e², e b and b², where the estimate is Σe / Σb = 0."""
-    _, clusters, columns = moments.shape
-    flat = np.moveaxis(moments, 1, 0).reshape(clusters, -1)
-    counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
-    shifts, errors = [], []
-    for begin in range(0, RESAMPLES, at_once):
-        # How often each cluster is drawn stands for the resampled rows.
-        times = counts[begin : begin + at_once].astype(np.float64)
-        e, b, ee, eb, bb = (times @ flat).reshape(-1, 5, columns).swapaxes(0, 1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            shift = np.where(b > 0, e / b, np.nan)
-            spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)
-            errors.append(correction * np.sqrt(spread) / b)
-        shifts.append(shift)
-    return np.concatenate(shifts), np.concatenate(errors)
 
 
 @lru_cache(maxsize=1)

@@ -228,13 +228,7 @@ class LoggedSteps:
         return self.regroup(rows, numbers, None if self.user is None else self.user[sessions])
 
     def regroup(self, rows: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
-        """Some steps, in other sessions.
-
-        Args:
-            rows: (M,) numbers of the steps, in their new order.
-            session: (M,) session of each, in the new order.
-            user: (S,) of the new sessions; None where each is of another user.
-        """
+        """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
         values = {name: getattr(self, name) for name in (*_COLUMNS, "model", "groups")}
         taken: dict[str, Any] = {
             name: replace(value, **{key: column[rows] for key, column in vars(value).items()})
@@ -257,11 +251,7 @@ class LoggedSteps:
 
 
 def _convert_to_floats(name: str, values: Any) -> Float64Array:
-    """(N,) values as float64, not copied where they are that; NaN where one is missing or masked.
-
-    Raises:
-        InputError: they are no numbers, or have another shape.
-    """
+    """(N,) values as float64, not copied where they are that; NaN where one is missing."""
     try:
         column = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     except (TypeError, ValueError) as error:
@@ -319,20 +309,17 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
 
 
 def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = None) -> LoggedSteps:
-    """Sessions of one step each, put together to pages.
+    """Put sessions of one step each together to pages: a session a page, in order of the numbers of
+    `page`, each of the user of its first step.
 
     The evaluated policy chooses each position without knowing what the others got; its probability
     of a page is the product of those of the positions. A model of the steps' reward stays: in DR it
     is a control variate, whose errors the weights correct.
 
     Args:
-        steps: sessions of one step.
         page: (N,) whose equal numbers mark one page.
         position: (N,) by which the steps of a page are ordered, the cascade's first in front; None
             for the order of the steps.
-
-    Returns:
-        A session a page, in order of the numbers of `page`, each of the user of its first step.
 
     Raises:
         InputError: a session has several steps, or `page` has another shape.
@@ -353,12 +340,8 @@ def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = Non
 
 
 def number_pages(user: IntArray, time: IntArray) -> IntArray:
-    """(N,) number of the page of each step: of one user, each row within 10 ms of the one before.
-
-    Args:
-        user: (N,) whose step it is.
-        time: (N,) ms.
-    """
+    """(N,) number of each step's page: rows of one user (N,), each within 10 ms of the one before,
+    by their time (N,) in ms."""
     order = np.lexsort((time, user))
     begins = (np.diff(user[order], prepend=-1) != 0) | (np.diff(time[order], prepend=0) > PAGE_MS)
     page = np.empty(len(order), dtype=np.int64)

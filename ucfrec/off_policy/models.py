@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
-from ucfrec.errors import InputError
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.off_policy.score import ScoredSteps
 from ucfrec.processes import require_blas_memory
@@ -30,11 +29,11 @@ _NUMBERS_AT_ONCE = 2**22
 class StepInputs:
     """B logged steps as the models see them."""
 
-    context: Tensor
-    """(B, C): the state (S), the return that is left of the target, and last-layer features of the
-    policy's window, which item-knn and crm-greedy lack."""
-    state_size: int
-    """S."""
+    states: Tensor
+    """(B, S)."""
+    window: Tensor
+    """(B, 1 + F): the return that is left of the target, and last-layer features of the policy's
+    window, which item-knn and crm-greedy lack."""
     chosen: Tensor
     """(B, D) embedding of the logged item; zeros for an item that the run does not know."""
     shown: Tensor
@@ -51,21 +50,20 @@ class StepInputs:
         )
 
     def _cross(self, items: Tensor, score: Tensor) -> Float32Array:
-        """Features (B, P), linear in item embeddings (B, D) and score (B, 1): a constant 1, the
-        context, the item, and products of the two.
+        """Features (B, P), linear in item embeddings (B, D) and score (B, 1): a constant 1, state,
+        window, item, and products.
 
         The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) and the
         return left are multiplied with the item's own, dimension by dimension. The rest of the
         state (user, observation) is multiplied with as many of the item's first dimensions as
         `_PRODUCTS` allows.
         """
-        dim, size = items.shape[1], self.state_size
-        left = self.context[:, [size]]
-        embeddings, remainder = self.context[:, : 3 * dim], self.context[:, 3 * dim : size]
+        dim, left = items.shape[1], self.window[:, [0]]
+        embeddings, remainder = self.states[:, : 3 * dim], self.states[:, 3 * dim :]
         leading = items[:, : _PRODUCTS // max(remainder.shape[1], 1)]
         products = (remainder.unsqueeze(2) * leading.unsqueeze(1)).flatten(1)
         ones, matches = torch.ones(len(items), 1), embeddings * items.repeat(1, 3)
-        parts = [ones, self.context, items, score, matches, left * items, products]
+        parts = [ones, self.states, self.window, items, score, matches, left * items, products]
         return np.asarray(torch.cat(parts, dim=1))
 
 
@@ -87,11 +85,11 @@ def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tens
     scores = batch.scores.log_softmax(-1).clamp(min=_LOWEST_SCORE)
     mean_score = (probabilities * scores).sum(1)
     score = torch.where(in_catalogue, scores.gather(1, column)[:, 0], mean_score)
-    context = [batch.states, batch.returns_left[:, None]]
-    context += [] if batch.features is None else [batch.features]
+    window = [batch.returns_left[:, None]]
+    window += [] if batch.features is None else [batch.features]
     inputs = StepInputs(
-        context=torch.cat([part.float() for part in context], dim=1),
-        state_size=batch.states.shape[1],
+        states=batch.states.float(),
+        window=torch.cat([part.float() for part in window], dim=1),
         chosen=embeddings[batch.items] * in_catalogue[:, None],
         shown=probabilities @ embeddings,
         scores=torch.stack([score, mean_score], dim=1),
@@ -103,19 +101,16 @@ class InputsFile:
     """Inputs of N steps in a file without a name: some hundred numbers a step, none in memory."""
 
     def __init__(self, steps: int) -> None:
-        self._steps, self._end = steps, 0
-        self._rows = array_on_disk((0, 0))
-        self._sizes: list[int] = []
-        self._state_size = 0
+        self._rows = array_on_disk((steps, 0))
+        self._end, self._sizes = 0, [0]
 
     def append(self, inputs: StepInputs) -> None:
         """Write the next steps."""
-        parts = (inputs.context, inputs.chosen, inputs.shown, inputs.scores)
-        self._sizes = [part.shape[1] for part in parts]
-        self._state_size = inputs.state_size
+        parts: list[Tensor] = [*vars(inputs).values()]
         if not self._end:
-            self._rows = array_on_disk((self._steps, sum(self._sizes)))
-        begin, self._end = self._end, self._end + len(inputs.context)
+            self._sizes = [part.shape[1] for part in parts]
+            self._rows = array_on_disk((len(self._rows), sum(self._sizes)))
+        begin, self._end = self._end, self._end + len(parts[0])
         self._rows[begin : self._end] = torch.cat(parts, dim=1).numpy()
 
     def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
@@ -124,14 +119,13 @@ class InputsFile:
 
     def states(self) -> Iterator[Float32Array]:
         """(B, S) states of all steps in order, some thousand at once."""
-        return (np.asarray(part.context[:, : part.state_size]) for part in self._read())
+        return (np.asarray(inputs.states) for inputs in self._read())
 
     def _read(self) -> Iterator[StepInputs]:
         at_once = max(1, min(ROWS_AT_ONCE, _NUMBERS_AT_ONCE // self._rows.shape[1]))
-        for begin in range(0, self._steps, at_once):
+        for begin in range(0, len(self._rows), at_once):
             rows = torch.from_numpy(np.array(self._rows[begin : begin + at_once]))
-            context, chosen, mean, scores = torch.split(rows, self._sizes, dim=1)
-            yield StepInputs(context, self._state_size, chosen, mean, scores)
+            yield StepInputs(*torch.split(rows, self._sizes, dim=1))
 
 
 def array_on_disk(shape: tuple[int, int]) -> Float32Array:
@@ -196,10 +190,6 @@ class BehaviorModel:
     calibration_error: float
     """Mean absolute difference between what is predicted and what occurs, over groups and tenths
     of the predicted probability, weighted by their steps."""
-    temperature: float
-    """Scores are divided by it."""
-    share: float
-    """How much of the group's share in the logs is mixed in."""
 
     def __str__(self) -> str:
         return (
@@ -222,8 +212,7 @@ def fit_behavior(
         states: reads what was known before each step.
         item: (N,) logged items; −1, unknown, gets probability 1 and is fitted on nowhere.
         group: (N,) their groups, from 0.
-        session: (N,) number of each step's session, from 0.
-        user: (S,) of each session; None where each is of another user.
+        session: (N,) as of `LoggedSteps`, as is `user`.
     """
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
@@ -269,8 +258,6 @@ def fit_behavior(
         log_loss=float(-np.log(of_group[in_catalogue]).mean()),
         share_log_loss=float(-np.log(mean_shares).mean()),
         calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
-        temperature=calibration[0],
-        share=calibration[1],
     )
 
 
@@ -399,23 +386,18 @@ def fit_models(
     user: IntArray | None = None,
     discount: float = 1.0,
 ) -> tuple[Modelled, ModelReport]:
-    """Linear models of reward and Q, cross-fitted over users: no session is predicted by a model
-    that saw it, nor by one that saw another session of its user.
+    """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
+    by a model that saw it, nor by one that saw another session of its user.
 
     Args:
-        reward: (N,).
-        session: (N,) number of each step's session, from 0, never falling; steps in order.
-        user: (S,) whose session each is; None where each is of another user.
-        discount: γ of Q.
+        reward: (N,) as of `LoggedSteps`, as are `session`, `user` and `discount`.
 
     Returns:
-        What the models say of the N steps, and how good they are; an `InputError` with one user.
+        What the models say of the N steps, and how good they are.
     """
     sessions = np.arange(int(session[-1]) + 1)
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]
     users = int(group.max()) + 1
-    if users < 2:
-        raise InputError("a model needs sessions of users other than the one it predicts")
     fold_of = np.random.default_rng(seed).permutation(users) % min(_RETURN_FOLDS, users)
     folds = fold_of[group][session]
     last = np.diff(session, append=len(sessions)) > 0
@@ -423,13 +405,24 @@ def fit_models(
     with progress(2 * len(reward), "models", "steps") as bar:
         sums = _add_up(chunks, reward, folds, last, bar.update)
         fits = [
-            sums.fit(fold, reward[folds != fold], horizon, discount)
+            _fit_to_others(sums, fold, reward[folds != fold], horizon, discount)
             for fold in range(len(sums.rows))
         ]
-        modelled = _predict(chunks, fits, folds, bar.update)
-    errors = reward + discount * np.where(last, 0.0, np.roll(modelled.v, -1)) - modelled.q
+        weights = np.stack([fit.weights for fit in fits], axis=2)
+        predictions, begin = np.empty((2, 2, len(reward))), 0
+        for batch in chunks():
+            fold = folds[begin : begin + len(batch[0]), None]
+            for both, inputs in zip(predictions, batch, strict=True):
+                for predicted, model in zip(both, weights, strict=True):
+                    values = np.take_along_axis(inputs @ model, fold, axis=1)
+                    predicted[begin : begin + len(fold)] = values[:, 0]
+            begin += len(fold)
+            bar.update(len(fold))
+    (logged_reward, q), (mean_reward, v) = predictions
+    modelled = Modelled(mean_reward, q, v, logged_reward)
+    errors = reward + discount * np.where(last, 0.0, np.roll(v, -1)) - q
     variance = float(((reward - reward.mean()) ** 2).mean())
-    left = float(((reward - modelled.logged_reward) ** 2).mean())
+    left = float(((reward - logged_reward) ** 2).mean())
     return modelled, ModelReport(
         reward_r2=1 - left / variance if variance > 0 else 0.0,
         td_loss=float((errors**2).mean()),
@@ -439,18 +432,7 @@ def fit_models(
     )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Weights (P,) of the reward model and of Q."""
-
-    reward: Float64Array
-    q: Float64Array
-    iterations: int
-    converged: bool
-
-
-@dataclass(frozen=True)
-class _Sums:
+class _Sums(NamedTuple):
     """Sums over the steps of each of F folds."""
 
     gram: Float64Array
@@ -462,40 +444,44 @@ class _Sums:
     rows: IntArray
     """(F,)."""
 
-    def fit(self, fold: int, reward: Float64Array, horizon: int, discount: float) -> _Fit:
-        """The models that know all folds but one.
 
-        The ridge penalty counts features by their root mean square, and gives all P of them
-        together the variance of the noise; the constant goes free.
+class _Fit(NamedTuple):
+    weights: Float64Array
+    """(2, P) of the reward model and of Q."""
+    iterations: int
+    converged: bool
 
-        Args:
-            reward: rewards of the steps of the other folds.
-        """
-        gram, follows, rewards = (
-            sums.sum(axis=0) - sums[fold] for sums in (self.gram, self.follows, self.rewards)
-        )
-        rows = int(self.rows.sum() - self.rows[fold])
-        mean_square = np.diag(self.gram.sum(axis=0)) / int(self.rows.sum())
-        # A feature that is always 0 has no weight to find.
-        penalty: Float64Array = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
-        penalty[0] = 0.0
-        factor = cho_factor(gram + np.diag(penalty))
-        weights = first = cho_solve(factor, rewards, check_finite=False)
-        most = horizon * max(abs(reward.min()), abs(reward.max()))
-        iterations, converged = 1, True
-        while iterations < _ROUNDS * horizon:
-            iterations += 1
-            previous, target = weights, rewards + discount * (follows @ weights)
-            weights = cho_solve(factor, target, check_finite=False)
-            size = (weights @ gram @ weights / rows) ** 0.5
-            if not size <= most:
-                # Root mean square above the largest possible return: it diverges.
-                weights, converged = previous, False
-                break
-            change = weights - previous
-            if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
-                break
-        return _Fit(first, weights, iterations, converged)
+
+def _fit_to_others(
+    sums: _Sums, fold: int, reward: Float64Array, horizon: int, discount: float
+) -> _Fit:
+    """The models that know all folds but one, with the rewards of these others.
+
+    The ridge penalty counts features by their root mean square, and gives all P of them together
+    the variance of the noise; the constant goes free.
+    """
+    gram, follows, rewards, rows = (total.sum(axis=0) - total[fold] for total in sums)
+    mean_square = np.diag(sums.gram.sum(axis=0)) / int(sums.rows.sum())
+    # A feature that is always 0 has no weight to find.
+    penalty: Float64Array = len(gram) * np.where(mean_square > 0, mean_square, 1.0)
+    penalty[0] = 0.0
+    factor = cho_factor(gram + np.diag(penalty))
+    weights = first = cho_solve(factor, rewards, check_finite=False)
+    most = horizon * max(abs(reward.min()), abs(reward.max()))
+    iterations, converged = 1, True
+    while iterations < _ROUNDS * horizon:
+        iterations += 1
+        previous, target = weights, rewards + discount * (follows @ weights)
+        weights = cho_solve(factor, target, check_finite=False)
+        size = (weights @ gram @ weights / rows) ** 0.5
+        if not size <= most:
+            # Root mean square above the largest possible return: it diverges.
+            weights, converged = previous, False
+            break
+        change = weights - previous
+        if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
+            break
+    return _Fit(np.stack([first, weights]), iterations, converged)
 
 
 def _add_up(
@@ -529,27 +515,3 @@ def _add_up(
         update(rows)
     assert sums is not None
     return sums
-
-
-def _predict(
-    chunks: Chunks, fits: list[_Fit], folds: IntArray, update: Callable[[int], object]
-) -> Modelled:
-    """What the models say of every step."""
-    reward_weights = np.stack([fit.reward for fit in fits], axis=1)
-    q_weights = np.stack([fit.q for fit in fits], axis=1)
-    predictions, begin = np.empty((4, len(folds))), 0
-    for features, at_policy in chunks():
-        end = begin + len(features)
-        fold = folds[begin:end, None]
-        for row, inputs, weights in (
-            (0, at_policy, reward_weights),
-            (1, features, q_weights),
-            (2, at_policy, q_weights),
-            (3, features, reward_weights),
-        ):
-            values = np.take_along_axis(inputs @ weights, fold, axis=1)
-            predictions[row, begin:end] = values[:, 0]
-        begin = end
-        update(len(features))
-    reward, q, v, logged_reward = predictions
-    return Modelled(reward, q, v, logged_reward)

@@ -18,9 +18,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import sessions_before
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.sessions import seen_before
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
+from ucfrec.episodes.windows import seen_before
 from ucfrec.errors import InputError
 from ucfrec.files.locks import scratch_folder
 from ucfrec.logs.mapping import LogMapping
@@ -62,12 +61,11 @@ class LoggedSessions:
     @property
     def history_lacking(self) -> str:
         """A warning where users are taken to have no earlier rows; empty otherwise."""
-        if self.rows.earlier is not None:
-            return ""
-        return (
+        text = (
             "the store of the run is gone or has changed: users are ranked without what they were "
             "shown before these logs; move the run together with its store"
         )
+        return text if self.rows.earlier is None else ""
 
 
 @dataclass(frozen=True)
@@ -75,21 +73,21 @@ class ScoredSteps:
     """B logged steps with the policy's probabilities of all items."""
 
     episodes: IntArray
-    """(B,): number of each step's session."""
+    """(B,) number of each step's session."""
     steps: IntArray
-    """(B,): position of each step in its session, from 0."""
+    """(B,) position of each step in its session, from 0."""
     items: Tensor
-    """(B,) int64: the logged items; −1 where the run does not know them."""
+    """(B,) int64; −1 where the run does not know the logged item."""
     states: Tensor
-    """(B, S): states before the steps."""
+    """(B, S) before the steps."""
     scores: Tensor
-    """(B, n_items): what the rule decides by, see `ucfrec.acting.scorer.Scorer.scores`."""
+    """(B, n_items) what the rule decides by, see `ucfrec.acting.scorer.Scorer.scores`."""
     log_probabilities: Tensor
-    """(B, n_items): natural logarithm of the probability that the policy shows each item."""
+    """(B, n_items) natural logarithm of the probability that the policy shows each item."""
     returns_left: Tensor
-    """(B,): target return less the session's reward before the step."""
+    """(B,) target return less the session's reward before the step."""
     features: Tensor | None
-    """(B, d): last-layer features of the policy's window; None of a policy that is not a network of
+    """(B, d) last-layer features of the policy's window; None of a policy that is not a network of
     features (item-knn, crm-greedy)."""
 
 
@@ -101,9 +99,8 @@ def read_logged_sessions(
     keep_unknown: bool = False,
     memory_limit: str = "2GB",
 ) -> Iterator[LoggedSessions]:
-    """Read logs in the same way as the training logs of a run.
-
-    The result is a context manager; the prepared logs are on disk until its block ends.
+    """Read logs in the same way as the training logs of a run; they are on disk until the block of
+    this context manager ends.
 
     Args:
         mapping: which columns of the logs mean what; what it leaves open is as in the training
@@ -160,11 +157,11 @@ def prepare_sessions(
         if len(trained.user_ids):
             numbers = np.unique(store.episode_values(schema.USER))
             strangers = report["users"] - int((numbers >= 0).sum())
-            name, users = str(files[0]), report["users"]
-            note_unknown(name, schema.USER_ID, strangers, users, "the run was trained on")
+            name, where = str(files[0]), "the run was trained on"
+            note_unknown(name, schema.USER_ID, strangers, report["users"], where)
         store = _select_observations(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
-        store, rows = _add_history(trained, store, users, readable_store(trained))
+        store, rows = _add_history(trained, store, users, _readable_store(trained))
         yield LoggedSessions(store, users, report, rows, unknown)
 
 
@@ -174,13 +171,12 @@ def _add_history(
     """The sessions and all rows of their users; earlier rows of a session that goes on are a part
     of it, as in `recommend`. Session ids of the store are not kept: such sessions begin with the
     logs."""
-    record = trained.record
-    rows = UserRows.of(
-        store, users, None if earlier is None else _select_observations(earlier, trained)
-    )
-    if record.session_by != schema.SESSION_ID:
-        store = rows.continued(record.session_gap_ms)
-    return store, rows
+    if earlier is not None:
+        earlier = _select_observations(earlier, trained)
+    rows = UserRows.of(store, users, earlier)
+    if trained.record.session_by == schema.SESSION_ID:
+        return store, rows
+    return rows.continued(trained.record.session_gap_ms), rows
 
 
 def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
@@ -201,16 +197,15 @@ def score_steps(
     rule: DecisionRule | None = None,
     seen: UserRows | None = None,
 ) -> Iterator[ScoredSteps]:
-    """Compute the policy's probabilities at every step of `store`, in order and in batches.
+    """Compute the policy's probabilities at every step of `store`, in order and in batches, under
+    its own rule or another.
 
     Args:
-        rule: the decision rule; None for the run's own.
         seen: rows of the users; items that a user was shown before a step are excluded there, as
             `recommend` and `serve` exclude them by default. None to exclude none.
     """
-    n_items = len(trained.items)
+    n_items, total, scorer = len(trained.items), store.n_steps, trained.scorer(rule)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
-    total, scorer = store.n_steps, trained.scorer(rule)
     with progress(total, "score", "steps") as bar:
         for begin in range(0, total, at_once):
             numbers = np.arange(begin, min(begin + at_once, total))
@@ -236,8 +231,8 @@ def score_steps(
 
 
 def _find_seen_items(seen: UserRows, steps: IntArray, n_items: int) -> tuple[Tensor, Tensor]:
-    """Rows (M,) and items (M,) of what users were shown before steps; none of a row in which no
-    item would be left."""
+    """Rows (M,) and items (M,) of what users were shown before steps; none of a row that would
+    have no item left."""
     rows, items = seen.seen(steps)
     in_catalogue = items < n_items
     pairs = np.unique(rows[in_catalogue] * n_items + items[in_catalogue])
@@ -252,11 +247,10 @@ def score(
     rule: DecisionRule | None = None,
     filter_seen: bool = False,
 ) -> Iterator[pd.DataFrame]:
-    """Compute the policy's probability of every logged choice.
+    """Compute the policy's probability of every logged choice, under its own rule or another.
 
     Args:
         logged: the logs, without unknown items.
-        rule: the decision rule; None for the run's own.
         filter_seen: exclude items that the user was shown before a step.
 
     Yields:
@@ -327,11 +321,8 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """The share of logged rows that are in the run's training or validation data; None if the run's
     store has been moved, deleted or changed.
 
-    Rows are the same if their user, item and time are. A refit was trained on its test split too.
-
-    Args:
-        logged: a store that numbers users and items as the run's store does
-            (`ucfrec.logs.prepare(like=…)`).
+    Rows are the same if their user, item and time are, which both stores number alike
+    (`ucfrec.logs.prepare(like=…)`). A refit was trained on its test split too.
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
@@ -344,8 +335,7 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
 
 def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
     """`share_seen` of rows by their `hash_rows`."""
-    store = readable_store(trained)
-    if store is None:
+    if (store := _readable_store(trained)) is None:
         return None
     keys, rows = np.unique(keys, return_counts=True)
     seen = np.zeros(len(keys), dtype=bool)
@@ -357,8 +347,8 @@ def share_of_rows_seen(trained: TrainedPolicy, keys: KeyArray) -> float | None:
     return float(rows[seen].sum() / rows.sum())
 
 
-def readable_store(trained: TrainedPolicy) -> EpisodeStore | None:
-    """The store that the run was trained on; None where it is gone, changed or damaged."""
+def _readable_store(trained: TrainedPolicy) -> EpisodeStore | None:
+    """The run's store; None where it is gone, changed or damaged."""
     try:
         return trained.training_store()
     except InputError:
@@ -376,16 +366,13 @@ def seen_too_often(seen: float | None) -> list[str]:
 
 
 def _hash_store(store: EpisodeStore) -> Iterator[KeyArray]:
-    """Hash the (user, item, time) of each step to one number; some at a time, in order."""
-    if not store.n_episodes:
-        return
+    """`hash_rows` of all steps, some at a time, in order."""
     users: Array = store.episode_values(schema.USER)
-    for episodes, steps in store.step_batches():
-        yield hash_rows(
-            users[episodes],
-            store.step_values(schema.ITEM, episodes, steps),
-            store.step_values(schema.TIMESTAMP, episodes, steps),
+    for episodes, steps in store.step_batches() if store.n_episodes else ():
+        items, times = (
+            store.step_values(name, episodes, steps) for name in (schema.ITEM, schema.TIMESTAMP)
         )
+        yield hash_rows(users[episodes], items, times)
 
 
 def hash_rows(users: Array, items: Array, times: Array) -> KeyArray:

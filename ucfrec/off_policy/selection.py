@@ -12,8 +12,9 @@ together, from one bootstrap that draws users and treats all candidates alike:
   chapter 10).
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class Standing:
     probability_best: float
     """Share of resamples in which no other candidate has a larger value."""
     rank: int
-    """From 1, by value."""
+    """From 1."""
 
 
 @dataclass(frozen=True)
@@ -50,21 +51,21 @@ class Selection:
     """The candidates in order of their values, and what choosing the first costs."""
 
     standings: tuple[Standing, ...]
+    """Empty if no verdict stands; then the numbers are NaN."""
     corrected: float
     """Value of the first without the luck of having been chosen."""
     regret: float
     """With 95% confidence the first is at most this far below the best of them; 0 if it is
     best beyond doubt (Hsu, Annals of Statistics 1984, with the clustered bootstrap)."""
-
-    @property
-    def chosen(self) -> Standing:
-        """The candidate of the largest value."""
-        return self.standings[0]
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    """Name of each candidate that is not ranked, and what forbids a conclusion on it."""
 
     @property
     def headline(self) -> str:
         """What was chosen, and how certain that is."""
-        first = self.chosen
+        if not self.standings:
+            return "The logs allow no conclusion on any of the candidates"
+        first = self.standings[0]
         if len(self.standings) == 1:
             return f"{first.name} is the only candidate"
         sure = f"best with probability {first.probability_best:.2f}"
@@ -77,6 +78,22 @@ class Selection:
             f"{first.name} comes first: {self.corrected:.4g} per session once corrected for the "
             f"choice ({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
         )
+
+    def columns(self, name: str) -> dict[str, Any]:
+        """What the rows of a candidate record of it."""
+        columns: dict[str, Any] = {"selection": self.headline}
+        for standing in self.standings:
+            if standing.name == name:
+                columns |= {
+                    "band_low": standing.low,
+                    "band_high": standing.high,
+                    "probability_best": standing.probability_best,
+                    "rank": standing.rank,
+                    "candidates": len(self.standings),
+                }
+                if standing.rank == 1:
+                    columns |= {"corrected": self.corrected, "regret": self.regret}
+        return columns
 
 
 def select(
@@ -110,19 +127,15 @@ def select(
     # What the first of each resample is worth there, beyond its worth in the whole sample.
     luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
     first = int(np.argmax(value))
-    corrected = float(value[first] - max(luck, 0.0))
-    return Selection(tuple(standings), corrected, _find_regret(terms, first, seed, user))
-
-
-def _find_regret(terms: Float64Array, first: int, seed: int, user: IntArray | None) -> float:
-    """Upper end of how much better than the first any other may be."""
-    lead = np.delete(terms, first, axis=1) - terms[:, [first]]
-    if not lead.shape[1]:
-        return 0.0
-    resamples = resample(lead, np.ones_like(lead), user, seed)
-    upper = resamples.value + _critical(-_studentise(resamples)) * resamples.error
-    # Candidates that never differ are neither better nor worse.
-    return float(upper[resamples.spreads].max(initial=0.0))
+    corrected, regret = float(value[first] - max(luck, 0.0)), 0.0
+    if len(names) > 1:
+        # Upper end of how much better than the first any other may be.
+        lead = np.delete(terms, first, axis=1) - terms[:, [first]]
+        leads = resample(lead, np.ones_like(lead), user, seed)
+        upper = leads.value + _critical(-_studentise(leads)) * leads.error
+        # Candidates that never differ are neither better nor worse.
+        regret = float(upper[leads.spreads].max(initial=0.0))
+    return Selection(tuple(standings), corrected, regret)
 
 
 def _studentise(resamples: Resamples) -> Float64Array:
@@ -137,42 +150,7 @@ def _critical(deviations: Float64Array) -> float:
     return float(np.quantile(deviations.max(axis=1), LEVEL))
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What the logs say of several candidates together."""
-
-    selection: Selection | None
-    """The candidates whose verdicts stand, ranked; None if there are none."""
-    excluded: Mapping[str, str]
-    """Name of each other candidate, and what forbids a conclusion."""
-
-    @property
-    def headline(self) -> str:
-        """Which candidate to take, or that the logs do not show it."""
-        if self.selection is None:
-            return "The logs allow no conclusion on any of the candidates"
-        return self.selection.headline
-
-    def columns(self, name: str) -> dict[str, Any]:
-        """What the rows of a candidate record of it."""
-        columns: dict[str, Any] = {"selection": self.headline}
-        if self.selection is None or name in self.excluded:
-            return columns
-        standings = self.selection.standings
-        standing = next(row for row in standings if row.name == name)
-        columns |= {
-            "band_low": standing.low,
-            "band_high": standing.high,
-            "probability_best": standing.probability_best,
-            "rank": standing.rank,
-            "candidates": len(standings),
-        }
-        if standing is self.selection.chosen:
-            columns |= {"corrected": self.selection.corrected, "regret": self.selection.regret}
-        return columns
-
-
-def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
+def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
     """Rank the candidates whose verdicts stand.
 
     Args:
@@ -197,19 +175,15 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Choice:
     terms = {name: report.terms for name, report in reports.items() if name not in excluded}
     columns = [values for values in terms.values() if values is not None]
     if not columns:
-        return Choice(None, excluded)
-    user = reports[first].user
-    return Choice(select(list(terms), np.stack(columns, axis=1), seed, user), excluded)
+        return Selection((), math.nan, math.nan, excluded)
+    ranked = select(list(terms), np.stack(columns, axis=1), seed, reports[first].user)
+    return replace(ranked, excluded=excluded)
 
 
 def names_of(candidates: Sequence[Mapping[str, object]]) -> list[str]:
-    """Names that say what differs among the candidates, e.g. "target return 5, greedy".
-
-    Candidates that differ have different names: numbers have the digits that distinguish them.
-
-    Args:
-        candidates: of each, what it is made of, e.g. run, target return and rule.
-    """
+    """Names that say what differs among candidates, of what each is made of, e.g. "target return 5,
+    greedy". Candidates that differ have different names: numbers have the digits that distinguish
+    them."""
     differing = [
         key for key in candidates[0] if len({str(parts[key]) for parts in candidates}) > 1
     ] or list(candidates[0])[:1]

@@ -82,12 +82,6 @@ class Diagnosis:
     """Between these lies the value if the propensities are true, whatever the choices that the logs
     lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
-    @property
-    def few_weigh(self) -> bool:
-        """Whether few users have most of the weight: then tests of weights, which take means for
-        normal, reject too often."""
-        return (self.tail or 0.0) > HEAVY_TAIL or self.effective_users < ENOUGH_USERS
-
     def as_columns(self) -> dict[str, Any]:
         """What speaks against the estimates, by name."""
         return {
@@ -188,7 +182,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
 
 
 def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> WeightTest:
-    """One test that weights (N,) of users (N,) have mean 1: within three standard errors."""
+    """Test that weights (N,) of users (N,) have mean 1, within three standard errors."""
     mean, error = cluster_mean(weights, user)
     return WeightTest(name, mean, error, abs(mean - 1) <= _ERRORS * error)
 
@@ -319,8 +313,9 @@ class Verdict:
     @property
     def headline(self) -> str:
         """The verdict without its reasons."""
+        rests_on = f" ({self.declared})" if self.declared else ""
         if not self.reliable or self.lift_low is None or self.lift_high is None:
-            return f"Do not rely on this estimate{self._rests_on}"
+            return f"Do not rely on this estimate{rests_on}"
         if self.lift_low > 0:
             says = "The policy has a higher return than the logged one"
         elif self.lift_high < 0:
@@ -331,12 +326,8 @@ class Verdict:
             f"{says}: {self.lift:+.4g} per session [{self.lift_low:+.4g}, {self.lift_high:+.4g}] "
             f"by {self.estimator}, better with probability {self.probability_better:.3f}; a lift "
             f"of {self.wanted_lift:.4g} would show with about {self.sessions_needed or 0:,} "
-            f"sessions{self._rests_on}"
+            f"sessions{rests_on}"
         )
-
-    @property
-    def _rests_on(self) -> str:
-        return f" ({self.declared})" if self.declared else ""
 
 
 def conclude(
@@ -456,9 +447,11 @@ def _explain_failure(diagnosis: Diagnosis, filter_seen: bool) -> str:
         failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
     )
     alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
+    # Where few users have most of the weight, tests that take means for normal reject too often.
+    few_weigh = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.effective_users < ENOUGH_USERS
     if worst.mean >= 1:
         return f"{worst}, where 1 is expected: propensities are too small"
-    if alone and diagnosis.few_weigh:
+    if alone and few_weigh:
         cause = (
             "sessions that the policy would often have may be too rare in these logs: give more "
             "logs; or the logs lack choices that the policy makes"

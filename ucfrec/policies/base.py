@@ -11,10 +11,9 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
 from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
 from ucfrec.settings import Dropout, Width, require, settings_table
@@ -184,7 +183,7 @@ class SequencePolicy(nn.Module, ABC):
         Returns-to-go are first raised to the lowest value in the training data: after a session has
         reached its target return, they would otherwise leave the range of the training data.
         """
-        states = ((windows.states - self.state_mean) / self.state_std).clamp(-_CLIP, _CLIP)
+        states = standardise(windows.states, self.state_mean, self.state_std)
         returns_to_go = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
         return replace(windows, states=states, returns_to_go=returns_to_go / self.return_scale)
 
@@ -203,13 +202,12 @@ class SequencePolicy(nn.Module, ABC):
             features: (B, K, d) of the windows.
             windows: normalised.
         """
-        exposed, padded = self.exposed(windows), some_padding(windows.mask)
+        padded = some_padding(windows.mask)
+        exposed = self.exposed(windows, padded)
 
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
             return values.flatten(0, 1) if padded is None else values[padded]
 
-        if exposed is not None and padded is not None:
-            exposed = exposed.select(padded.flatten())
         inputs = (steps(features), steps(windows.actions), exposed)
         if self.values is None:
             value = self.head.loss(*inputs)  # type: ignore[arg-type]
@@ -254,16 +252,23 @@ class SequencePolicy(nn.Module, ABC):
         best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 
-    def exposed(self, windows: Windows) -> Exposed | None:
-        """What was shown before each of the (B·K) steps; None without `policy.exposure`."""
+    def exposed(self, windows: Windows, steps: Tensor | None = None) -> Exposed | None:
+        """What was shown before each of the (B·K) steps, or of the `steps` of a mask (B, K); None
+        without `policy.exposure`."""
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
-        return Exposed.before(windows, self.head.exposure.lags)
+        exposed = Exposed.before(windows, self.head.exposure.lags)
+        return exposed if steps is None else exposed.select(steps.flatten())
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
         return Exposed.before_last(windows, self.head.exposure.lags)
+
+
+def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """States (..., S) in standard deviations from their mean, clipped."""
+    return ((states - mean) / std).clamp(-_CLIP, _CLIP)
 
 
 def require_items(name: str, sizes: Mapping[str, int]) -> None:

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -117,7 +117,7 @@ class PopularPolicy(SequencePolicy):
     @torch.no_grad()
     def _set_mean(self, train: EpisodeStore) -> None:
         if isinstance(self.head, VectorHead):
-            actions = torch.from_numpy(train.step_values(schema.ACTION, *train.all_steps()))
+            actions = torch.from_numpy(train.column(schema.ACTION))
             mean = actions.double().mean(0).to(self.head.scale) / self.head.scale
             self.head.out.bias.copy_(torch.atanh(mean.clamp(-_WITHIN, _WITHIN)))
 
@@ -201,9 +201,9 @@ def shrink_rates(counts: TrainingCounts) -> Tensor:
     `PRIOR` steps at the mean are added to every item, and half a step to both outcomes of the mean,
     so that no rate is 0 or 1.
     """
-    shown, liked = counts.shown.double(), counts.liked.double()
-    mean = (liked.sum() + 0.5) / (shown.sum() + 1)
-    rates: Tensor = (liked + PRIOR * mean) / (shown + PRIOR)
+    impressions, liked = counts.shown.double(), counts.liked.double()
+    mean = (liked.sum() + 0.5) / (impressions.sum() + 1)
+    rates: Tensor = (liked + PRIOR * mean) / (impressions + PRIOR)
     return rates.float()
 
 
@@ -217,7 +217,7 @@ def count_decayed(
         half_life: hours; infinite, or without times in the store, all steps count alike.
     """
     n_items = len(train.item_states.embeddings)
-    shown, liked = np.zeros(n_items), np.zeros(n_items)
+    impressions, liked = np.zeros(n_items), np.zeros(n_items)
     timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
     last = int(train.column(schema.TIMESTAMP).max()) if timed else 0
     names = (schema.ITEM, schema.REWARD, *([schema.TIMESTAMP] if timed else []))
@@ -225,9 +225,9 @@ def count_decayed(
         weights = np.ones(len(items))
         if timed:
             weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
-        shown += np.bincount(items, weights, n_items)
+        impressions += np.bincount(items, weights, n_items)
         liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
-    return TrainingCounts(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)
+    return TrainingCounts(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
 
 @settings_table("policy")
@@ -291,10 +291,11 @@ class ItemKNNPolicy(SequencePolicy):
     def _choose_temperature(self, held_out: EpisodeStore) -> None:
         """Minimise the negative log-likelihood, convex in the temperature, by bisection."""
         numbers = np.linspace(0, held_out.n_steps - 1, min(held_out.n_steps, _ROWS), dtype=np.int64)
-        windows = held_out.windows(*held_out.locate(numbers), self.config.context)
+        episodes, steps = held_out.locate(numbers)
+        windows = held_out.windows(episodes, steps, self.config.context)
         windows = windows.to(self.cosines.device)
-        scores, shown = self.features(windows)[:, -1], windows.actions[:, -1:]
-        of_shown = scores.gather(1, shown).mean()
+        scores, items = self.features(windows)[:, -1], windows.actions[:, -1:]
+        of_shown = scores.gather(1, items).mean()
         assert isinstance(self.head, ItemHead)
         low, high = 0.0, _HOTTEST
         for _ in range(_HALVINGS):
@@ -323,10 +324,10 @@ class ItemKNNPolicy(SequencePolicy):
             rewards: (B, N) of these, in reward units.
         """
         weights = (rewards - self.reward_low) * (items >= 0)
-        known = items.clamp(min=0)
-        weighted = (self.cosines[known] * weights.unsqueeze(-1)).flatten(1)
+        items = items.clamp(min=0)
+        weighted = (self.cosines[items] * weights.unsqueeze(-1)).flatten(1)
         scores = weighted.new_zeros(len(items), len(self.cosines))
-        return scores.scatter_add_(1, self.neighbors[known].flatten(1), weighted)
+        return scores.scatter_add_(1, self.neighbors[items].flatten(1), weighted)
 
     def _logits(self, windows: Windows) -> Tensor:
         assert isinstance(self.head, ItemHead)
@@ -381,13 +382,13 @@ class BPRPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Factors (B, K, d) of the user before each step."""
-        liked = self._liked(windows).unsqueeze(-1)
+        liked = self._find_liked(windows).unsqueeze(-1)
         sums = (self.of_history(windows.actions) * liked).cumsum(1)
         means = sums / liked.cumsum(1).clamp(min=1)
         return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
 
-    def _liked(self, windows: Windows) -> Tensor:
-        """(B, K) 1 at liked steps, as of `ucfrec.episodes.item_counts`, otherwise 0."""
+    def _find_liked(self, windows: Windows) -> Tensor:
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
         least = least_liked(self.reward_low, self.reward_high)
         return ((windows.rewards >= least) & windows.mask).float()
 
@@ -395,19 +396,18 @@ class BPRPolicy(SequencePolicy):
         """Mean loss over the liked steps of the windows, and scalars to log."""
         head = self.head
         assert isinstance(head, ItemHead)
-        normalized, liked = self.normalize(windows), self._liked(windows) > 0
-        features, shown = self.features(normalized)[liked], windows.actions[liked]
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(liked.flatten())
-        negative = torch.randint(len(head.bias), shown.shape, device=shown.device)
-        apart = head.logit(features, shown, exposed) - head.logit(features, negative, exposed)
-        value = -F.logsigmoid(apart).sum() / max(1, len(shown))
+        normalized, liked = self.normalize(windows), self._find_liked(windows) > 0
+        features, items = self.features(normalized)[liked], windows.actions[liked]
+        exposed = self.exposed(normalized, liked)
+        negative = torch.randint(len(head.bias), items.shape, device=items.device)
+        apart = head.logit(features, items, exposed) - head.logit(features, negative, exposed)
+        value = -F.logsigmoid(apart).sum() / max(1, len(items))
         return value, {"bpr_loss": value.detach()}
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean loss over the liked last steps and all items, the validation loss."""
-        liked = self._liked(windows)[:, -1] > 0
+        liked = self._find_liked(windows)[:, -1] > 0
         if not bool(liked.any()):
             return windows.rewards.new_zeros(())
-        scores, shown = self.act(windows)[liked], windows.actions[liked, -1:]
-        return -F.logsigmoid(scores.gather(1, shown) - scores).mean()
+        scores, items = self.act(windows)[liked], windows.actions[liked, -1:]
+        return -F.logsigmoid(scores.gather(1, items) - scores).mean()

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
-from ucfrec.episodes.item_counts import TrainingCounts, least_liked, liked_rewards
+from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy, require_items
@@ -48,7 +48,7 @@ class BoostedPolicy(SequencePolicy):
 
     Config = BoostedConfig
     config: BoostedConfig
-    shown: Tensor
+    impressions: Tensor
     liked: Tensor
     directions: Tensor
     tag: Tensor
@@ -64,7 +64,7 @@ class BoostedPolicy(SequencePolicy):
         super().__init__(config, sizes)
         n_items, splits = sizes["items"], (_SPLITS, TREES)
         for name, value in (
-            ("shown", torch.zeros(n_items)),
+            ("impressions", torch.zeros(n_items)),
             ("liked", torch.zeros(n_items)),
             ("directions", torch.zeros(n_items, sizes["action"])),
             ("tag", torch.arange(n_items)),
@@ -80,7 +80,7 @@ class BoostedPolicy(SequencePolicy):
     def start_from(self, train: EpisodeStore) -> None:
         """Set counts, directions and first tags of the items, and the range of the rewards."""
         counts, states = TrainingCounts.of(train), train.item_states
-        self.shown.copy_(counts.shown)
+        self.impressions.copy_(counts.shown)
         self.liked.copy_(counts.liked)
         self.directions.copy_(F.normalize(states.embeddings, dim=1))
         if states.tags.shape[1]:
@@ -99,7 +99,8 @@ class BoostedPolicy(SequencePolicy):
             if len(steps) > _MAX_ROWS:
                 sample = np.random.default_rng(seed).choice(len(steps), _MAX_ROWS, replace=False)
                 steps = np.sort(sample)
-            trees = fit_trees(*self._rows(train, steps), seed)
+            inputs, liked = self._rows(train, steps)
+            trees = fit_trees(inputs, liked, seed)
             self.base.copy_(trees["base"])
             count = len(trees["leaves"])
             self.leaves[:count] = trees["leaves"]
@@ -111,31 +112,28 @@ class BoostedPolicy(SequencePolicy):
     def _rows(self, train: EpisodeStore, numbers: IntArray) -> tuple[Array, BoolArray]:
         """Inputs (M, F) of the trees at training steps (M,), and which were liked."""
         folds = np.arange(train.n_episodes) % _FOLDS
-        other_counts = []
+        whole, in_folds = torch.stack([self.impressions, self.liked]).cpu(), list[Tensor]()
         for fold in range(_FOLDS):
-            fold_counts = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
-            other_counts.append(
-                torch.stack(
-                    [self.shown.cpu() - fold_counts.shown, self.liked.cpu() - fold_counts.liked]
-                )
-            )
-        counts = torch.stack(other_counts, dim=1)  # (2, folds, n_items)
+            of_fold = TrainingCounts.of(train.select(np.flatnonzero(folds == fold)))
+            in_folds.append(whole - torch.stack([of_fold.shown, of_fold.liked]))
+        counts = torch.stack(in_folds, dim=1)  # (2, folds, n_items), without the fold
         inputs, target = [], []
         for begin in range(0, len(numbers), _AT_ONCE):
-            at = train.locate(numbers[begin : begin + _AT_ONCE])
-            windows = train.windows(*at, self.config.context)
+            episodes, steps = train.locate(numbers[begin : begin + _AT_ONCE])
+            windows = train.windows(episodes, steps, self.config.context)
             items = windows.actions[:, -1:]
-            of_items = counts[:, torch.from_numpy(folds[at[0]]).unsqueeze(1), items]
-            device = self.shown.device
+            of_items = counts[:, torch.from_numpy(folds[episodes]).unsqueeze(1), items]
+            device = self.impressions.device
             rows = self._inputs(windows.to(device), items.to(device), of_items.to(device))
             inputs.append(rows[:, 0].cpu().numpy())
-            target.append(liked_rewards(train, train.step_values(schema.REWARD, *at)))
+            rewards = train.step_values(schema.REWARD, episodes, steps)
+            target.append(liked_rewards(train, rewards))
         return np.concatenate(inputs), np.concatenate(target)
 
-    def _rate(self, liked: Tensor, shown: Tensor) -> Tensor:
+    def _rate(self, liked: Tensor, impressions: Tensor) -> Tensor:
         """Log-odds of rates of likes, shrunk to the mean by `PRIOR` rows."""
-        mean = (self.liked.sum() + 0.5) / (self.shown.sum() + 1)
-        return torch.logit((liked + PRIOR * mean) / (shown + PRIOR))
+        mean = (self.liked.sum() + 0.5) / (self.impressions.sum() + 1)
+        return torch.logit((liked + PRIOR * mean) / (impressions + PRIOR))
 
     def _inputs(self, windows: Windows, items: Tensor, counts: Tensor | None = None) -> Tensor:
         """Inputs (B, C, F) of the trees for C items at the windows' last steps.
@@ -145,18 +143,20 @@ class BoostedPolicy(SequencePolicy):
             items: (C,), or (B, C) int64.
             counts: (2, B, C) how often the items were shown and liked; None for all training rows.
         """
-        before = windows.mask[:, :-1].float()  # (B, N)
+        valid = windows.mask[:, :-1].float()  # (B, N)
         earlier, rewards = windows.actions[:, :-1], windows.rewards[:, :-1]
-        liked = before * (rewards >= least_liked(self.reward_low, self.reward_high))
-        shown_of, liked_of = (self.shown[items], self.liked[items]) if counts is None else counts
-        count, likes = before.sum(1, keepdim=True), liked.sum(1, keepdim=True)
+        liked = valid * (rewards >= least_liked(self.reward_low, self.reward_high))
+        if counts is None:
+            counts = torch.stack([self.impressions[items], self.liked[items]])
+        shown_of, liked_of = counts
+        count, likes = valid.sum(1, keepdim=True), liked.sum(1, keepdim=True)
         cosines = self.directions[items] @ self.directions[earlier].mT  # (B, C, N)
         # Products of other batches differ in the last bits, which could change a tree's branch.
-        cosines = _rounded(cosines)
+        cosines = _round(cosines)
         none = cosines.new_zeros(cosines.shape[:2])
         alike = self.tag[items].unsqueeze(-1) == self.tag[earlier].unsqueeze(1)
         tagged, liked_tagged = (
-            (alike.float() @ weights.unsqueeze(-1)).squeeze(-1) for weights in (before, liked)
+            (alike.float() @ weights.unsqueeze(-1)).squeeze(-1) for weights in (valid, liked)
         )
         whole = (likes + 1) / (count + 2)
         columns = (
@@ -164,16 +164,16 @@ class BoostedPolicy(SequencePolicy):
             torch.log1p(shown_of),
             self._rate(likes, count),
             count,
-            liked[:, -1:] - 1 + before[:, -1:] if earlier.shape[1] else none[:, :1],
-            _rounded((cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1)),
-            _rounded((cosines @ before.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1)),
-            cosines[..., -1] * before[:, -1:] if earlier.shape[1] else none,
+            liked[:, -1:] - 1 + valid[:, -1:] if earlier.shape[1] else none[:, :1],
+            _round((cosines @ liked.unsqueeze(-1)).squeeze(-1) / likes.clamp(min=1)),
+            _round((cosines @ valid.unsqueeze(-1)).squeeze(-1) / count.clamp(min=1)),
+            cosines[..., -1] * valid[:, -1:] if earlier.shape[1] else none,
             torch.logit((liked_tagged + 2 * whole) / (tagged + 2)),
             tagged,
         )
         return torch.stack([weights.expand_as(none) for weights in columns], dim=-1)
 
-    def _scored(self, windows: Windows, items: Tensor) -> Tensor:
+    def _score(self, windows: Windows, items: Tensor) -> Tensor:
         """Log-odds (B, C) of a like of items as of `_inputs`."""
         inputs = self._inputs(windows, items)
         scores = []
@@ -193,9 +193,9 @@ class BoostedPolicy(SequencePolicy):
     @torch.no_grad()
     def act(self, windows: Windows) -> Tensor:
         """Log-odds of a like of all items at the last step, (B, n_items)."""
-        rates = self._rate(self.liked, self.shown)
+        rates = self._rate(self.liked, self.impressions)
         best = rates.topk(min(self.config.boosted, len(rates))).indices
-        boosted = self._scored(windows, best)
+        boosted = self._score(windows, best)
         # Others have their rate and what the session adds to those that the trees score.
         added = (boosted - rates[best]).mean(1, keepdim=True)
         return (rates + added).index_copy(1, best, boosted)
@@ -209,9 +209,9 @@ class BoostedPolicy(SequencePolicy):
         """Mean log loss (nats) of likes at the windows' last steps."""
         least = least_liked(self.reward_low, self.reward_high)
         liked = (windows.rewards[:, -1] >= least).float()
-        scores = self._scored(windows, windows.actions[:, -1:])[:, 0]
+        scores = self._score(windows, windows.actions[:, -1:])[:, 0]
         return F.binary_cross_entropy_with_logits(scores, liked)
 
 
-def _rounded(values: Tensor) -> Tensor:
+def _round(values: Tensor) -> Tensor:
     return torch.round(values, decimals=_DECIMALS)

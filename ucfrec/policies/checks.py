@@ -84,7 +84,7 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
     back[::2] = 0  # what acting computes is the last row
     cuts = context - 1 - back
     first, acts = _outputs(policy, windows)
-    second, other_acts = _outputs(policy, _changed(windows, cuts, policy))
+    second, other_acts = _outputs(policy, _change(windows, cuts, policy))
     unchanged = windows.mask & (torch.arange(context) <= cuts[:, None])
     if _alike(first[unchanged], second[unchanged]) and _alike(acts[::2], other_acts[::2]):
         return
@@ -125,7 +125,7 @@ def _sample(train: EpisodeStore, length: int, most: int | None = None) -> Window
     return train.windows(episodes, lasts if most is None else lasts.clip(max=most - 1), length)
 
 
-def _changed(windows: Windows, cuts: Tensor, policy: SequencePolicy) -> Windows:
+def _change(windows: Windows, cuts: Tensor, policy: SequencePolicy) -> Windows:
     """Windows with other actions and rewards from the steps `cuts` (B,) on, and other states and
     returns-to-go after them."""
     at = torch.arange(windows.mask.shape[1])

@@ -12,9 +12,8 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.counterfactual.reward_model import mlp
-from ucfrec.episodes.exposure import Shown
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import Shown, Windows
 from ucfrec.policies.base import PolicyConfig, SequencePolicy
 from ucfrec.policies.heads import VectorHead
 from ucfrec.user_model.reward import MEMORY, ItemRewardModel

@@ -72,13 +72,13 @@ class DTPolicy(SequencePolicy):
 
     def transform(self, windows: Windows) -> Tensor:
         """Outputs at all tokens R_0, s_0, a_0, R_1, …, (B, 3K, d), from normalised windows."""
-        return self.attended(self.tokens(windows), windows.mask)
+        return self.attend(self.tokens(windows), windows.mask)
 
     def tokens(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens R_t, s_t and a_t, (B, K, d) each, from normalised windows."""
         return self.embed(windows, self.head.embed(windows.actions))  # type: ignore[no-any-return]
 
-    def attended(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> Tensor:
+    def attend(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> Tensor:
         """Outputs (B, 3K, d) at tokens of `tokens`; `mask` (B, K) is false at padding."""
         hidden, visible = self._first(tokens, mask)
         for block in self.blocks:
@@ -89,7 +89,7 @@ class DTPolicy(SequencePolicy):
         """Row K − 1 of `features`, (B, d), without what the last block has for other tokens."""
         first = self._first(self.tokens(windows), windows.mask)
         state = slice(-2, -1)
-        return self.final_norm(rows_through(self.blocks, *first, state))[:, 0]  # type: ignore[no-any-return]
+        return self.final_norm(pass_rows(self.blocks, *first, state))[:, 0]  # type: ignore[no-any-return]
 
     def _first(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the first block (B, 3K, d), and which of them see which, (B, 1, 3K, 3K)."""
@@ -114,16 +114,16 @@ class Block(nn.Module):
     def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
         """Map (B, L, d) to (B, L, d); `visible` (B, 1, L, L) comes from `visible_tokens`."""
         query, key, value = self.query_key_value(self.attention_norm(hidden)).chunk(3, dim=-1)
-        return self._updated(hidden, query, key, value, visible)
+        return self._update(hidden, query, key, value, visible)
 
     def rows(self, hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
         """The `rows` of what `forward` gives, (B, M, d)."""
         layer, dim, normed = self.query_key_value, hidden.shape[-1], self.attention_norm(hidden)
         query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
         key, value = F.linear(normed, layer.weight[dim:], layer.bias[dim:]).chunk(2, dim=-1)
-        return self._updated(hidden[:, rows], query, key, value, visible[:, :, rows])
+        return self._update(hidden[:, rows], query, key, value, visible[:, :, rows])
 
-    def _updated(
+    def _update(
         self, hidden: Tensor, query: Tensor, key: Tensor, value: Tensor, visible: Tensor
     ) -> Tensor:
         """Tokens (B, M, d) whose queries (B, M, d) have attended to keys and values (B, L, d)."""
@@ -138,9 +138,7 @@ class Block(nn.Module):
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
 
-def rows_through(
-    blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice
-) -> Tensor:
+def pass_rows(blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
     """The `rows` (B, M, d) of what `Block`s make of (B, L, d), by `visible` (B, 1, L, L)."""
     *first_blocks, last = blocks
     assert isinstance(last, Block)
@@ -150,17 +148,11 @@ def rows_through(
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, visible: Tensor, dropout: float) -> Tensor:
-    """Scaled dot-product attention.
+    """Scaled dot-product attention (B, H, L, c) of query, key and value of this shape.
 
     Args:
-        query: (B, H, L, c), as are `key` and `value`.
-        key: see `query`.
-        value: see `query`.
         visible: (B, 1, L, L) bool, true where a row may attend to a column; somewhere in each row.
         dropout: share of the attention weights that is dropped, as by `Dropout`.
-
-    Returns:
-        (B, H, L, c).
     """
     if dropout == 0 or query.device.type != "cpu":
         return F.scaled_dot_product_attention(query, key, value, visible, dropout)
@@ -201,17 +193,13 @@ class CDT4RecPolicy(DTPolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set the mean and standard deviation of the training rewards."""
-        rewards = torch.from_numpy(train.step_values(schema.REWARD, *train.all_steps()))
+        rewards = torch.from_numpy(train.column(schema.REWARD))
         self.reward_mean.copy_(rewards.mean())
         self.reward_std.copy_(rewards.std(correction=0).clamp(min=1e-6))
 
-    def estimated_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
-        """Estimates (B, K) of the logged actions' standardised rewards.
-
-        Args:
-            hidden: (B, 3K, d) outputs of `transform`.
-            mask: (B, K) bool, false at padding.
-        """
+    def estimate_rewards(self, hidden: Tensor, mask: Tensor) -> Tensor:
+        """Estimates (B, K) of the logged actions' standardised rewards, from outputs (B, 3K, d) of
+        `transform`; the mask (B, K) is false at padding."""
         states, actions = hidden[:, 1::3], hidden[:, 2::3]
         length = mask.shape[1]
         later = torch.ones(length, length, dtype=torch.bool, device=mask.device).triu(1)
@@ -233,7 +221,7 @@ class CDT4RecPolicy(DTPolicy):
         hidden = self.transform(normalized)
         imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
         rewards = (windows.rewards - self.reward_mean) / self.reward_std
-        reward_loss = (self.estimated_rewards(hidden, mask) - rewards).square()[mask].mean()
+        reward_loss = (self.estimate_rewards(hidden, mask) - rewards).square()[mask].mean()
         return imitation + self.config.reward_weight * reward_loss, {
             **scalars,
             "reward_loss": reward_loss.detach(),
@@ -290,7 +278,7 @@ class DT4RecPolicy(DTPolicy):
         """Action loss plus weighted contrastive loss over all steps, and scalars to log."""
         config, normalized = self.config, self.normalize(windows)
         tokens = self.tokens(normalized)
-        features = self.attended(tokens, normalized.mask)[:, 1::3]
+        features = self.attend(tokens, normalized.mask)[:, 1::3]
         imitation, scalars = self.imitation(features, normalized)
         if config.contrastive_weight == 0:
             return imitation, scalars
@@ -304,9 +292,8 @@ class DT4RecPolicy(DTPolicy):
         """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.
 
         Args:
-            windows: B normalised windows.
+            windows: B normalised windows, with their `features` (B, K, d).
             encoded: their tokens s_t and a_t, (B, K, d) each, which returns do not change.
-            features: (B, K, d) their features.
         """
         config, mask = self.config, windows.mask
         actions = self.head.embed(windows.actions)[mask]
@@ -316,7 +303,7 @@ class DT4RecPolicy(DTPolicy):
             both_valid = mask & mask[order]
             returns = torch.where(both_valid, windows.returns_to_go[order], windows.returns_to_go)
             prompts = self.embed.returns(replace(windows, returns_to_go=returns))
-            negative = self.attended((prompts, *encoded), mask)[:, 1::3]
+            negative = self.attend((prompts, *encoded), mask)[:, 1::3]
             score = F.cosine_similarity(negative[mask], actions, dim=-1)
             # An equal return-to-go is not a negative.
             same = (returns == windows.returns_to_go)[mask]

@@ -16,45 +16,32 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.reward_model import mlp
-from ucfrec.episodes.exposure import Exposed
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions, Windows
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.policies.base import Context, PolicyConfig, Returns
+from ucfrec.policies.base import Context, PolicyConfig, Returns, standardise
 from ucfrec.policies.dt import DTConfig, DTPolicy
-from ucfrec.policies.heads import ItemHead, VectorHead
+from ucfrec.policies.heads import VectorHead
 from ucfrec.processes import random_state_kept
-from ucfrec.settings import BatchSize, Count, LearningRate, Weight, Width, require, settings_table
+from ucfrec.settings import Count, Weight, require, settings_table
 
 _AT_ONCE = 4096
 _LOGGED = 100_000
 """Largest number of logged actions that candidates are drawn from."""
-
-
-@settings_table("cql")
-class CQLConfig:
-    """Settings of CQL, which estimates state values here; like returns-to-go, without discount."""
-
-    steps: Count = 2000
-    """Updates of the network."""
-    weight: Weight = 1.0
-    """α of the conservative term."""
-    hidden: Width = 128
-    """Width of the two hidden layers."""
-    candidates: Annotated[int, Field(ge=2, le=10_000)] = 20
-    """Actions sampled in place of all actions: half from the logs, half uniformly."""
-    learning_rate: LearningRate = 3e-4
-    """Learning rate."""
-    batch_size: BatchSize = 128
-    """Transitions per update."""
-    target_rate: Annotated[float, Field(gt=0, le=1)] = 0.01
-    """Rate at which the target network moves to the network at every update."""
+_HIDDEN = 128
+"""Width of the two hidden layers of CQL's network."""
+_CANDIDATES = 20
+"""Actions sampled in place of all actions: half from the logs, half uniformly."""
+_LEARNING_RATE = 3e-4
+_BATCH_SIZE = 128
+_TARGET_RATE = 0.01
+"""Rate at which the target network moves to the network at every update."""
 
 
 class ConservativeQ(nn.Module):
     """Q(s, a) of states and action vectors (embeddings, for items), and its target network.
 
-    States are standardised; values are in units of the largest absolute training return.
+    Values are in units of the largest absolute training return, without discount.
     """
 
     state_mean: Tensor
@@ -65,9 +52,9 @@ class ConservativeQ(nn.Module):
     high: Tensor
     unit: Tensor
 
-    def __init__(self, store: EpisodeStore, config: CQLConfig) -> None:
+    def __init__(self, store: EpisodeStore, weight: float) -> None:
         super().__init__()
-        self.config = config
+        self.weight = weight
         mean, std = store.state_statistics
         episodes, steps = store.all_steps()
         sample = np.linspace(0, len(steps) - 1, min(len(steps), _LOGGED)).astype(np.int64)
@@ -83,28 +70,28 @@ class ConservativeQ(nn.Module):
         self.register_buffer("high", vectors.max(0).values)
         self.register_buffer("unit", torch.tensor(float(np.abs(store.returns).max()) or 1.0))
         inputs = len(mean) + vectors.shape[1]
-        self.network, self.target = (mlp(inputs, config.hidden, 2, 1) for _ in range(2))
+        self.network, self.target = (mlp(inputs, _HIDDEN, 2, 1) for _ in range(2))
         self.target.load_state_dict(self.network.state_dict())
         self.target.requires_grad_(False)
 
     def q(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
         """Values (M,) of states (M, S) and actions (M, A), by `network` or the trained network."""
-        standard = ((states - self.state_mean) / self.state_std).clamp(-10, 10)
-        value: Tensor = (network or self.network)(torch.cat([standard, actions], dim=-1))
+        states = standardise(states, self.state_mean, self.state_std)
+        value: Tensor = (network or self.network)(torch.cat([states, actions], dim=-1))
         return value.squeeze(-1)
 
     def candidates(self, count: int) -> Tensor:
-        """Random actions (count, C, A) for `count` states; see `CQLConfig.candidates`."""
-        shape = (count, self.config.candidates // 2)
+        """Random actions (count, C, A) for `count` states."""
+        shape = (count, _CANDIDATES // 2)
         logged = self.logged[torch.randint(len(self.logged), shape)]
         if self.every is not None:
             uniform = self.every[torch.randint(len(self.every), shape)]
         else:
             low, high = self.low, self.high
-            uniform = low + (high - low) * torch.rand(*shape, len(low))
+            uniform = low + (high - low) * torch.rand((*shape, len(low)))
         return torch.cat([logged, uniform], dim=1)
 
-    def compared(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
+    def compare(self, states: Tensor, actions: Tensor, network: nn.Module | None = None) -> Tensor:
         """Values (M, C) of candidate actions (M, C, A) in states (M, S)."""
         repeated = states.unsqueeze(1).expand(-1, actions.shape[1], -1)
         flat = self.q(repeated.flatten(0, 1), actions.flatten(0, 1), network)
@@ -112,7 +99,7 @@ class ConservativeQ(nn.Module):
 
     def state_values(self, states: Tensor, network: nn.Module | None = None) -> Tensor:
         """V̂(s) (M,) of states (M, S): mean of Q under the softmax of Q over candidates."""
-        values = self.compared(states, self.candidates(len(states)), network)
+        values = self.compare(states, self.candidates(len(states)), network)
         return (values.softmax(-1) * values).sum(-1)
 
     def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
@@ -122,51 +109,54 @@ class ConservativeQ(nn.Module):
         """
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
-                slow.lerp_(fast, self.config.target_rate)
+                slow.lerp_(fast, _TARGET_RATE)
             next_values = self.state_values(batch.next_states, self.target)
             target = batch.rewards / self.unit + next_values.masked_fill(batch.last, 0.0)
         value = self.q(batch.states, batch.actions)
-        values = self.compared(batch.states, self.candidates(len(value)))
+        values = self.compare(batch.states, self.candidates(len(value)))
         soft_maximum = torch.cat([values, value.unsqueeze(1)], dim=1).logsumexp(-1)
         conservative = (soft_maximum - value).mean()
         error = 0.5 * F.mse_loss(value, target)
-        return self.config.weight * conservative + error, {"td": error.detach()}
+        return self.weight * conservative + error, {"td": error.detach()}
 
 
 @random_state_kept()
-def relabelled(store: EpisodeStore, config: CQLConfig, folder: Path, seed: int) -> EpisodeStore:
+def relabel(
+    store: EpisodeStore, steps: int, weight: float, folder: Path, seed: int
+) -> EpisodeStore:
     """The store with returns-to-go raised by CQL's state values (EDT4Rec).
 
     Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
 
     Args:
         store: training episodes without augmented episodes.
-        folder: keeps the Q function; training resumes from it.
+        steps: updates of the Q function, which the folder keeps; training resumes from it.
+        weight: α of the conservative term.
     """
     torch.manual_seed(seed)
-    network = ConservativeQ(store, config)
+    network = ConservativeQ(store, weight)
     loop = LoopConfig(
-        steps=config.steps,
-        batch_size=config.batch_size,
-        learning_rate=config.learning_rate,
+        steps=steps,
+        batch_size=_BATCH_SIZE,
+        learning_rate=_LEARNING_RATE,
         clip_norm=1.0,
         warmup_steps=0,
         average=0.0,
     )
 
     def draw(generator: np.random.Generator) -> Transitions:
-        return store.transitions(*store.draw_steps(generator, config.batch_size))
+        return store.transitions(*store.draw_steps(generator, _BATCH_SIZE))
 
     fit(network, draw, network.loss, loop, folder, seed=seed, describe="cql")
     torch.manual_seed(seed)
-    episodes, steps = store.all_steps()
-    values = np.empty(len(steps), dtype=np.float64)
+    episodes, numbers = store.all_steps()
+    values = np.empty(len(numbers), dtype=np.float64)
     with torch.no_grad():
-        for begin in range(0, len(steps), _AT_ONCE):
+        for begin in range(0, len(numbers), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
-            states = store.windows(episodes[part], steps[part], 1).states[:, 0]
+            states = store.windows(episodes[part], numbers[part], 1).states[:, 0]
             values[part] = (network.state_values(states) * network.unit).numpy()
-    rewards = store.step_values(schema.REWARD, episodes, steps)
+    rewards = store.step_values(schema.REWARD, episodes, numbers)
     return store.with_returns_to_go(optimistic_returns(rewards, values, store.lengths))
 
 
@@ -179,8 +169,6 @@ def optimistic_returns(
 
     With C_t the sum of rewards before t, R_t + C_t is the maximum of V_k + C_k over k > t (V = 0
     after the last step): a running maximum from the end, computed for all episodes at once.
-
-    Example: rewards [1, 0, 0] with values [9, 2, 5] of one episode give [6, 5, 0].
 
     Args:
         rewards: (N,) of all episodes, concatenated.
@@ -266,17 +254,15 @@ class EDT4RecPolicy(DTPolicy):
         train = super().training_view(train, config, folder, seed)
         if not config.relabel:
             return train
-        cql = CQLConfig(steps=config.cql_steps, weight=config.cql_weight)
-        return relabelled(train, cql, folder, seed)
+        return relabel(train, config.cql_steps, config.cql_weight, folder, seed)
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Negative log-likelihood (nats) plus the entropy constraint's terms for λ and policy."""
         normalized = self.normalize(_consistent(windows))
         features = self.features(normalized)
         imitation, scalars = self.imitation(features, normalized)
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(windows.mask.flatten())
-        entropy = _entropy(self.head, features[windows.mask], exposed)
+        exposed = self.exposed(normalized, windows.mask)
+        entropy = self.head.entropy(features[windows.mask], exposed)  # type: ignore[operator]
         multiplier = self.log_multiplier.exp()
         constraint = (
             multiplier * (entropy.detach() - self.least_entropy) - multiplier.detach() * entropy
@@ -310,13 +296,10 @@ class GaussianHead(VectorHead):
         nats = 0.5 * error.square() + log_deviation + 0.5 * math.log(2 * math.pi)
         return nats.sum(-1)
 
-
-def _entropy(head: nn.Module, features: Tensor, exposed: Exposed | None) -> Tensor:
-    """Mean entropy (nats) of the head's distribution over M steps, features (M, d)."""
-    if isinstance(head, GaussianHead):
-        return (head.deviations(features) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1).mean()
-    assert isinstance(head, ItemHead)
-    return head.entropy(features, exposed)
+    def entropy(self, features: Tensor, exposed: None = None) -> Tensor:
+        """Mean entropy (nats) over M steps, features (M, d)."""
+        nats = self.deviations(features) + 0.5 * math.log(2 * math.pi * math.e)
+        return nats.sum(-1).mean()
 
 
 def _consistent(windows: Windows) -> Windows:

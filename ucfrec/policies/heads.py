@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Exposed, ExposureTerm, Likeness, columns_of
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.exposure import ExposureTerm, Likeness, columns_of
+from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.fitting.distributed import joint_moments
 
 EXPOSURE_KNOTS = 6
@@ -35,7 +35,8 @@ class Candidates:
 
 
 class Proposal:
-    """Draws items with probability Q: half in proportion to training counts, half evenly.
+    """Draws items with probability Q: half in proportion to training counts (n_items,) above 0,
+    half evenly.
 
     By counts alone, items that the logs hardly show but the policy likes would be drawn too rarely
     for their weight; evenly alone, popular items would (`benchmarks/LOG.md` has all three). The
@@ -44,10 +45,6 @@ class Proposal:
     """
 
     def __init__(self, counts: Tensor) -> None:
-        """
-        Args:
-            counts: (n_items,) training counts, above 0.
-        """
         share = counts.double() / counts.double().sum()
         self.share = (share + 1 / len(counts)) / 2
         self._cumulative = self.share.cumsum(0)
@@ -119,11 +116,7 @@ class ItemHead(nn.Module):
         exposure: ExposureTerm | None = None,
         samples: int = 0,
     ) -> None:
-        """
-        Args:
-            embedding_size: of an item's fixed embedding.
-            samples: draws for the softmax of a training batch; 0 for the softmax of all items.
-        """
+        """Samples are draws for the softmax of a training batch; 0 for that of all items."""
         super().__init__()
         self.samples = samples
         self.exposure = exposure
@@ -153,9 +146,8 @@ class ItemHead(nn.Module):
     def all_vectors(self) -> Tensor:
         """Vectors (n_items, d) of all items.
 
-        In evaluation mode without gradients they are computed once for each state of the weights.
-        Fused optimizers and `.data` change weights without a trace, so whatever trains also ends
-        what is kept: gradients, and any change of mode.
+        Without gradients they are computed once for each state of the weights. Fused optimizers and
+        `.data` change weights without a trace, so gradients and changes of mode end what is kept.
         """
         if self.training or torch.is_grad_enabled():
             self._kept = None
@@ -171,9 +163,15 @@ class ItemHead(nn.Module):
         self._kept = None
         return super().train(mode)
 
-    def embed(self, actions: Tensor) -> Tensor:
-        """Embed int64 items (B, K) as (B, K, d)."""
-        return self._vectors_of(actions)
+    def embed(self, items: Tensor) -> Tensor:
+        """Vectors (..., d) of int64 items (...); in evaluation mode without gradients, those kept.
+
+        A graph that is exported computes those of its items.
+        """
+        if self.training or torch.is_grad_enabled() or torch.compiler.is_compiling():
+            self._kept = None
+            return self.vectors(items)
+        return F.embedding(items, self.all_vectors())
 
     def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Logits over all items (..., n_items) from features (..., d).
@@ -182,16 +180,13 @@ class ItemHead(nn.Module):
             features: (M, d) with `exposed`.
             exposed: what was shown before the M steps; needed with an exposure term.
         """
-        # Scaling the features instead of the logits saves two passes over the larger of them.
-        scaled = features / features.shape[-1] ** 0.5
-        logits: Tensor = F.linear(scaled, self.all_vectors(), self.bias).float()
-        if self.exposure is not None and exposed is not None:
-            return self.exposure.added_to(logits, exposed)
-        return logits
+        return self._logits(features, self.all_vectors(), self.bias, None, exposed)
 
-    def logits_of(self, features: Tensor, items: Tensor, exposed: Exposed | None = None) -> Tensor:
+    def predict_items(
+        self, features: Tensor, items: Tensor, exposed: Exposed | None = None
+    ) -> Tensor:
         """The columns (M, L) of `predict` of `items` (L,), ascending, each once."""
-        return self._logits(features, self._vectors_of(items), self._bias_of(items), items, exposed)
+        return self._logits(features, self.embed(items), self._gather_bias(items), items, exposed)
 
     def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M,)."""
@@ -205,9 +200,15 @@ class ItemHead(nn.Module):
             return F.cross_entropy(self.predict(features, exposed), actions, reduction="none")
         logit = self.logit(features, actions, exposed)
         if not self.training:
-            return self._log_normaliser(features, exposed) - logit
+            # The softmax over all items, some at once.
+            items = torch.arange(len(self.counts), device=features.device)
+            parts = [
+                self.predict_items(features, part, exposed).logsumexp(-1)
+                for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
+            ]
+            return torch.stack(parts).logsumexp(0) - logit
         candidates = self._proposal_now().draw(self.samples)
-        logits = self._weighted(features, candidates, exposed)
+        logits = self._weigh(features, candidates, exposed)
         # The logged item counts as itself, not as one that was drawn.
         column = columns_of(actions, candidates.items)
         rows = torch.nonzero(column >= 0)[:, 0]
@@ -221,7 +222,7 @@ class ItemHead(nn.Module):
             of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
             return of_all
         candidates = self._proposal_now().draw(self.samples)
-        logs = self._weighted(features, candidates, exposed).log_softmax(-1)
+        logs = self._weigh(features, candidates, exposed).log_softmax(-1)
         estimate: Tensor = -(logs.exp() * (logs - candidates.log_weights)).sum(-1).mean()
         return estimate
 
@@ -230,51 +231,30 @@ class ItemHead(nn.Module):
         features: Tensor,
         vectors: Tensor,
         bias: Tensor,
-        items: Tensor,
+        items: Tensor | None,
         exposed: Exposed | None,
     ) -> Tensor:
+        # Scaling the features instead of the logits saves two passes over the larger of them.
         logits = F.linear(features / features.shape[-1] ** 0.5, vectors, bias).float()
         if self.exposure is not None and exposed is not None:
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def _weighted(
-        self, features: Tensor, candidates: Candidates, exposed: Exposed | None
-    ) -> Tensor:
+    def _weigh(self, features: Tensor, candidates: Candidates, exposed: Exposed | None) -> Tensor:
         """Logits (M, L) of the candidates plus their log weights."""
-        bias = self._bias_of(candidates.items) + candidates.log_weights
-        return self._logits(
-            features, self.vectors(candidates.items), bias, candidates.items, exposed
-        )
+        items = candidates.items
+        bias = self._gather_bias(items) + candidates.log_weights
+        return self._logits(features, self.vectors(items), bias, items, exposed)
 
     def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
         """Logits (M,) of the logged items."""
-        product = (features * self._vectors_of(actions)).sum(-1) / features.shape[-1] ** 0.5
-        logit: Tensor = product + self._bias_of(actions)
+        product = (features * self.embed(actions)).sum(-1) / features.shape[-1] ** 0.5
+        logit: Tensor = product + self._gather_bias(actions)
         if self.exposure is not None and exposed is not None:
             return logit + self.exposure.to_items(exposed, actions.unsqueeze(1))
         return logit
 
-    def _log_normaliser(self, features: Tensor, exposed: Exposed | None) -> Tensor:
-        """Log of the sum (M,) of the exponentiated logits of all items, some items at once."""
-        items = torch.arange(len(self.counts), device=features.device)
-        parts = [
-            self.logits_of(features, part, exposed).logsumexp(-1)
-            for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
-        ]
-        return torch.stack(parts).logsumexp(0)
-
-    def _vectors_of(self, items: Tensor) -> Tensor:
-        """Vectors (..., d) of items (...); in evaluation mode without gradients, those kept.
-
-        A graph that is exported computes those of its items.
-        """
-        if self.training or torch.is_grad_enabled() or torch.compiler.is_compiling():
-            self._kept = None
-            return self.vectors(items)
-        return F.embedding(items, self.all_vectors())
-
-    def _bias_of(self, items: Tensor) -> Tensor:
+    def _gather_bias(self, items: Tensor) -> Tensor:
         return torch.gather(self.bias, 0, items, sparse_grad=True)
 
     def _proposal_now(self) -> Proposal:
@@ -283,8 +263,8 @@ class ItemHead(nn.Module):
             proposal = self._proposal = Proposal(self.counts)
         return proposal
 
-    def _load_from_state_dict(self, *arguments: Any, **named: Any) -> None:
-        super()._load_from_state_dict(*arguments, **named)
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        super()._load_from_state_dict(*arguments, **options)
         self._proposal = None
 
 
@@ -295,9 +275,7 @@ def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 
     """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors.
 
     Args:
-        sizes: see `ucfrec.policies.base.SequencePolicy`.
         lags: earlier steps that an exposure term of items reads; 0 for no such term.
-        samples: see `ItemHead`.
     """
     if not sizes["items"]:
         return VectorHead(dim, sizes["action"])
@@ -323,36 +301,28 @@ class ValueHead(nn.Module):
         self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
 
     def forward(self, windows: Windows, actions: Tensor) -> Tensor:
-        """Mean and expectile (B, K, 2).
-
-        Args:
-            windows: normalised.
-            actions: (B, K, d) the embedded actions of the windows; no gradient goes into them.
-        """
+        """Mean and expectile (B, K, 2), of normalised windows and their embedded actions (B, K, d),
+        into which no gradient goes."""
         mask = windows.mask
         time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
-        taken = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
-        before = F.pad(taken, (0, 0, 1, 0))[:, :-1]
-        tokens = F.relu(self.embed(torch.cat([windows.states, time, before], dim=-1)))
+        actions = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
+        earlier = F.pad(actions, (0, 0, 1, 0))[:, :-1]
+        tokens = F.relu(self.embed(torch.cat([windows.states, time, earlier], dim=-1)))
         # Padding is moved from the left to the right, where it follows every step.
         padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)
-        candidates, _ = self.history(_taken(tokens, (steps + padding).clamp(max=mask.shape[1] - 1)))
-        return self.out(_taken(candidates, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
+        following = (steps + padding).clamp(max=mask.shape[1] - 1)
+        outputs, _ = self.history(_take_steps(tokens, following))
+        return self.out(_take_steps(outputs, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
 
     @staticmethod
     def loss(values: Tensor, returns: Tensor) -> Tensor:
-        """Squared error of the mean plus the expectile's, over M steps.
-
-        Args:
-            values: (M, 2).
-            returns: (M,) returns-to-go.
-        """
+        """Squared error of the mean plus the expectile's, values (M, 2), to returns-to-go (M,)."""
         error = returns - values[:, 1]
         slope = torch.where(error < 0, 1 - BEST, BEST)
         return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
 
 
-def _taken(values: Tensor, steps: Tensor) -> Tensor:
+def _take_steps(values: Tensor, steps: Tensor) -> Tensor:
     """The rows (B, K) `steps` of `values` (B, K, d)."""
     return values.gather(1, steps.unsqueeze(-1).expand_as(values))
 
@@ -360,14 +330,10 @@ def _taken(values: Tensor, steps: Tensor) -> Tensor:
 def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
     """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation.
 
-    Args:
-        values: (M, 2) from `ValueHead`.
-        returns: (M,) returns-to-go.
-
-    Returns:
-        Weights without gradient, with mean 1 over the steps of all processes.
+    From values (M, 2) of `ValueHead` and returns-to-go (M,); without gradient, with mean 1 over the
+    steps of all processes.
     """
     advantage = (returns - values[:, 0]).detach()
     deviation = joint_moments(advantage)[1]
-    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_CLIP).exp()
+    weights = (advantage / deviation.clamp(min=1e-6)).clamp(_CLIP[0], _CLIP[1]).exp()
     return weights / joint_moments(weights)[0]

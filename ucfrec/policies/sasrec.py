@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
 from ucfrec.policies.base import Layers, SequencePolicy, embedding, require_items
-from ucfrec.policies.dt import Block, DTConfig, rows_through
+from ucfrec.policies.dt import Block, DTConfig, pass_rows
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.ucf import Dropout, visible_tokens
 from ucfrec.settings import Share, settings_table
@@ -52,18 +52,18 @@ class SASRecPolicy(SequencePolicy):
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), without what the last block has for other steps."""
-        step = slice(-1, None)
-        return self.final_norm(rows_through(self.blocks, *self._tokens(windows), step))[:, 0]  # type: ignore[no-any-return]
+        hidden, visible = self._tokens(windows)
+        return self.final_norm(pass_rows(self.blocks, hidden, visible, slice(-1, None)))[:, 0]  # type: ignore[no-any-return]
 
     def _tokens(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The first block's tokens (B, K, d), and which of them see which, (B, 1, K, K)."""
-        before = self.head.embed(windows.actions).roll(1, dims=1)
+        earlier = self.head.embed(windows.actions).roll(1, dims=1)
         # The first step of a window has no earlier action in the window.
         has_earlier = windows.mask & windows.mask.roll(1, dims=1)
         has_earlier[:, 0] = False
         last = self.embed_timestep.num_embeddings - 1
         time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        tokens = before.masked_fill(~has_earlier.unsqueeze(-1), 0.0) + time
+        tokens = earlier.masked_fill(~has_earlier.unsqueeze(-1), 0.0) + time
         return self.dropout(tokens), visible_tokens(windows.mask)
 
 
@@ -100,24 +100,23 @@ class GSASRecPolicy(SASRecPolicy):
         assert isinstance(head, ItemHead)
         normalized = self.normalize(windows)
         valid = windows.mask
-        features, shown = self.features(normalized)[valid], windows.actions[valid]
-        exposed = self.exposed(normalized)
-        exposed = None if exposed is None else exposed.select(valid.flatten())
-        items = self._drawn(len(head.bias))
+        features, actions = self.features(normalized)[valid], windows.actions[valid]
+        exposed = self.exposed(normalized, valid)
+        items = self._draw(len(head.bias))
         rate = min(1.0, (len(items) - 1) / max(1, len(head.bias) - 1)) or 1.0
         t = self.config.calibration
         beta = rate * (t * (1 - 1 / rate) + 1 / rate)
         # Where the bias is the log share of an item, the scores are the loss's best ones.
         offset = math.log(beta / rate)
-        negative = head.logits_of(features, items, exposed) + offset
-        positive = head.logit(features, shown, exposed) + offset
-        is_negative = items != shown.unsqueeze(1)
+        negative = head.predict_items(features, items, exposed) + offset
+        positive = head.logit(features, actions, exposed) + offset
+        is_negative = items != actions.unsqueeze(1)
         against = (F.softplus(negative) * is_negative).sum(1)
         losses = (against - beta * F.logsigmoid(positive)) / (len(items) + 1)
         value = losses.mean()
         return value, {"gbce_loss": value.detach()}
 
-    def _drawn(self, n_items: int) -> Tensor:
+    def _draw(self, n_items: int) -> Tensor:
         """Items (L,), ascending, each once: k uniform ones, or all of a small catalogue."""
         device = self.state_mean.device
         if n_items <= self.config.negatives:

@@ -3,7 +3,7 @@
 Dropout, attention and convolution cost less here than PyTorch's on a CPU.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Final
 
 import torch
@@ -89,10 +89,9 @@ class UCFPolicy(SequencePolicy):
         super().__init__(config, sizes)
         dim = config.dim
         self.embed = TokenEmbedding(config, sizes["state"])
-        blocks = dim, config.conv_blocks, config.dropout
-        self.return_stream = ConvStream(*blocks)
-        self.state_stream = ConvStream(*blocks)
-        self.action_stream = ConvStream(*blocks)
+        self.return_stream = ConvStream(config)
+        self.state_stream = ConvStream(config)
+        self.action_stream = ConvStream(config)
         self.fuse = nn.Linear(3 * dim, dim)
         self.fuse_norm = nn.LayerNorm(dim)
         self.attention = SupervisedAttention(config)
@@ -107,23 +106,26 @@ class UCFPolicy(SequencePolicy):
 
     def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
-        return self._outputs(*self._fused(windows), _visible(windows.mask))
+        states, tokens = self._fuse_streams(windows)
+        return self._outputs(states, tokens, _visible(windows.mask))
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d): attention has a single query."""
-        states, tokens = self._fused(windows)
+        states, tokens = self._fuse_streams(windows)
         return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
 
     def acting_features(self) -> Callable[[Windows], Tensor]:
         """`last_features`, with stacked weights for a few windows."""
-        own = type(self).last_features is UCFPolicy.last_features
-        return StackedStreams(self) if own else self.last_features
+        is_inherited = type(self).last_features is UCFPolicy.last_features
+        return StackedStreams(self) if is_inherited else self.last_features
 
-    def _fused(self, windows: Windows) -> tuple[Tensor, Tensor]:
+    def _fuse_streams(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The tokens s_t (B, K, d), and all tokens (B, 3K, d), once their streams are fused."""
+        padded = some_padding(windows.mask)
         tokens = self.embed(windows, self.head.embed(windows.actions))
-        streams = (self.return_stream, self.state_stream, self.action_stream)
-        returns, states, actions = convolve_streams(streams, tokens, windows.mask)
+        returns = self.return_stream(tokens[0], padded)
+        states = self.state_stream(tokens[1], padded)
+        actions = self.action_stream(tokens[2], padded)
         # A linear layer on the concatenation of the modalities known so far ([R, 0, 0], [R, s, 0],
         # [R, s, a]) equals a running sum of the products with the three blocks of its weight.
         of_return, of_state, of_action = self.fuse.weight.chunk(3, dim=1)
@@ -133,7 +135,6 @@ class UCFPolicy(SequencePolicy):
         fused_states = self.fuse_norm(states + revealed)
         revealed = revealed + F.linear(actions, of_action)
         fused_actions = self.fuse_norm(actions + revealed)
-
         return fused_states, interleave(fused_returns, fused_states, fused_actions)
 
     def _outputs(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
@@ -203,16 +204,14 @@ class SupervisedAttention(nn.Module):
         self.dropout = Dropout(config.dropout)
 
     def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d).
+        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d), R_0, s_0, a_0, R_1, …
 
         Args:
-            tokens: keys and values, in the order R_0, s_0, a_0, R_1, …
             visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
 
         Returns:
             Output (B, Q, d), without dropout of its own, and probabilities (B, H, Q, 3K) before
-            dropout. Each row sums to one; padded tokens get zero probability, except from their own
-            row.
+            dropout, which sum to one in each row.
         """
         width = states.shape[-1] // self.heads
         # Heads are slices, which matrix products read where they lie; heads as a dimension of the
@@ -252,11 +251,8 @@ class Dropout(nn.Dropout):
 
 
 def draw_mask(shape: torch.Size, p: float) -> Tensor:
-    """Independent draws, float32 on the CPU: 0 with probability p, otherwise 1 / (1 − p).
-
-    Args:
-        p: from 0 to 1, rounded to a multiple of 2⁻¹⁶.
-    """
+    """Independent draws, float32 on the CPU: 0 with probability p, rounded to a multiple of 2⁻¹⁶,
+    otherwise 1 / (1 − p)."""
     dropped = round(p * _LEVELS)
     if dropped == _LEVELS:
         return torch.zeros(shape)
@@ -281,16 +277,12 @@ class TokenEmbedding(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, windows: Windows, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tokens of returns-to-go, states and actions, (B, K, d) each.
-
-        Args:
-            windows: normalised.
-            actions: (B, K, d) embedded actions.
-        """
+        """Tokens of returns-to-go, states and actions, (B, K, d) each, from normalised windows and
+        embedded actions (B, K, d)."""
         time, returns, states = self._parts(windows)
         return self.norm(returns + time), self.norm(states + time), self.norm(actions + time)
 
-    def stacked(self, windows: Windows, actions: Tensor) -> Tensor:
+    def stack(self, windows: Windows, actions: Tensor) -> Tensor:
         """The same as one tensor (3, B, K, d), with fewer operations."""
         time, returns, states = self._parts(windows)
         return self.norm(torch.stack([returns, states, actions]) + time)  # type: ignore[no-any-return]
@@ -356,12 +348,14 @@ class _ShiftedProducts(torch.autograd.Function):
 class ConvStream(nn.Module):
     """Convolution blocks of one modality (Table 6): x ← LN(x + Dropout(GELU(PW(DW₃(x)))))."""
 
-    def __init__(self, dim: int, blocks: int, dropout: float) -> None:
+    def __init__(self, config: UCFConfig) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(_ConvBlock(dim, dropout) for _ in range(blocks))
+        self.blocks = nn.ModuleList(
+            _ConvBlock(config.dim, config.dropout) for _ in range(config.conv_blocks)
+        )
 
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
-        """Map (B, K, d) to (B, K, d); padded steps are set to zero before every convolution."""
+        """Map (B, K, d) to (B, K, d); steps outside the mask count as zeros in convolutions."""
         for block in self.blocks:
             tokens = block(tokens, mask)
         return tokens
@@ -378,14 +372,6 @@ class _ConvBlock(nn.Module):
     def forward(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         local = self.depthwise(tokens, mask)
         return self.norm(self.dropout.add(tokens, F.gelu(self.pointwise(local))))  # type: ignore[no-any-return]
-
-
-def convolve_streams(
-    streams: Iterable[nn.Module], tokens: Iterable[Tensor], mask: Tensor
-) -> list[Tensor]:
-    """The tokens (B, K, d) of each modality through its stream; steps outside `mask` count as 0."""
-    padded = some_padding(mask)
-    return [stream(values, padded) for stream, values in zip(streams, tokens, strict=True)]
 
 
 def visible_tokens(valid: Tensor) -> Tensor:
@@ -407,10 +393,7 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
     normalised to sum to one.
 
     Args:
-        mask: (B, K) bool, true at steps of the episode, false at padding.
-        window: number of earlier states that are parents.
-        decay: weight of the state k steps earlier is decay^k.
-        previous_action: weight of a_{t−1}.
+        mask: (B, K) bool, false at padding.
 
     Returns:
         (B, K, 3K); rows of padded steps are zero.
@@ -429,24 +412,15 @@ def parent_targets(mask: Tensor, window: int, decay: float, previous_action: flo
 
 
 def mask_loss(attention: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
-    """Mean cross-entropy (nats) of attention against the causal parents (Eq. 5).
-
-    Args:
-        attention: (B, H, K, 3K) probabilities after the softmax, before dropout.
-        targets: (B, K, 3K) from `parent_targets`.
-        mask: (B, K) bool.
-    """
+    """Mean cross-entropy (nats) of attention (B, H, K, 3K), before dropout, against the causal
+    parents (B, K, 3K) of `parent_targets` at the steps of the mask (B, K) (Eq. 5)."""
     entropy = -(targets.unsqueeze(1) * torch.log(attention + EPSILON)).sum(-1)  # (B, H, K)
     return entropy.mean(1)[mask].mean()
 
 
 def _visible(mask: Tensor) -> Tensor:
     """(B, K, 3K): true where s_t may attend to a token: itself and valid tokens before it."""
-    length = mask.shape[1]
-    row = 3 * torch.arange(length, device=mask.device).unsqueeze(1) + 1
-    token = torch.arange(3 * length, device=mask.device)
-    valid = mask.repeat_interleave(3, dim=1).unsqueeze(1)
-    return (token <= row) & valid | (token == row)
+    return visible_tokens(mask.repeat_interleave(3, dim=1))[:, 0, 1::3]
 
 
 class StackedStreams:
@@ -456,15 +430,12 @@ class StackedStreams:
     """
 
     def __init__(self, policy: UCFPolicy) -> None:
-        """
-        Args:
-            policy: in evaluation mode; its weights must not change afterwards.
-        """
+        """The policy is in evaluation mode; its weights must not change afterwards."""
         self._policy = policy
         streams = (policy.return_stream, policy.state_stream, policy.action_stream)
         with torch.no_grad():
             layers = zip(*(stream.blocks for stream in streams), strict=True)
-            self._blocks = [_stacked(blocks) for blocks in layers]
+            self._blocks = [_stack_blocks(blocks) for blocks in layers]
             self._eps = float(policy.return_stream.blocks[0].norm.eps)  # type: ignore[arg-type,union-attr]
             self._fuse = torch.stack([part.T for part in policy.fuse.weight.chunk(3, dim=1)])
             # The sum over the modalities known so far begins with the bias.
@@ -480,16 +451,16 @@ class StackedStreams:
         head = policy.head
         # Vectors of a few items cost less than keeping those of all.
         embed = head.vectors if isinstance(head, ItemHead) else head.embed
-        tokens = policy.embed.stacked(windows, embed(windows.actions))
-        tokens = self._convolved(tokens, some_padding(windows.mask))
+        tokens = policy.embed.stack(windows, embed(windows.actions))
+        tokens = self._convolve(tokens, some_padding(windows.mask))
         rows = tokens.view(3, batch * length, -1)
         sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
         fused = policy.fuse_norm(sums.add_(rows)).view(tokens.shape)
-        attended = self._attended(fused, windows.mask)
+        attended = self._attend_last(fused, windows.mask)
         hidden = fused[1, :, -1] + attended
         return policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
-    def _convolved(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
+    def _convolve(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
         """The three streams of tokens (3, B, K, d); padded steps count as zeros."""
         shape, dim = tokens.shape, tokens.shape[-1]
         for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
@@ -502,7 +473,7 @@ class StackedStreams:
             tokens = torch.addcmul(shift, normed, scale)
         return tokens
 
-    def _attended(self, tokens: Tensor, mask: Tensor) -> Tensor:
+    def _attend_last(self, tokens: Tensor, mask: Tensor) -> Tensor:
         """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""
         layer, (_, batch, length, dim) = self._policy.attention, tokens.shape
         heads, size = layer.heads, dim // layer.heads
@@ -518,18 +489,18 @@ class StackedStreams:
         return layer.out(mixed)  # type: ignore[no-any-return]
 
 
-def _stacked(blocks: tuple[torch.nn.Module, ...]) -> tuple[Tensor, ...]:
+def _stack_blocks(blocks: tuple[torch.nn.Module, ...]) -> tuple[Tensor, ...]:
     """The weights of one block of each stream."""
 
-    def stacked(name: str) -> Tensor:
+    def stack(name: str) -> Tensor:
         return torch.stack([block.get_parameter(name) for block in blocks])
 
-    taps = stacked("depthwise.weight")[:, :, 0]  # (3, d, 3)
+    taps = stack("depthwise.weight")[:, :, 0]  # (3, d, 3)
     return (
         taps.permute(2, 0, 1)[:, :, None, None].contiguous(),
-        stacked("depthwise.bias")[:, None, None],
-        stacked("pointwise.weight").mT.contiguous(),
-        stacked("pointwise.bias").unsqueeze(1),
-        stacked("norm.weight")[:, None, None],
-        stacked("norm.bias")[:, None, None],
+        stack("depthwise.bias")[:, None, None],
+        stack("pointwise.weight").mT.contiguous(),
+        stack("pointwise.bias").unsqueeze(1),
+        stack("norm.weight")[:, None, None],
+        stack("norm.bias")[:, None, None],
     )

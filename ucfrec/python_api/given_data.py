@@ -149,8 +149,8 @@ def _note_dropped(report: Mapping[str, Any], **how: Any) -> None:
     """Warn of dropped rows, but for the reasons that `prepare` itself warns of."""
     dropped: Mapping[str, int] = report["dropped"]
     most = MANY * (report["rows_read"] - dropped["left_out"])
-    few = {name: n for name, n in dropped.items() if n <= most or name == "left_out"}
-    note_dropped("", few, report["rows_read"], **how)
+    counts = {name: n for name, n in dropped.items() if n <= most or name == "left_out"}
+    note_dropped("", counts, report["rows_read"], **how)
 
 
 @contextmanager
@@ -219,10 +219,10 @@ def read_histories(
         store = trained.require_store("give the histories of the users as a frame")
         if ids is not None:
             numbers = trained.users.numbers(ids)
-            wanted = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
-            if not wanted.any():
+            theirs = pd.Series(store.episode_values(schema.USER)).isin(numbers[numbers >= 0])
+            if not theirs.any():
                 raise InputError(f"none of the {len(ids):,} users is in the store of the run")
-            store = store.select(wanted.to_numpy().nonzero()[0])
+            store = store.select(theirs.to_numpy().nonzero()[0])
         columns = [schema.PROPENSITY, schema.IS_RANDOM, schema.SPLIT]
         frame = store.to_frame().drop(columns=columns, errors="ignore")
         mapping = LogMapping({name: name for name in _KEYS if name in frame})

@@ -50,8 +50,7 @@ from ucfrec.python_api.given_data import (
 )
 from ucfrec.python_api.training import Scratch, keep_beside, train_policy
 from ucfrec.recommending.export import Exported, export
-from ucfrec.recommending.recommend import recommend
-from ucfrec.recommending.similar import similar_items
+from ucfrec.recommending.recommend import recommend, similar_items
 from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in, rank_policies
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
@@ -123,11 +122,8 @@ class Recommender:
         return "".join(f"<p>{escape(line)}</p>" for line in lines)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The arguments of the constructor, as scikit-learn's estimators have it.
-
-        Args:
-            deep: also every setting, as `table__field`.
-        """
+        """The arguments of the constructor, as scikit-learn's estimators have it; with `deep`, also
+        every setting, as `table__field`."""
         params = {name: getattr(self, name) for name in _OWN}
         if deep:
             for table in TABLES:
@@ -176,13 +172,12 @@ class Recommender:
         on_step: Watcher | None = None,
         on_validation: Watcher | None = None,
     ) -> Self:
-        """Train on a store's training episodes; logs are prepared into a store first.
+        """Train on a store's training episodes; returns this recommender. Logs are prepared first.
 
         Args:
             data: a store or its folder; or logs: files, folders and globs, what
-                `ucfrec_datasets.load` returns, or a frame with one row per interaction:
-                `user_id`, `item_id`, `timestamp` (milliseconds, dates or timestamps) and
-                feedback.
+                `ucfrec_datasets.load` returns, or a frame with one row per interaction: `user_id`,
+                `item_id`, `timestamp` (milliseconds, dates or timestamps) and feedback.
             out: run folder, resumed if training was interrupted; a store prepared from logs is kept
                 beside it, as `OUT-store`. None for temporary ones, which last as long as this
                 recommender.
@@ -199,9 +194,6 @@ class Recommender:
                 `rank` and `ope` on the test split use the weights before that.
             on_step: called after every update with the step and `{"loss": …}`.
             on_validation: called after every validation with the step and all that is logged.
-
-        Returns:
-            This recommender, trained.
         """
         options = {
             "reward": reward,
@@ -276,11 +268,10 @@ class Recommender:
         made of at most the last 1,000 rows of a user; all rows count as seen.
 
         Args:
-            histories: one row per interaction, in any order: `user_id`, `item_id`, `timestamp`
-                (milliseconds, dates or timestamps); `reward`, or the columns of the training
-                reward's expression; `session_id`, if the run's sessions are split by it; and
-                `observation` (lists of floats), if the run has observations. None for the rows
-                of the store that the policy was trained on.
+            histories: one row per interaction, as for `fit`, in any order: with `reward`, or the
+                columns of the training reward's expression; `session_id`, if the run's sessions
+                are split by it; and `observation` (lists of floats), if the run has observations.
+                None for the rows of the store that the policy was trained on.
             k: number of items per user, at least 1.
             users: the only user_ids to recommend to; None for all of the histories.
             filter_seen: exclude items that the user's history contains.
@@ -352,17 +343,14 @@ class Recommender:
             seed: of the bootstrap over users and of the random baseline.
         """
         beside = require_list("others", others, "a Recommender", Recommender)
-        trained, *rest = (policy._load_for(logs) for policy in (self, *beside))
-        require_one_catalogue([trained, *rest])
-        candidates = [(trained, rule or trained.rule), *((policy, policy.rule) for policy in rest)]
-        with (
-            read_logs(trained, logs, mapping, keep_unknown=False) as logged,
-            use_words_of_python(),
-        ):
+        policies = [policy._load_for(logs) for policy in (self, *beside)]
+        require_one_catalogue(policies)
+        rules = [rule or policies[0].rule, *(policy.rule for policy in policies[1:])]
+        with read_logs(policies[0], logs, mapping, keep_unknown=False) as logged:
             return rank_policies(
-                candidates,
+                list(zip(policies, rules, strict=True)),
                 logged,
-                _named(logs),
+                _name_logs(logs),
                 k=k,
                 filter_seen=filter_seen,
                 liked=liked,
@@ -395,7 +383,7 @@ class Recommender:
             return estimate_return(
                 (trained, rule or trained.rule),
                 logged,
-                [_named(logs)],
+                [_name_logs(logs)],
                 options=options,
                 seed=seed,
                 checkpoint="best",
@@ -482,8 +470,8 @@ class Recommender:
         """
         window = None if window_days is None else round(window_days * DAY_MS)
         options = UpdateOptions(AppendOptions(window), refit=refit, filter_seen=filter_seen)
-        given = open_files(self.trained, logs, mapping)
-        with given as (files, columns, frame), use_words_of_python(frame):
+        opened = open_files(self.trained, logs, mapping)
+        with opened as (files, columns, frame), use_words_of_python(frame):
             update_run(self.run, files, Path(out), mapping=columns, options=options)
         write_card(Path(out))
         return self.load(out)
@@ -508,30 +496,25 @@ class Recommender:
         results: ResultTable | Path | str | Iterable[ResultTable | Path | str] = (),
         items: Path | str | None = None,
     ) -> Path:
-        """Write one HTML page about the training and results: `ucfrec report`.
+        """Write one HTML page about the training and results, and return it: `ucfrec report`.
 
         Args:
             file: HTML file to write.
             results: what `evaluate` and `ope` returned, or files of it; one or several.
             items: file with item features to show beside sample recommendations.
-
-        Returns:
-            The file.
         """
         what = "what evaluate or ope returned, or files of it"
-        kinds = (Evaluation, OffPolicyReport, Path, str)
-        listed = [results] if isinstance(results, ResultTable) else results
-        given: list[ResultTable | Path | str] = require_list("results", listed, what, *kinds)
-        with tempfile.TemporaryDirectory() as scratch:
+        tables = [results] if isinstance(results, ResultTable) else results
+        tables = require_list("results", tables, what, Evaluation, OffPolicyReport, Path, str)
+        with tempfile.TemporaryDirectory() as scratch, use_words_of_python():
             files = []
-            for number, result in enumerate(given):
+            for number, result in enumerate(tables):
                 if isinstance(result, ResultTable):
                     files.append(Path(scratch) / f"{number}.json")
                     result.save(files[-1])
                 else:
                     files.append(Path(result))
-            with use_words_of_python():
-                write_report(Path(file), [self.run], files, None if items is None else Path(items))
+            write_report(Path(file), [self.run], files, None if items is None else Path(items))
         return Path(file)
 
     @_checked
@@ -549,7 +532,7 @@ class Recommender:
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
-        policy.settings = _changed(config)
+        policy.settings = _list_changes(config)
         return policy
 
 
@@ -557,7 +540,7 @@ UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
 
 
-def _changed(config: Config) -> dict[str, Any]:
+def _list_changes(config: Config) -> dict[str, Any]:
     """The settings `table.field` of a configuration that are not the defaults of its policy."""
     defaults = asdict(resolve_config(config.policy_name))
     return {
@@ -568,12 +551,12 @@ def _changed(config: Config) -> dict[str, Any]:
     }
 
 
-def _named(logs: Logs | None) -> str:
+def _name_logs(logs: Logs | None) -> str:
     """What a model card calls the logs that a measurement is on."""
     if logs is None:
         return TEST_SPLIT
     if isinstance(logs, pd.DataFrame):
         return "a frame"
     files = logs.files if isinstance(logs, LogFiles) else logs
-    listed = [files] if isinstance(files, (str, Path)) else files
-    return ", ".join(shorten_paths(str(file)) for file in listed)
+    paths = [files] if isinstance(files, (str, Path)) else files
+    return ", ".join(shorten_paths(str(path)) for path in paths)

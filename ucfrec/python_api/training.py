@@ -13,10 +13,9 @@ from ucfrec.fitting.distributed import leads, processes
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.reporting.model_card import write_card
 from ucfrec.runs.config import Config
-from ucfrec.runs.record import REFIT, RunRecord
+from ucfrec.runs.record import REFIT, STORE_SUFFIX, RunRecord
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.screened import train_screened
-from ucfrec.updating.update import STORE_SUFFIX
 
 
 def train_policy(

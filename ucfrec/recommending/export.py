@@ -1,37 +1,49 @@
-"""Write a trained policy under its rule as an ONNX graph that other runtimes can run."""
+"""A trained policy under its rule as an ONNX graph, for other runtimes and for single requests."""
 
+import contextlib
+import io
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from ucfrec import __version__
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
+from ucfrec.arrays import Array
+from ucfrec.episodes.windows import Sessions
+from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.recommending.export_graph import (
-    EXCLUDED,
-    GRAPH,
-    INPUTS,
-    OUTPUTS,
-    RuleGraph,
-    draw_sessions,
-    measure_magnitude,
-    name_inputs,
-    require_close,
-    require_installed,
-    run_graph,
-    write_graph,
-)
 from ucfrec.runs.trained_policy import TrainedPolicy
 
+GRAPH: Final = "model.onnx"
 DESCRIPTION: Final = "model.json"
-_SESSIONS: Final = 16
-"""Random sessions on which the graph is compared with torch."""
-_REMEDY: Final = "use `ucfrec serve` or `recommend --stream`"
+OUTPUTS: Final = ("scores", "top_items", "top_scores")
+TOLERANCE: Final = 1e-5
+"""Largest difference of a score to torch's, relative to what is added for it: see `require_close`.
+"""
+_STATE: Final = ("items", "rewards", "steps", "collected", "users")
+"""Inputs: the first fields of `Sessions`, of which `items` are the actions."""
+_EXCLUDED: Final = "excluded"
+_OBSERVATIONS: Final = "observations"
+_OPSET: Final = 20
+_DEFAULT_K: Final = 100
+_CHUNK: Final = 2**16
+"""Items among which the best are looked for at once."""
+_COMPARED: Final = 16
+"""Random sessions on which a graph is compared with torch."""
+_MOST_EXCLUDED: Final = 0.5
+"""Largest share of the items that these exclude, where the graph answers single requests."""
+_SERVE: Final = "use `ucfrec serve` or `recommend --stream`"
+_TORCH: Final = "use --engine torch"
 
 
 @dataclass(frozen=True)
@@ -47,74 +59,401 @@ class Exported:
 def export(
     trained: TrainedPolicy, out: Path, *, rule: DecisionRule | None = None, k: int | None = None
 ) -> Exported:
-    """Write a folder with the graph (`model.onnx`, see `write_graph`) and `model.json`.
+    """Write a folder with the graph (`model.onnx`, see `_write_graph`) and `model.json`.
 
     The graph is compared with torch on random sessions, several and one, before the folder appears.
 
     Args:
         rule: the decision rule; None for the run's own.
+        k: number of best items of the output; None for 100, or all items if there are fewer.
 
     Raises:
         InputError: the extra `export` is not installed, the policy cannot be exported, the graph's
             scores differ from torch's, or `out` exists.
     """
-    require_installed()
+    _require_installed()
     graph = RuleGraph(trained.scorer(rule), trained.name, k).eval()
+    arguments = _draw_arguments(graph.scorer, 3, seed=0)
+    batch = torch.export.Dim("batch", min=1, max=2**20)
+    shapes: dict[str, Any] = {name: {0: batch} for name in arguments}
+    shapes[_EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
+    inputs: tuple[Any, ...] = tuple(arguments.values())
+    if _OBSERVATIONS not in arguments:
+        shapes[_OBSERVATIONS], inputs = None, (*inputs, None)
+    names = list(arguments), list(OUTPUTS)
     with atomic_folder(out) as scratch:
-        _write(graph, scratch / GRAPH, trained.name)
-        difference = max(_measure_difference(graph, scratch / GRAPH, n) for n in (_SESSIONS, 1))
+        path, difference = scratch / GRAPH, 0.0
+        _write_graph(graph, inputs, path, names, trained.name, _SERVE, shapes)
+        runner = _start_runner(path)
+        for sessions in (_COMPARED, 1):
+            arguments = _draw_arguments(graph.scorer, sessions, seed=sessions)
+            scores, _, top_scores = _run_graph(runner, arguments)
+            with torch.no_grad():
+                expected, _, top_expected = graph(*arguments.values())
+            pairs = ((scores, expected), (top_scores, top_expected))
+            size = measure_magnitude(graph.scorer)
+            difference = max(difference, require_close(pairs, _SERVE, size))
         sizes = {file.name: file.stat().st_size for file in sorted(scratch.iterdir())}
         description = _describe_graph(graph, trained) | {"files": list(sizes)}
         write_json(scratch / DESCRIPTION, description)
     return Exported(sum(sizes.values()), difference)
 
 
-def _draw_arguments(graph: RuleGraph, sessions: int, seed: int) -> dict[str, Tensor]:
-    """Random inputs of the graph, in the order of its arguments."""
-    states = graph.scorer.states
+class RuleGraph(nn.Module):
+    """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
+
+    def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
+        """
+        Raises:
+            InputError: the policy has vector actions, or scores items in a way of its own.
+        """
+        super().__init__()
+        if scorer.states is None:
+            raise InputError(
+                "this policy's actions are vectors; only policies of items can be exported"
+            )
+        if not scorer.has_factors:
+            raise InputError(
+                f"policies of kind {kind!r} score items in a way of their own, which "
+                "cannot be exported; train one that predicts from a sequence, such as ucf, dt or bc"
+            )
+        items = len(scorer.states.embeddings)
+        most = min(items, _CHUNK)
+        k = min(_DEFAULT_K, items) if k is None else k
+        if not 1 <= k <= most:
+            raise InputError(
+                f"--k is {k}; the run has {items:,} items: give a whole number from 1 to {most:,}"
+            )
+        self.scorer, self.k, self._items = scorer, k, items
+        self._parts = _list_modules(scorer)
+
+    def forward(
+        self,
+        items: Tensor,
+        rewards: Tensor,
+        steps: Tensor,
+        collected: Tensor,
+        users: Tensor,
+        excluded: Tensor,
+        observations: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Scores (B, n_items), the k best items (B, k) and their log-probabilities (B, k).
+
+        The inputs are the fields of `Sessions`, and the items `excluded` (B, E), padded with −1.
+        """
+        places = torch.where(excluded < 0, self._items, excluded)
+        nothing = torch.zeros(excluded.shape[0], self._items + 1, dtype=torch.bool)
+        left_out = nothing.scatter(1, places, torch.ones_like(places, dtype=torch.bool))[:, :-1]
+        sessions = Sessions(items, rewards, steps, collected, users, observations)
+        scores = self.scorer.scores(sessions, excluded=left_out, empty=True)
+        return scores, *find_best(scores, self.k)
+
+
+def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The k best items (B, k), −1 where fewer are left, and their log-probabilities (B, k).
+
+    Exact: the best of all are among the best of each chunk.
+    """
+    n = scores.shape[1]
+    chunks = -(-n // _CHUNK)
+    if chunks > 1:
+        padded = F.pad(scores, (0, chunks * _CHUNK - n), value=-torch.inf)
+        best = padded.view(-1, chunks, _CHUNK).topk(k, dim=-1)
+        offsets = torch.arange(0, chunks * _CHUNK, _CHUNK).view(1, -1, 1)
+        numbers = (best.indices + offsets).flatten(1)
+        values, places = best.values.flatten(1).topk(k, dim=-1)
+        items = numbers.gather(1, places)
+    else:
+        values, items = scores.topk(k, dim=-1)
+    left = values > -torch.inf
+    highest = torch.where(left[:, :1], values[:, :1], 0.0)
+    total = (scores - highest).exp().sum(1, keepdim=True).log() + highest
+    return torch.where(left, items, -1), torch.where(left, values - total, -torch.inf)
+
+
+class ScoreGraph:
+    """`Scorer.scores` of one session, by onnxruntime and one thread."""
+
+    def __init__(self, scorer: Scorer, kind: str) -> None:
+        """
+        Args:
+            scorer: of a policy; its weights must not change afterwards.
+
+        Raises:
+            InputError: the extra `export` is not installed, the policy scores items in a way of its
+                own or cannot be exported, or what the graph gives differs from torch's.
+        """
+        _require_installed()
+        if not scorer.has_factors:
+            raise InputError(
+                f"policies of kind {kind!r} score items in a way of their own, which onnxruntime "
+                f"cannot compute; {_TORCH}"
+            )
+        assert scorer.states is not None
+        items = len(scorer.states.embeddings)
+
+        def draw_example(seed: int) -> tuple[Sessions, Tensor]:
+            """A random session, and items that may not be shown."""
+            rng = np.random.default_rng(seed)
+            excluded = rng.random((1, items)) < rng.uniform(0, _MOST_EXCLUDED)
+            return _draw_sessions(scorer, 1, seed), torch.from_numpy(excluded)
+
+        session, excluded = draw_example(seed=0)
+        example = {**_name_inputs(session), _EXCLUDED: excluded}
+        names = list(example), ["scores"]
+        with tempfile.TemporaryDirectory() as folder:
+            path, network = Path(folder) / GRAPH, _Network(scorer).eval()
+            _write_graph(network, tuple(example.values()), path, names, kind, _TORCH)
+            self._runner = _start_runner(path, threads=1)
+        size = measure_magnitude(scorer)
+        for number in range(1, 1 + _COMPARED):
+            session, excluded = draw_example(seed=number)
+            expected = scorer.scores(session, excluded=excluded, empty=True)
+            require_close([(self(session, excluded).numpy(), expected)], _TORCH, size)
+
+    def __call__(self, session: Sessions, excluded: Tensor) -> Tensor:
+        """Scores (1, n_items) of one session, of which `excluded` (1, n_items) bool may not be
+        shown."""
+        inputs = {**_name_inputs(session), _EXCLUDED: excluded}
+        return torch.from_numpy(_run_graph(self._runner, inputs)[0])
+
+
+class _Network(nn.Module):
+    """The scores of one session as a module."""
+
+    def __init__(self, scorer: Scorer) -> None:
+        super().__init__()
+        self._scorer, self._parts = scorer, _list_modules(scorer)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
+        *session, excluded = inputs
+        return self._scorer.scores(Sessions(*session), excluded=excluded, empty=True)
+
+
+def _list_modules(scorer: Scorer) -> nn.ModuleList:
+    models = (scorer.policy, scorer.reward_model)
+    return nn.ModuleList(model for model in models if model is not None)
+
+
+def _draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
+    """Random sessions of at most twice as many steps as the scorer reads."""
+    states, length = scorer.states, scorer.length
     assert states is not None
-    n, rng = len(states.embeddings), np.random.default_rng(seed)
-    values = name_inputs(draw_sessions(graph.scorer, sessions, seed))
-    left_out = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
-    values[EXCLUDED] = torch.from_numpy(left_out)
-    names = (*INPUTS[:-1], EXCLUDED, INPUTS[-1])
-    return {name: values[name] for name in names if name in values}
+    rng = np.random.default_rng(seed)
+    steps = rng.integers(0, 2 * length + 1, size=sessions)
+    inside = np.arange(length) >= length - steps[:, None]
+    items = np.where(inside, rng.integers(len(states.embeddings), size=inside.shape), -1)
+    rewards = rng.choice([states.reward_low, states.reward_high], size=inside.shape)
+    rewards = np.where(inside, rewards, 0.0).astype(np.float32)
+    users = rng.integers(-1, max(1, len(states.user_features)), size=sessions)
+    observed, observations = scorer.policy.state_mean.shape[0] - states.size, None
+    if observed:
+        size = (sessions, scorer.policy.config.context, observed)
+        observations = torch.from_numpy(rng.normal(size=size).astype(np.float32))
+    return Sessions(
+        actions=torch.from_numpy(items),
+        rewards=torch.from_numpy(rewards),
+        steps=torch.from_numpy(steps),
+        collected=torch.from_numpy(rewards.sum(1, dtype=np.float64)),
+        users=torch.from_numpy(users),
+        observations=observations,
+    )
 
 
-def _write(graph: RuleGraph, path: Path, kind: str) -> None:
-    arguments = _draw_arguments(graph, 3, seed=0)
-    batch = torch.export.Dim("batch", min=1, max=2**20)
-    shapes: dict[str, Any] = {name: {0: batch} for name in arguments}
-    shapes[EXCLUDED] = {0: batch, 1: torch.export.Dim("excluded_items", min=1, max=2**24)}
-    inputs: tuple[Any, ...] = tuple(arguments.values())
-    if INPUTS[-1] not in arguments:
-        shapes[INPUTS[-1]] = None
-        inputs = (*inputs, None)
-    write_graph(graph, inputs, path, (list(arguments), list(OUTPUTS)), kind, _REMEDY, shapes)
+def _draw_arguments(scorer: Scorer, sessions: int, seed: int) -> dict[str, Tensor]:
+    """Random inputs of a `RuleGraph`, in the order of its arguments."""
+    assert scorer.states is not None
+    n, rng = len(scorer.states.embeddings), np.random.default_rng(seed)
+    values = _name_inputs(_draw_sessions(scorer, sessions, seed))
+    observations = {name: values.pop(name) for name in (_OBSERVATIONS,) if name in values}
+    excluded = rng.integers(-1, n, size=(sessions, min(5, n // 2 + 1)))
+    return values | {_EXCLUDED: torch.from_numpy(excluded)} | observations
 
 
-def _measure_difference(graph: RuleGraph, path: Path, sessions: int) -> float:
-    """Largest difference of the graph's scores to torch's; see `require_close`."""
+def _name_inputs(sessions: Sessions) -> dict[str, Tensor]:
+    """The inputs of a graph, by name; the observations, if there are any, last."""
+    values = {name: getattr(sessions, name) for name in (*_STATE[1:], _OBSERVATIONS)}
+    values = {"items": sessions.actions} | values
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _start_runner(path: Path, threads: int = 0) -> Any:
+    """An `onnxruntime.InferenceSession`; 0 threads for as many as it likes."""
     import onnxruntime
 
-    arguments = _draw_arguments(graph, sessions, seed=sessions)
-    runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    scores, _, top_scores = run_graph(runner, arguments)
-    with torch.no_grad():
-        expected, _, top_expected = graph(*arguments.values())
-    size = measure_magnitude(graph.scorer)
-    return require_close((scores, top_scores), (expected, top_expected), _REMEDY, size)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = threads
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def _run_graph(runner: Any, inputs: dict[str, Tensor]) -> list[Array]:
+    arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
+    outputs: list[Array] = runner.run(None, arrays)
+    return outputs
+
+
+def measure_magnitude(scorer: Scorer) -> float:
+    """Size of what is added up to a score under the scorer's rule, at least 1.
+
+    A sum is rounded relative to its terms, even if what is left of them is about 0.
+    """
+    rule, model = scorer.rule, scorer.reward_model
+    added = rule.reward_weight
+    if rule.looks_ahead and model is not None:
+        low, high = float(model.reward_low), float(model.reward_high)
+        added *= (max(abs(low), abs(high)) + rule.lookahead) / (high - low)
+    return max(1.0, rule.policy_weight, added)
+
+
+def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: float) -> float:
+    """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
+
+    Args:
+        size: see `measure_magnitude`.
+
+    Raises:
+        InputError: it is beyond the tolerance.
+    """
+    largest = 0.0
+    for theirs, tensor in pairs:
+        ours = tensor.numpy()
+        same = np.where(np.isneginf(ours), np.isneginf(theirs), np.isfinite(theirs))
+        finite = np.isfinite(ours) & np.isfinite(theirs)
+        apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(size, np.abs(ours[finite]))
+        largest = max(largest, float(apart.max(initial=0.0)), 0.0 if same.all() else np.inf)
+    if not largest <= TOLERANCE:
+        raise InputError(
+            f"what onnxruntime computes differs from torch's by {largest:.2g}, more than "
+            f"{TOLERANCE:g}; {remedy}, and report this"
+        )
+    return largest
+
+
+def _require_installed() -> None:
+    try:
+        import onnx  # noqa: F401
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"ONNX needs {error.name}, which is not installed; install ucfrec[export]"
+        ) from None
+
+
+def _write_graph(
+    module: nn.Module,
+    arguments: tuple[Tensor, ...],
+    path: Path,
+    names: tuple[list[str], list[str]],
+    kind: str,
+    remedy: str,
+    shapes: dict[str, Any] | None = None,
+) -> None:
+    """Write a module as an ONNX graph with its weights.
+
+    Weights of more than 1.5 GB lie beside it, in a file with `.data` appended to its name: the file
+    of a graph ends at 2 GB.
+
+    Args:
+        module: in evaluation mode.
+        names: of the inputs and of the outputs.
+        remedy: what to do where it cannot be exported.
+        shapes: sizes that may vary; None for those of the example alone.
+
+    Raises:
+        InputError: torch cannot export it.
+    """
+    try:
+        with _quiet(), torch.no_grad():
+            # What is computed once must not be a part of the graph.
+            module(*arguments)
+            torch.onnx.export(
+                module,
+                arguments,
+                path,
+                input_names=names[0],
+                output_names=names[1],
+                dynamic_shapes=shapes,
+                opset_version=_OPSET,
+                dynamo=True,
+                external_data=False,  # torch still puts more than 1.5 GB of them beside it
+                verbose=False,
+            )
+    except (InputError, OSError, MemoryError):
+        raise
+    except Exception as error:  # torch's exporter has no class of errors of its own for all of them
+        # The exporter's own message lists its steps; the reason is that of the error behind it.
+        reason = one_line(str(error.__cause__ or error).strip()) or type(error).__name__
+        raise InputError(
+            f"torch cannot export policies of kind {kind!r} ({reason:.160}); {remedy}"
+        ) from None
+
+
+@contextlib.contextmanager
+def _quiet() -> Any:
+    """Keep the exporter from printing."""
+    level = logging.root.manager.disable
+    logging.disable(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(level)
 
 
 def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    rule, record = graph.scorer.rule, trained.record
+    rule, record, length = graph.scorer.rule, trained.record, graph.scorer.length
+    items, k, b = len(trained.items), graph.k, "batch"
+    context = graph.scorer.policy.config.context
+    inputs: list[tuple[str, str, list[int | str], str]] = [
+        (
+            "items",
+            "int64",
+            [b, length],
+            "index of each item shown in the session, the latest last; -1 before the session began",
+        ),
+        ("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
+        ("steps", "int64", [b], "number of items that the session has shown"),
+        ("collected", "float64", [b], "sum of the rewards of the session"),
+        ("users", "int64", [b], "index of the user in user_ids; -1 for others"),
+        (
+            _EXCLUDED,
+            "int64",
+            [b, "excluded_items"],
+            "items that may not be shown, e.g. those already seen; padded with -1, at least one "
+            "column",
+        ),
+        (
+            _OBSERVATIONS,
+            "float32",
+            [b, context, record.observation_size],
+            "of the last steps, the one to decide included; `ucfrec recommend` repeats the last",
+        ),
+    ]
+    outputs: list[tuple[str, str, list[int | str], str]] = [
+        (
+            "scores",
+            "float32",
+            [b, items],
+            "policy_weight times the policy's log-probability plus reward_weight times what the "
+            "reward model says, with a lookahead also of what follows, up to a constant; -inf for "
+            "items that `excluded`, tag_window or tag_run leave out",
+        ),
+        ("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
+        ("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
+    ]
+    if not record.observation_size:
+        del inputs[-1]
+    names = ("name", "dtype", "shape", "meaning")
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
-        "inputs": _describe_inputs(graph.scorer, record.observation_size),
-        "outputs": _describe_outputs(len(trained.items), graph.k),
+        "inputs": [dict(zip(names, tensor, strict=True)) for tensor in inputs],
+        "outputs": [dict(zip(names, tensor, strict=True)) for tensor in outputs],
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
         "rule_notes": "the graph applies target, minimum_target, policy_weight, reward_weight, "
@@ -131,44 +470,3 @@ def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),
     }
-
-
-def _describe_inputs(scorer: Scorer, observed: int) -> list[dict[str, Any]]:
-    b, length = "batch", scorer.length
-    items = "index of each item shown in the session, the latest last; -1 before the session began"
-    excluded = (
-        "items that may not be shown, e.g. those already seen; padded with -1, at least one column"
-    )
-    inputs = [
-        _describe("items", "int64", [b, length], items),
-        _describe("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
-        _describe("steps", "int64", [b], "number of items that the session has shown"),
-        _describe("collected", "float64", [b], "sum of the rewards of the session"),
-        _describe("users", "int64", [b], "index of the user in user_ids; -1 for others"),
-        _describe("excluded", "int64", [b, "excluded_items"], excluded),
-    ]
-    if observed:
-        shape: list[int | str] = [b, scorer.policy.config.context, observed]
-        last = "of the last steps, the one to decide included; `ucfrec recommend` repeats the last"
-        inputs.append(_describe("observations", "float32", shape, last))
-    return inputs
-
-
-def _describe_outputs(items: int, k: int) -> list[dict[str, Any]]:
-    b = "batch"
-    scores = (
-        "policy_weight times the policy's log-probability plus reward_weight times what the reward "
-        "model says, with a lookahead also of what follows, up to a constant; -inf for items that "
-        "`excluded`, tag_window or tag_run leave out"
-    )
-    return [
-        _describe("scores", "float32", [b, items], scores),
-        _describe("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
-        _describe(
-            "top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"
-        ),
-    ]
-
-
-def _describe(name: str, dtype: str, shape: list[int | str], meaning: str) -> dict[str, Any]:
-    return {"name": name, "dtype": dtype, "shape": shape, "meaning": meaning}

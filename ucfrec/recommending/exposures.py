@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from uuid import uuid4
 
 import pandas as pd
@@ -18,8 +18,10 @@ from ucfrec import schema
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.recommending.recommend import RANK
-from ucfrec.recommending.responder import Answer
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+if TYPE_CHECKING:
+    from ucfrec.recommending.responder import Answer
 
 _ROWS: Final = 50_000
 _SECONDS: Final = 60.0
@@ -59,7 +61,7 @@ def exposures_written(
         schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
     }  # fmt: skip
 
-    def passed() -> Iterator[pd.DataFrame]:
+    def write_all() -> Iterator[pd.DataFrame]:
         for frame in frames:
             exposures = frame.rename(columns={RANK: schema.POSITION}).assign(**constants)
             exposures[schema.USER_ID] = exposures[schema.USER_ID].astype(str)
@@ -68,7 +70,7 @@ def exposures_written(
             yield frame
 
     with atomic_file(path) as scratch, pq.ParquetWriter(scratch, columns) as writer:
-        yield passed()
+        yield write_all()
 
 
 class ExposureLog:
@@ -101,7 +103,7 @@ class ExposureLog:
         self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
         self._thread.start()
 
-    def add(self, user_id: int | str, answer: Answer) -> None:
+    def add(self, user_id: int | str, answer: "Answer") -> None:
         """Remember an answer that is given now; takes microseconds."""
         now, size = int(self._clock() * 1000), len(answer.items)
         with self._lock:
@@ -152,23 +154,26 @@ class ExposureLog:
             # A full log would otherwise try again at every answer.
             time.sleep(min(1.0, self._seconds))
 
-    def _table(self, waiting: list[tuple[str, int, Answer]]) -> pa.Table:
-        columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
-        for user_id, now, answer in waiting:
-            size = len(answer.items)
-            columns[schema.ITEM_ID] += answer.items
-            columns[schema.PROPENSITY] += answer.propensities
-            columns[schema.POSITION] += range(1, size + 1)
-            for name, value in (
-                (schema.USER_ID, user_id),
-                (schema.TIMESTAMP, now),
-                (schema.REQUEST_ID, answer.request_id),
-                (schema.RUN, answer.run),
-                (schema.RULE, answer.rule),
-                (schema.ARM, answer.arm),
-            ):
-                columns[name] += [value] * size
-        return pa.table(columns, self._schema)
+    def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
+        rows = [
+            (
+                user_id,
+                item,
+                now,
+                answer.request_id,
+                position,
+                propensity,
+                answer.run,
+                answer.rule,
+                answer.arm,
+            )
+            for user_id, now, answer in waiting
+            for position, (item, propensity) in enumerate(
+                zip(answer.items, answer.propensities, strict=True), start=1
+            )
+        ]
+        columns = zip(self._schema.names, zip(*rows, strict=True), strict=True)
+        return pa.table(dict(columns), self._schema)
 
 
 def _warn(message: str) -> None:

@@ -13,8 +13,8 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
-from ucfrec.episodes.earlier import LONGEST_HISTORY
 from ucfrec.episodes.item_table import IdLookup
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
@@ -23,10 +23,8 @@ from ucfrec.logs.rows import choose_rows
 from ucfrec.runs.later_logs import columns_used, reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-_PLAIN = (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP)
 _MOST_PLAIN_ROWS = 1_000_000
 """Rows up to which a frame is read at once, not in batches of users."""
-_WORD = re.compile(r"\w+")
 
 
 @dataclass(frozen=True)
@@ -82,21 +80,28 @@ class Histories:
         Its columns are `user_id`, `item_id`, `timestamp` (ms), with `by_id` also `session_id`, all
         int64, and `reward`, a number; no row is out of range.
         """
-        columns = _read_plain_columns(frame, by_id)
-        if columns is None:
+        if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
             return None
-        rewards, users, items, times, *sessions = columns
-        table = {
-            "user": users,
-            schema.TIMESTAMP: times,
-            schema.ITEM: items,
-            schema.REWARD: rewards,
-            "row": np.arange(len(users)),
-        }
-        if by_id:
-            table["session"] = sessions[0]
+        names = {schema.USER_ID: "user", schema.ITEM_ID: schema.ITEM}
+        names |= {schema.TIMESTAMP: schema.TIMESTAMP}
+        names |= {schema.SESSION_ID: "session"} if by_id else {}
+        if {*frame.columns} != {*names, schema.REWARD} or frame.shape[1] != len(names) + 1:
+            return None
+        table = {short: frame[name].to_numpy() for name, short in names.items()}
+        if any(values.dtype != np.int64 for values in table.values()):
+            return None
+        if frame[schema.REWARD].dtype not in (np.float64, np.float32, np.int64, np.bool_):
+            return None
+        rewards, times = frame[schema.REWARD].to_numpy(np.float64), table[schema.TIMESTAMP]
+        if times.min() < EARLIEST_MS or times.max() > time.time() * 1000:
+            return None
+        # A comparison with NaN is false too.
+        if not (np.abs(rewards) <= schema.LARGEST_REWARD).all():
+            return None
+        table |= {schema.REWARD: rewards, "row": np.arange(len(frame))}
         order = choose_rows(table, duplicates)
-        rewards, users, items, times, *sessions = (values[order] for values in columns)
+        table = {name: values[order] for name, values in table.items()}
+        users, items = table["user"], table[schema.ITEM]
         same_user = users[1:] == users[:-1]
         owner = np.concatenate([[0], np.cumsum(~same_user)])
         ends = np.append(np.flatnonzero(~same_user), len(users) - 1)
@@ -108,9 +113,9 @@ class Histories:
             users=users[ends],
             owner=owner[recent],
             item_ids=items[recent],
-            rewards=rewards[recent].astype(np.float32),
-            timestamps=times[recent],
-            session_ids=sessions[0][recent] if by_id else None,
+            rewards=table[schema.REWARD][recent].astype(np.float32),
+            timestamps=table[schema.TIMESTAMP][recent],
+            session_ids=table["session"][recent] if by_id else None,
             seen_owner=seen_owner[new],
             seen_ids=seen[new],
             observations=None,
@@ -165,25 +170,24 @@ class Histories:
         """The users with the given numbers (M,), in that order."""
         owner, rows = _find_rows(self.owner, numbers)
         seen_owner, seen = _find_rows(self.seen_owner, numbers)
-        sessions, observations = self.session_ids, self.observations
-        return Histories(
+        return replace(
+            self.with_rows(rows),
             users=self.users[numbers],
             owner=owner,
+            seen_owner=seen_owner,
+            seen_ids=self.seen_ids[seen],
+            observations=None if self.observations is None else self.observations[numbers],
+        )
+
+    def with_rows(self, rows: BoolArray | IntArray) -> "Histories":
+        """The same users with only some rows: their numbers, or (N,) true for them."""
+        return replace(
+            self,
+            owner=self.owner[rows],
             item_ids=self.item_ids[rows],
             rewards=self.rewards[rows],
             timestamps=self.timestamps[rows],
-            session_ids=None if sessions is None else sessions[rows],
-            seen_owner=seen_owner,
-            seen_ids=self.seen_ids[seen],
-            observations=None if observations is None else observations[numbers],
-        )
-
-    def with_rows(self, keep: BoolArray) -> "Histories":
-        """The same users with only the rows where `keep` (N,) is true."""
-        names = ("owner", "item_ids", "rewards", "timestamps", "session_ids")
-        columns = {name: getattr(self, name) for name in names}
-        return replace(
-            self, **{name: values[keep] for name, values in columns.items() if values is not None}
+            session_ids=None if self.session_ids is None else self.session_ids[rows],
         )
 
 
@@ -233,14 +237,19 @@ def histories_of_frame(
     Raises:
         InputError: a column is missing, or has values that cannot be used.
     """
-    by_id = session_by(trained) == schema.SESSION_ID
-    computed = not stored and computes_with_reward(trained.record.reward)
-    plain_names = mapping == LogMapping() and not _is_concerned(trained, frame)
-    if not (trained.record.observation_size or computed) and plain_names:
-        plain = Histories.from_plain(frame, by_id, trained.record.data.duplicates)
+    record, columns = trained.record, {str(name) for name in getattr(frame, "columns", ())}
+    computed = not stored and computes_with_reward(record.reward)
+    # What the run remembers of its training log may mean columns of the frame.
+    texts = " ".join([*record.data.mapping.values(), record.data.where or ""]).casefold()
+    remembers = record.data.earliest is not None or not {*re.findall(r"\w+", texts)}.isdisjoint(
+        column.casefold() for column in columns
+    )
+    if not (record.observation_size or computed or remembers) and mapping == LogMapping():
+        by_id = session_by(trained) == schema.SESSION_ID
+        plain = Histories.from_plain(frame, by_id, record.data.duplicates)
         if plain is not None:
             return iter((plain,))
-    has_rewards = not computed and schema.REWARD in getattr(frame, "columns", ())
+    has_rewards = not computed and schema.REWARD in columns
     batches = frame_histories(
         frame,
         columns_used(trained, mapping),
@@ -280,33 +289,6 @@ def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
     lengths = ends - starts
     place = np.repeat(np.arange(len(numbers)), lengths)
     return place, np.arange(len(place)) + (ends - np.cumsum(lengths))[place]
-
-
-def _read_plain_columns(frame: pd.DataFrame, by_id: bool) -> list[Array] | None:
-    """Rewards, users, items, times and perhaps sessions for `Histories.from_plain`, (N,) each."""
-    if type(frame) is not pd.DataFrame or not 0 < len(frame) <= _MOST_PLAIN_ROWS:
-        return None
-    names = [*_PLAIN, schema.SESSION_ID] if by_id else [*_PLAIN]
-    if frame.shape[1] != len(names) + 1 or not {*names, schema.REWARD} <= {*frame.columns}:
-        return None
-    keys, rewards = [frame[name].to_numpy() for name in names], frame[schema.REWARD].to_numpy()
-    if any(values.dtype != np.int64 for values in keys):
-        return None
-    if rewards.dtype not in (np.float64, np.float32, np.int64, np.bool_):
-        return None
-    rewards, times, now = rewards.astype(np.float64), keys[2], time.time() * 1000
-    fine = times.min() >= EARLIEST_MS and times.max() <= now
-    # A comparison with NaN is false too.
-    fine = fine and bool((np.abs(rewards) <= schema.LARGEST_REWARD).all())
-    return [rewards, *keys] if fine else None
-
-
-def _is_concerned(trained: TrainedPolicy, frame: pd.DataFrame) -> bool:
-    """Whether what the run remembers of its training log may mean columns of the frame."""
-    source, names = trained.record.data, {str(n).casefold() for n in getattr(frame, "columns", ())}
-    texts = [*source.mapping.values(), source.where or ""]
-    words = {word.casefold() for text in texts for word in _WORD.findall(text)}
-    return source.earliest is not None or bool(words & names)
 
 
 def session_by(trained: TrainedPolicy) -> str:

@@ -1,34 +1,47 @@
-"""Recommend next items to the users of a log, also to users who are not in the training logs."""
+"""Recommend next items to users of logs, also to new ones; similar items; an approximate search."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.item_index import ItemIndex
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.sessions import Sessions
+from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
 from ucfrec.logs.rows import mix_bits
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-RANK, SCORE = "rank", "score"
-_USERS_AT_ONCE = 128
+RANK: Final = "rank"
+SCORE: Final = "score"
+SIMILAR_ITEM: Final = "similar_item_id"
+_USERS_AT_ONCE: Final = 128
 """Most users of a forward pass; scores of more leave the processor's cache."""
-_SCORES = 2**24
+_SCORES: Final = 2**24
 """Most scores of a forward pass of several users, users × items: 64 MiB."""
+_ITEMS_AT_ONCE: Final = 1024
 _NEGLIGIBLE: Final = 80.0
 """Nats below the best score from which on an item counts nothing, in float32."""
+_FEWEST: Final = 1_000
+"""Items below which one list of an index would hold few of them."""
+_SHARE: Final = 16
+"""One in so many lists of an index is searched."""
+_AT_LEAST: Final = 8
+"""Lists that are searched at least."""
+_MORE: Final = 256
+"""Candidates that are scored beside four times those requested."""
+_SAMPLE: Final = 32
+"""One in so many sessions is also searched exactly."""
 
 
 def recommend(
@@ -42,7 +55,7 @@ def recommend(
     skip_unknown: bool = False,
     new_session: bool = False,
     seed: int = 0,
-    index: ItemIndex | None = None,
+    index: "ItemIndex | None" = None,
 ) -> Iterator[pd.DataFrame]:
     """`k` next items of every user, by the decision rule.
 
@@ -79,15 +92,21 @@ def recommend(
             their batch is read.
     """
     chooser = Chooser(trained, trained.item_scorer(rule), seed, index)
-    k, excluded = require_whole("k", k), None
+    k, excluded, remaining = require_whole("k", k), None, iter(batches)
     if candidates is not None:
         ids = require_ids("candidates", candidates, schema.ITEM_ID)
-        allowed = candidate_numbers(trained.items, ids, skip_unknown)
         excluded = torch.ones(len(trained.items), dtype=torch.bool)
+        allowed = candidate_numbers(trained.items, ids, skip_unknown)
         excluded[torch.from_numpy(allowed)] = False
 
-    def to_frame(histories: Histories) -> pd.DataFrame:
-        requests = _request_ids(histories, seed)
+    def to_frame(batch: Histories) -> pd.DataFrame:
+        histories = batch.with_numbers(trained.items, filter_seen)
+        if not (skip_unknown or (histories.item_ids >= 0).all()):
+            raise _refuse_unknown(trained.items, [batch, *remaining])
+        # The seed and the time (ms) of the user's last row: a replay draws the same.
+        last = np.zeros(len(batch.users), dtype=np.int64)
+        np.maximum.at(last, batch.owner, batch.timestamps)
+        requests = np.asarray([f"{seed}-{time}" for time in last.tolist()], dtype=object)
         new = np.full(len(histories.users), new_session)
         items, scores, propensities = chooser.choose(histories, requests, k, new, excluded)
         left = np.isfinite(scores)
@@ -102,19 +121,7 @@ def recommend(
             }
         )
 
-    return map(to_frame, _number_items(trained.items, batches, filter_seen, skip_unknown))
-
-
-def _number_items(
-    known_ids: IdLookup, batches: Iterable[Histories], filter_seen: bool, skip_unknown: bool
-) -> Iterator[Histories]:
-    """Histories with the numbers of their items, −1 for unknown ones."""
-    remaining = iter(batches)
-    for batch in remaining:
-        numbered = batch.with_numbers(known_ids, filter_seen)
-        if not ((numbered.item_ids >= 0).all() or skip_unknown):
-            raise _unknown_items(known_ids, [batch, *remaining])
-        yield numbered
+    return map(to_frame, remaining)
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,7 @@ class Chooser:
     trained: TrainedPolicy
     scorer: Scorer
     seed: int
-    index: ItemIndex | None = None
+    index: "ItemIndex | None" = None
 
     def choose(
         self,
@@ -160,7 +167,11 @@ class Chooser:
             part = latest if len(order) == 1 else latest.of_users(users)
             without = excluded
             if any(allowed is not None for allowed in candidates):
-                without = _exclude_all_but([candidates[user] for user in users], count)
+                without = torch.zeros(len(users), count, dtype=torch.bool)
+                for row, user in enumerate(users.tolist()):
+                    if (allowed := candidates[user]) is not None:
+                        without[row] = True
+                        without[row, allowed] = False
             parts.append(self._choose_together(part, requests[users], min(k, count), without))
         back = np.argsort(order, kind="stable")
         items, scores, propensities = (
@@ -174,49 +185,30 @@ class Chooser:
         """`choose` with one forward pass, of latest sessions."""
         rule = self.scorer.rule
         sessions = sessions_of(self.trained, latest, self.scorer.length)
-        left_out = _left_out(rule, latest)
+        # What was seen, and what the latest sessions have shown, if the rule excludes it.
+        known = latest.seen_ids >= 0
+        rows, seen = latest.seen_owner[known], latest.seen_ids[known]
+        if rule.exclude_seen:
+            rows = np.concatenate([rows, latest.owner])
+            seen = np.concatenate([seen, latest.item_ids])
+        left_out = torch.from_numpy(rows), torch.from_numpy(seen)
         if self.index is not None:
-            items, values = self.index.best(sessions, left_out, excluded, k)
-            return items.numpy(), values.numpy(), np.ones(items.shape)
+            best, values = self.index.best(sessions, left_out, excluded, k)
+            return best.numpy(), values.numpy(), np.ones(best.shape)
         scores = self.scorer.scores(sessions, left_out, excluded, empty=True)
         draws = None
         if rule.draws:
             draws = uniforms(latest.users, requests, scores.shape[1] + 1, self.seed)
-        items, values, propensities = _choose_best(rule, scores, k, draws)
-        return items.numpy(), values.numpy(), propensities.numpy()
-
-
-def _exclude_all_but(candidates: Sequence[IntArray | None], n_items: int) -> Tensor:
-    """(B, n_items) true for items that are not among a user's candidates; none for None."""
-    excluded = torch.zeros(len(candidates), n_items, dtype=torch.bool)
-    for row, allowed in enumerate(candidates):
-        if allowed is not None:
-            excluded[row] = True
-            excluded[row, allowed] = False
-    return excluded
-
-
-@torch.inference_mode()
-def _choose_best(
-    rule: DecisionRule, scores: Tensor, k: int, draws: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`k` items (B, k), their log-probabilities (B, k) at temperature 1 among those left, −∞ for
-    items that are excluded, and their propensities (B, k) float64.
-
-    Args:
-        scores: (B, n_items) of `Scorer.scores`; may be overwritten.
-        k: number of items, at most n_items.
-        draws: (B, n_items + 1) of `uniforms`; needed if the rule draws.
-    """
-    # Exponentials that underflow take long, and what is lower adds nothing to a sum of 1 or more.
-    lowest = scores.amax(-1, keepdim=True) - _NEGLIGIBLE
-    total = scores.clamp(min=lowest).logsumexp(-1, keepdim=True)
-    none = torch.isneginf(total)
-    if none.any():
-        scores[none[:, 0]] = 0.0
-    items, propensities = rule.rank_items(scores, k, draws)
-    values = scores.gather(1, items) - total
-    return items, values.masked_fill(none, -torch.inf), propensities
+        with torch.inference_mode():
+            # Exponentials that underflow take long; what is lower adds nothing to a sum from 1 on.
+            lowest = scores.amax(-1, keepdim=True) - _NEGLIGIBLE
+            total = scores.clamp(min=lowest).logsumexp(-1, keepdim=True)
+            none = torch.isneginf(total)
+            if none.any():
+                scores[none[:, 0]] = 0.0
+            items, propensities = rule.rank_items(scores, k, draws)
+            values = (scores.gather(1, items) - total).masked_fill(none, -torch.inf)
+            return items.numpy(), values.numpy(), propensities.numpy()
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
@@ -240,7 +232,7 @@ def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArr
     return numbers[in_catalogue]
 
 
-def _unknown_items(index: IdLookup, batches: Iterable[Histories]) -> InputError:
+def _refuse_unknown(index: IdLookup, batches: Iterable[Histories]) -> InputError:
     rows, items = 0, set[Any]()
     for batch in batches:
         unknown = batch.item_ids[index.numbers(batch.item_ids) < 0]
@@ -286,25 +278,6 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
     return Sessions.from_rows(histories.owner, rows, rewards, users, length, observations)
 
 
-def _left_out(rule: DecisionRule, histories: Histories) -> tuple[Tensor, Tensor]:
-    """Rows (N,) and items (N,) of what is not recommended: the known ones of `seen_ids`, and what
-    the latest sessions have shown, if the rule excludes it."""
-    in_catalogue = histories.seen_ids >= 0
-    rows, items = [histories.seen_owner[in_catalogue]], [histories.seen_ids[in_catalogue]]
-    if rule.exclude_seen:
-        rows.append(histories.owner)
-        items.append(histories.item_ids)
-    return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(items))
-
-
-def _request_ids(batch: Histories, seed: int) -> Array:
-    """(U,) text that tells the requests of each user apart: the seed and the time (ms) of the
-    user's last row, so that a replay draws the same and later rows draw anew."""
-    last = np.zeros(len(batch.users), dtype=np.int64)
-    np.maximum.at(last, batch.owner, batch.timestamps)
-    return np.asarray([f"{seed}-{time}" for time in last.tolist()], dtype=object)
-
-
 def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
     """Draws (B, count) from [0, 1), float64, that depend on the user, the request and the seed.
 
@@ -320,3 +293,162 @@ def uniforms(users: Array, requests: Array, count: int, seed: int) -> Tensor:
         state = mix_bits(key + np.uint64(seed % 2**64) * np.uint64(0xD1B54A32D192ED03))[:, None]
         state = mix_bits(state + np.arange(count, dtype=np.uint64) * step)
     return torch.from_numpy((state >> np.uint64(11)).astype(np.float64) / 2**53)
+
+
+class ItemIndex:
+    """Looks for the best items of large catalogues in some lists of similar ones (faiss's IVF), and
+    scores these exactly.
+
+    Lists are chosen by the product with the items' vectors. What was shown (repetition, shared
+    tags) and what is excluded counts among the candidates found, not in finding them. Sessions of
+    which too few candidates are left are scored exactly.
+    """
+
+    def __init__(self, scorer: Scorer, kind: str) -> None:
+        """
+        Args:
+            scorer: of a policy of items; its weights must not change afterwards.
+
+        Raises:
+            InputError: faiss is not installed, or the rule or the policy need scores of all items.
+        """
+        try:
+            import faiss
+        except ModuleNotFoundError:
+            raise InputError(
+                "the approximate search needs faiss, which is not installed; install ucfrec[faiss]"
+            ) from None
+        if scorer.rule.draws:
+            raise InputError(
+                f"the rule draws items ({scorer.rule}), which needs all scores; leave "
+                "--approximate out, or give --temperature 0 --explore 0"
+            )
+        if not scorer.is_product:
+            raise InputError(
+                f"policies of kind {kind!r} score items in a way of their own under this rule; "
+                "leave --approximate out"
+            )
+        self._scorer, self._rng = scorer, np.random.default_rng(0)
+        vectors = scorer.vectors()
+        size = vectors.shape[1]
+        lists = max(1, round(len(vectors) ** 0.5)) if len(vectors) >= _FEWEST else 1
+        faiss.omp_set_num_threads(torch.get_num_threads())
+        self._index = faiss.IndexIVFFlat(
+            faiss.IndexFlatIP(size), size, lists, faiss.METRIC_INNER_PRODUCT
+        )
+        self._index.cp.seed = 0
+        self._index.nprobe = max(_AT_LEAST, lists // _SHARE)
+        self._index.train(vectors)
+        self._index.add(vectors)
+        self.found = self.wanted = 0
+        """Of the best items of the sampled sessions: those found, and all."""
+        self.sampled = 0
+        """Sessions that were also searched exactly."""
+
+    def best(
+        self,
+        sessions: Sessions,
+        left_out: tuple[Tensor, Tensor],
+        excluded: Tensor | None,
+        k: int,
+    ) -> tuple[Tensor, Tensor]:
+        """`k` items (B, k), best first, and their scores (B, k) less that of the best, nats; −∞
+        where fewer are left.
+
+        Args:
+            sessions: B sessions; see `Scorer.scores`.
+            left_out: rows (N,) and items (N,) of what may not be recommended.
+            excluded: (n_items,) bool, what no user is recommended.
+            k: at most the number of items.
+        """
+        items, scores = self._search(sessions, left_out, excluded, k)
+        short = torch.isneginf(scores[:, -1])
+        sampled = torch.zeros(len(short), dtype=torch.bool)
+        sampled[self._rng.choice(len(short), size=-(-len(short) // _SAMPLE), replace=False)] = True
+        for row in torch.nonzero(short | sampled)[:, 0].tolist():
+            items_out = left_out[1][left_out[0] == row]
+            row_out = torch.zeros_like(items_out), items_out
+            session = sessions.at(torch.tensor([row]))
+            exact = self._scorer.scores(session, row_out, excluded, empty=True)[0].topk(k)
+            if short[row]:
+                items[row], scores[row] = exact.indices, exact.values
+            if sampled[row]:
+                best = exact.indices[~torch.isneginf(exact.values)]
+                self.found += int(torch.isin(best, items[row]).sum())
+                self.wanted += len(best)
+                self.sampled += 1
+        highest = scores[:, :1].masked_fill(torch.isneginf(scores[:, :1]), 0.0)
+        return items, scores - highest
+
+    def _search(
+        self,
+        sessions: Sessions,
+        left_out: tuple[Tensor, Tensor],
+        excluded: Tensor | None,
+        k: int,
+    ) -> tuple[Tensor, Tensor]:
+        """The best k of the candidates and their scores, (B, k) each."""
+        scorer, n_items = self._scorer, self._index.ntotal
+        query = scorer.query(sessions)
+        part, count = scorer.weigh(query), min(n_items, 4 * k + _MORE)
+        factors = F.pad(part.factors, (0, 1), value=1.0).numpy()
+        products, numbers = self._index.search(factors, count)
+        items, missing = torch.from_numpy(numbers), torch.from_numpy(numbers < 0)
+        items = items.clamp(min=0)
+        scores = scorer.scores_of_some(query, part, items, torch.from_numpy(products))
+        if excluded is not None:
+            missing |= excluded[items]
+        # Pairs of a row and an item are single numbers.
+        rows = torch.arange(len(items)).unsqueeze(1) * n_items
+        missing |= torch.isin(rows + items, left_out[0] * n_items + left_out[1])
+        best = scores.masked_fill(missing, -torch.inf).topk(k)
+        return items.gather(1, best.indices), best.values
+
+
+def similar_items(
+    trained: TrainedPolicy, items: Iterable[Any] | None = None, k: int = 10
+) -> pd.DataFrame:
+    """The `k` most similar other items of each item, by the cosine of the items' vectors.
+
+    The vectors are those by which the policy scores items; of a policy that scores items in a way
+    of its own, such as `item-knn`, the store's embeddings of the items.
+
+    Args:
+        items: item_ids; None for all.
+
+    Returns:
+        `item_id`, `rank` (from 1), `similar_item_id`, `score` (cosine, −1 to 1).
+
+    Raises:
+        InputError: the policy's actions are vectors, an item is not known, or `items` or `k` is
+            something else.
+    """
+    k, ids = require_whole("k", k), trained.items.ids
+    chosen = ids if items is None else require_ids("items", items, schema.ITEM_ID)
+    scorer = trained.item_scorer(replace(trained.rule, reward_weight=0.0, lookahead=0.0))
+    assert scorer.states is not None
+    vectors = scorer.states.embeddings
+    if scorer.has_factors:
+        vectors = torch.from_numpy(scorer.vectors()[:, :-1])
+    vectors = F.normalize(vectors, dim=1)
+    all_numbers = trained.items.numbers(chosen)
+    if (all_numbers < 0).any():
+        unknown = chosen[all_numbers < 0]
+        raise InputError(
+            f"{len(unknown)} of {len(chosen)} items are not in the training data, such as "
+            f"{unknown[0]}; leave them out"
+        )
+    k = min(k, len(ids) - 1)
+    frames = []
+    for begin in range(0, len(all_numbers), _ITEMS_AT_ONCE):
+        numbers = torch.from_numpy(all_numbers[begin : begin + _ITEMS_AT_ONCE])
+        cosines = (vectors[numbers] @ vectors.T).scatter(1, numbers.unsqueeze(1), -torch.inf)
+        best = cosines.topk(k, dim=1)
+        columns = {
+            schema.ITEM_ID: ids[numbers.numpy().repeat(k)],
+            RANK: np.tile(np.arange(1, k + 1), len(numbers)),
+            SIMILAR_ITEM: ids[best.indices.numpy().ravel()],
+            SCORE: best.values.numpy().ravel(),
+        }
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)

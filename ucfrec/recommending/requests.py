@@ -1,15 +1,20 @@
-"""One user's request for recommendations, as JSON, and the history that it holds."""
+"""One user's request for recommendations, as JSON, the history that it holds, and its rewards."""
 
 import json
 import math
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Annotated, Any, Final, NotRequired
 
+import duckdb
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -24,12 +29,15 @@ from pydantic import (
 from typing_extensions import TypedDict
 
 from ucfrec import schema
-from ucfrec.arrays import Array
-from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
+from ucfrec.logs.engine import bind, engine, explain_errors
+from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
+from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.rows import DAY_MS, choose_rows
+from ucfrec.logs.tables import is_number
 from ucfrec.recommending.histories import Histories
-from ucfrec.recommending.row_rewards import RowRewards
 from ucfrec.runs.later_logs import reward_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
@@ -45,6 +53,12 @@ _MOST_FAULTS: Final = 1000
 """Beyond this number, it would take too long to look at each."""
 _SHOWN: Final = 60
 """Most characters of a wrong value in a message."""
+_TYPES: Final = ("constrained-str", "float", "constrained-int")
+"""Last part of pydantic's place of an error in one of several types."""
+_ROWS: Final = "history"
+"""Name of the rows in messages and in the engine."""
+_MEMORY: Final = "256MB"
+"""Of the engine: a request is some megabytes, and no expression makes much more of it."""
 
 
 def _parse_time(value: float | str) -> float:
@@ -154,10 +168,7 @@ class StreamRequest(Request):
 
 
 def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
-    """Read a request.
-
-    Args:
-        kind: `Request` or a subclass.
+    """Read a request of a kind, `Request` or a subclass.
 
     Raises:
         InputError: it is not such a request, or too large.
@@ -172,13 +183,29 @@ def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
                 f"the request has {faults:,} faults; most are entries that requests do not have"
             ) from None
         raise InputError(_describe(error.errors(include_url=False))) from None
-    _require_within(request, limits)
+    counts = {
+        "items (k)": (request.k or 1, limits.k),
+        "rows of history": (len(request.history), limits.history),
+        "candidates": (len(request.candidates or ()), limits.candidates),
+    }
+    if isinstance(request, StreamRequest):
+        counts["interactions"] = (len(request.interactions), limits.history)
+    for name, (count, most) in counts.items():
+        if count > most:
+            raise InputError(f"{count:,} {name}: the limit is {most:,}; request less")
     return request
 
 
 def _describe(errors: Sequence[Any]) -> str:
     """The first of pydantic's errors in one line, and how many there are: one a place."""
-    first, places = errors[0], [_find_place(error) for error in errors]
+    # The place of an error in one of the types that a place takes ends with the type.
+    places = [
+        error["loc"][:-1]
+        if error["type"] != "extra_forbidden" and error["loc"] and error["loc"][-1] in _TYPES
+        else error["loc"]
+        for error in errors
+    ]
+    first = errors[0]
     if first["type"] == "json_invalid":
         return f"the request is not JSON ({_uncapitalise(first['msg'])})"
     where, more = ".".join(map(str, places[0])) or "the request", len(set(places)) - 1
@@ -196,38 +223,110 @@ def _describe(errors: Sequence[Any]) -> str:
     )
 
 
-def _find_place(error: Any) -> tuple[str | int, ...]:
-    """Where an error is, whichever of the types that the place takes it is about."""
-    place: tuple[str | int, ...] = error["loc"]
-    is_entry = error["type"] == "extra_forbidden" or not place or place[-1] not in _TYPES
-    return place if is_entry else place[:-1]
-
-
-_TYPES: Final = ("constrained-str", "float", "constrained-int")
-"""Last part of pydantic's place of an error in one of several types."""
-
-
 def _uncapitalise(message: str) -> str:
     message = message.removeprefix("Value error, ")
     return message[:1].lower() + message[1:]
 
 
-def _require_within(request: Request, limits: Limits) -> None:
-    """Check the limits of a request, but for its bytes.
+class RowRewards:
+    """Computes the rewards of rows, one request after the other; not for several threads at once.
 
-    Raises:
-        InputError: it requests too much.
+    A row's `reward` counts, unless the run's reward expression computes with a column of that name.
+    Rows without one have feedback, from which that expression makes it: at once if it is the name
+    of a column, otherwise by the engine, which takes some milliseconds.
     """
-    counts = {
-        "items (k)": (request.k or 1, limits.k),
-        "rows of history": (len(request.history), limits.history),
-        "candidates": (len(request.candidates or ()), limits.candidates),
-    }
-    if isinstance(request, StreamRequest):
-        counts["interactions"] = (len(request.interactions), limits.history)
-    for name, (count, most) in counts.items():
-        if count > most:
-            raise InputError(f"{count:,} {name}: the limit is {most:,}; request less")
+
+    def __init__(self, expression: Expression) -> None:
+        self._expression, self._computed = expression, computes_with_reward(expression)
+        self._stack = ExitStack()
+        self._connection: duckdb.DuckDBPyConnection | None = None
+
+    def close(self) -> None:
+        """Close the engine."""
+        self._stack.close()
+
+    def of_rows(self, rows: Sequence[Mapping[str, Any]]) -> list[float]:
+        """Rewards (N,) of rows.
+
+        Raises:
+            InputError: a reward or feedback is missing, not finite or too large.
+        """
+        if not rows:
+            return []
+        rewards = [row.get(schema.REWARD) for row in rows]
+        if not self._computed and any(value is not None for value in rewards):
+            return _require_numbers(rewards, f"no {schema.REWARD}, as other rows have")
+        name = str(self._expression)
+        if re.fullmatch(r"[A-Za-z_]\w*", name):
+            either = "no" if name == schema.REWARD else f"neither {schema.REWARD} nor"
+            return _require_numbers(_column(rows, name), f"{either} {name}")
+        return _require_numbers(self._evaluate(rows), "no reward")
+
+    def _evaluate(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
+        if self._connection is None:
+            self._connection = self._stack.enter_context(engine((), None, _MEMORY))
+        connection, source = self._connection, Path(_ROWS)
+        names, columns = {name.casefold() for row in rows for name in row}, {}
+        for name in columns_of(connection, self._expression):
+            if name.casefold() not in names:
+                what = f"no {name}" if self._computed else f"neither {schema.REWARD} nor {name}"
+                raise InputError(
+                    f"history has {what}, which the run's reward ({self._expression}) needs; give "
+                    f"{'it' if self._computed else 'one of them'}"
+                )
+            try:
+                columns[name] = pa.array(_column(rows, name))
+            except (pa.ArrowException, OverflowError) as error:
+                reason = str(error).splitlines()[0]
+                raise InputError(
+                    f"history: {name} has values of several types ({reason})"
+                ) from None
+        connection.register(_ROWS, pa.table(columns))
+        try:
+            described = connection.sql(f"DESCRIBE {_ROWS}").fetchall()
+            table = FrameTable((source,), tuple((row[0], row[1]) for row in described))
+            try:
+                with explain_errors(connection, (table,), source):
+                    sql, kind, *_ = bind(connection, table, "for the reward", self._expression)
+                    query = f"SELECT TRY(CAST({sql} AS DOUBLE)) FROM {table.sql}"
+                    values = [row[0] for row in connection.sql(query).fetchall()]
+            except InputError:
+                # Its text names files of the server.
+                types = ", ".join(f"{row[0]} is {row[1]}" for row in described)
+                raise InputError(
+                    f"history: the run's reward ({self._expression}) cannot be computed where "
+                    f"{types}; give values of the types that the training log has"
+                ) from None
+        finally:
+            connection.unregister(_ROWS)
+        if not (is_number(kind) or kind == "BOOLEAN"):
+            raise InputError(f"history: the run's reward is {kind} here; give numbers")
+        return values
+
+
+def _column(rows: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
+    """The entry `name` of each row, in whatever case it is written; None where there is none."""
+    values = [row.get(name) for row in rows]
+    if any(value is None for value in values):
+        folded = name.casefold()
+        for column in set().union(*rows) - {name}:
+            if column.casefold() == folded:
+                more = (row.get(column) for row in rows)
+                values = [b if a is None else a for a, b in zip(values, more, strict=True)]
+    return values
+
+
+def _require_numbers(values: Sequence[Any], missing: str) -> list[float]:
+    for n, value in enumerate(values):
+        if value is None:
+            raise InputError(f"history.{n} has {missing}; give every row its reward")
+        # Integers of JSON have any number of digits, more than a float has: they are only compared.
+        if not isinstance(value, (int, float)) or not abs(value) <= schema.LARGEST_REWARD:
+            raise InputError(
+                f"history.{n}: the reward is {value!r:.60}; give a number within "
+                f"±{schema.LARGEST_REWARD:g}"
+            )
+    return [float(value) for value in values]
 
 
 @dataclass(frozen=True)
@@ -268,7 +367,12 @@ class HistoryReader:
         }
         sessions = None
         if self.by_session_id:
-            sessions = id_array([_session_id(n, row) for n, row in enumerate(rows)])
+            for n, row in enumerate(rows):
+                if row.get("session_id") is None:
+                    raise InputError(
+                        f"history.{n} has no session_id, by which the run splits sessions"
+                    )
+            sessions = id_array([row["session_id"] for row in rows])
             columns["session"] = np.unique(sessions, return_inverse=True)[1]
         if self.observation_size:
             observed = [row.get("observation") or () for row in rows]
@@ -276,10 +380,7 @@ class HistoryReader:
                 columns[schema.OBSERVATION] = np.asarray(observed, dtype=np.float64)
         columns[schema.REWARD] = np.asarray(self.rewards.of_rows(rows), dtype=np.float64)
         order = choose_rows(columns, self.duplicates, user_id)[-LONGEST_HISTORY:]
-        observations = None
-        if self.observation_size:
-            last = self._observation(rows, int(order[-1]))
-            observations = np.asarray([last], dtype=np.float32)
+        observations = self._read_observation(rows, order[-1:])
         seen = pd.unique(items)
         return Histories(
             users=id_array([user_id]),
@@ -293,18 +394,22 @@ class HistoryReader:
             observations=observations,
         )
 
-    def _observation(self, rows: Sequence[Row], last: int) -> list[float]:
-        values = rows[last].get("observation") or []
+    def _read_observation(self, rows: Sequence[Row], last: IntArray) -> Float32Array | None:
+        """The observation (1, O) of the last row (1,); None if the policy has none."""
+        if not self.observation_size:
+            return None
+        number = int(last[0])
+        values = rows[number].get("observation") or []
         if len(values) != self.observation_size:
             raise InputError(
-                f"history.{last}: the observation has {len(values)} numbers; the policy needs "
+                f"history.{number}: the observation has {len(values)} numbers; the policy needs "
                 f"{self.observation_size}"
             )
         if max(map(abs, values)) > _LARGEST_FLOAT:
             raise InputError(
-                f"history.{last}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
+                f"history.{number}: the observation has numbers beyond ±{_LARGEST_FLOAT:.2g}"
             )
-        return [float(value) for value in values]
+        return np.asarray([values], dtype=np.float32)
 
 
 def _read_times(rows: Sequence[Row]) -> list[int]:
@@ -327,10 +432,3 @@ def id_array(ids: Sequence[int | str]) -> Array:
     if all(isinstance(value, int) for value in ids):
         return np.asarray(ids, dtype=np.int64)
     return np.asarray(list(map(str, ids)), dtype=object)
-
-
-def _session_id(n: int, row: Row) -> int | str:
-    session = row.get("session_id")
-    if session is None:
-        raise InputError(f"history.{n} has no session_id, by which the run splits sessions")
-    return session

@@ -1,11 +1,16 @@
-"""Answers to requests of several users at once, equal to those of `ucfrec recommend`."""
+"""Answers to requests of several users at once, equal to those of `ucfrec recommend`; by one run,
+or by several that share the users, replaced as the server runs."""
 
+import sys
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 from uuid import uuid4
 
 import numpy as np
+import xxhash
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import IntArray
@@ -13,6 +18,7 @@ from ucfrec.errors import InputError
 from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import Chooser, candidate_numbers, name_some
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, id_array
+from ucfrec.runs.promoted import POINTER, promoted
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 TORCH: Final = "torch"
@@ -20,6 +26,9 @@ ONNXRUNTIME: Final = "onnxruntime"
 _LARGEST_EXACT: Final = 2**53 - 1
 """Largest integer that JavaScript holds exactly."""
 ENGINES: Final = (TORCH, ONNXRUNTIME)
+SECONDS: Final = 2.0
+"""Time between two looks at which run is current."""
+_UNITS: Final = 2**32
 
 
 class Answer(NamedTuple):
@@ -45,9 +54,15 @@ class Answer(NamedTuple):
             {"item_id": exact_id(item), "score": score, "propensity": propensity}
             for item, score, propensity in columns
         ]
-        names = {"request_id": self.request_id, "run": self.run, "rule": self.rule}
-        names |= {"arm": self.arm} if self.arm else {}
-        return {"user_id": exact_id(user_id), **names, "items": items}
+        arm = {"arm": self.arm} if self.arm else {}
+        return {
+            "user_id": exact_id(user_id),
+            "request_id": self.request_id,
+            "run": self.run,
+            "rule": self.rule,
+            **arm,
+            "items": items,
+        }
 
 
 class Mean(NamedTuple):
@@ -60,6 +75,10 @@ class Mean(NamedTuple):
     def value(self) -> float:
         """The mean; 0 if it is of nothing."""
         return self.total / self.weight if self.weight else 0.0
+
+    def with_more(self, total: float, weight: float) -> "Mean":
+        """The mean with more of its values."""
+        return Mean(self.total + total, self.weight + weight)
 
 
 def exact_id(value: int | str) -> int | str:
@@ -113,7 +132,7 @@ class Responder:
         if engine not in ENGINES:
             raise InputError(f"the engine is {engine!r}; give one of {', '.join(ENGINES)}")
         if engine == ONNXRUNTIME:
-            from ucfrec.recommending.export_graph import ScoreGraph
+            from ucfrec.recommending.export import ScoreGraph
 
             scorer = scorer.answering_one_with(ScoreGraph(scorer, trained.name))
         self.trained, self.limits, self.rule = trained, limits, scorer.rule
@@ -164,21 +183,19 @@ class Responder:
             ]
 
     def _read_or_refuse(self, request: Request) -> _Question | InputError:
-        items = self.trained.items
+        items, candidates = self.trained.items, None
         try:
             history = self._reader.read(request.history, request.user_id)
             numbered = history.with_numbers(items, self._filter_seen)
             unknown = numbered.item_ids < 0
             count, rows = int(unknown.sum()), len(unknown)
-            total, weight = self._unknown_items
-            self._unknown_items = Mean(total + count, weight + rows)
+            self._unknown_items = self._unknown_items.with_more(count, rows)
             if count and not self._skip_unknown:
                 names = name_some(sorted(set(history.item_ids[unknown].tolist())))
                 raise InputError(
                     f"history: the policy does not know the item_id of {count} of {rows} rows "
                     f"({names}); leave them out"
                 )
-            candidates = None
             if request.candidates is not None:
                 ids = id_array(request.candidates)
                 candidates = candidate_numbers(items, ids, self._skip_unknown)
@@ -189,9 +206,8 @@ class Responder:
 
     def _answer(self, questions: Sequence[_Question]) -> Iterator[Answer]:
         histories = Histories.joined([question.history for question in questions])
-        total, weight = self._unknown_users
         unknown = int((self.trained.users.numbers(histories.users) < 0).sum())
-        self._unknown_users = Mean(total + unknown, weight + len(questions))
+        self._unknown_users = self._unknown_users.with_more(unknown, len(questions))
         numbers, scores, propensities = self._chooser.choose(
             histories,
             np.asarray([question.request_id for question in questions], dtype=object),
@@ -207,3 +223,210 @@ class Responder:
         for question, count, *lists in zip(questions, counts, *columns, strict=True):
             items, logs, chances = (values[: min(count, question.k)] for values in lists)
             yield Answer(items, logs, chances, question.request_id, *self._source)
+
+
+class _Current(NamedTuple):
+    """What the pointer file says, and when it was written: a run is tried again once it is promoted
+    again."""
+
+    name: str
+    fingerprint: str
+    written_ns: int
+
+
+class _Arm(NamedTuple):
+    """A run with its share of the users."""
+
+    name: str
+    share: float
+    responder: Responder
+
+
+def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
+    """Index of a user's arm: users are divided by a hash of their identifier, the same for ever.
+
+    Args:
+        shares: of the arms, which add up to 1.
+    """
+    place = xxhash.xxh3_64_intdigest(f"arm {user_id}".encode()) % _UNITS / _UNITS
+    for number, share in enumerate(shares):
+        place -= share
+        if place < 0:
+            return number
+    return len(shares) - 1
+
+
+def parse_split(text: str) -> dict[str, float]:
+    """Read `A=0.9,B=0.1`: names of runs and their shares of the users.
+
+    Raises:
+        InputError: it is written otherwise, or the shares do not add up to 1.
+    """
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, share = part.partition("=")
+        try:
+            shares[name.strip()] = float(share)
+        except ValueError:
+            raise InputError(f"--split {text}: write RUN=SHARE,RUN=SHARE") from None
+    if not all(0 < share <= 1 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
+        raise InputError(f"--split {text}: shares are above 0 and add up to 1")
+    return shares
+
+
+class Served:
+    """Answers requests with the current run, or with runs that share the users.
+
+    With `follow`, a thread loads a run that became current beside the one that answers, tries it,
+    and replaces that one between two batches of requests.
+    """
+
+    def __init__(
+        self, make: Callable[[Path], Responder], folder: Path, shares: Mapping[str, float] | None
+    ) -> None:
+        """
+        Args:
+            make: loads a run and checks its files.
+            shares: name of each arm's run to its share of the users; None for the current run.
+
+        Raises:
+            InputError: a run cannot be used, or no run of the folder was promoted.
+        """
+        self._make, self._folder = make, folder
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._refused: tuple[str, str] | None = None
+        self._known: _Current | None = None
+        if shares is None:
+            self._known = self._current()
+            shares = {self._known.name: 1.0}
+        self._arms = [_Arm(name, share, make(folder / name)) for name, share in shares.items()]
+        for arm in self._arms[1:]:
+            _require_alike(arm.responder.trained, self.trained)
+
+    @property
+    def trained(self) -> TrainedPolicy:
+        """The policy of the first arm."""
+        return self._arms[0].responder.trained
+
+    @property
+    def limits(self) -> Limits:
+        """Of a request."""
+        return self._arms[0].responder.limits
+
+    def answers(self, requests: Sequence[Request]) -> list[Answer | InputError]:
+        """Answer requests, each with the arm of its user; see `Responder.answers`."""
+        with self._lock:
+            if len(self._arms) == 1:
+                return self._arms[0].responder.answers(requests)
+            shares = [arm.share for arm in self._arms]
+            places = [arm_of(request.user_id, shares) for request in requests]
+            answers: dict[int, Answer | InputError] = {}
+            for number in set(places):
+                rows, arm = [n for n, p in enumerate(places) if p == number], self._arms[number]
+                outcomes = arm.responder.answers([requests[row] for row in rows])
+                for row, outcome in zip(rows, outcomes, strict=True):
+                    if isinstance(outcome, Answer):
+                        outcome = outcome._replace(arm=arm.name)
+                    answers[row] = outcome
+            return [answers[row] for row in range(len(requests))]
+
+    def described(self) -> dict[str, Any]:
+        """What answers, for the health page."""
+        arms = self._arms
+        page: dict[str, Any] = {**arms[0].responder.described(), "name": arms[0].name}
+        if len(arms) > 1:
+            page["arms"] = {a.name: {**a.responder.described(), "share": a.share} for a in arms}
+        if self._refused is not None:
+            page["refused"] = dict(zip(("name", "error"), self._refused, strict=True))
+        return page
+
+    def drift(self) -> dict[str, Mean]:
+        """See `Responder.drift`; of the first arm."""
+        return self._arms[0].responder.drift()
+
+    def check(self) -> None:
+        """Answer with the current run from now on, if it is another one and passes a trial.
+
+        Raises:
+            InputError: no run is current.
+        """
+        current = self._current()
+        if current == self._known:
+            return
+        self._known = current
+        same_run = current.fingerprint in ("", self.trained.fingerprint)
+        if current.name == self._arms[0].name and same_run:
+            self._refused = None
+        else:
+            self._replace(current.name)
+
+    def follow(self, seconds: float = SECONDS) -> None:
+        """Look every so many seconds whether another run is current, in a thread of its own."""
+        self._thread = threading.Thread(target=self._run, args=(seconds,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, and release what the runs hold."""
+        self._closed.set()
+        if self._thread is not None:
+            self._thread.join()
+        with self._lock:
+            for arm in self._arms:
+                arm.responder.close()
+
+    def _current(self) -> _Current:
+        pointer = promoted(self._folder)
+        if pointer is None:
+            raise InputError(
+                f"{self._folder} is not a run folder, and no run in it was promoted; name a run, "
+                "or ucfrec promote one"
+            )
+        written = (self._folder / POINTER).stat().st_mtime_ns
+        return _Current(pointer.run(self._folder).name, pointer.fingerprint, written)
+
+    def _run(self, seconds: float) -> None:
+        previous = ""
+        while not self._closed.wait(seconds):
+            message = ""
+            try:
+                self.check()
+            except Exception as error:
+                # Whatever is wrong with the pointer file, the run that answers goes on.
+                message = str(error)
+                self._refused, self._known = (POINTER, message), None
+            if message not in ("", previous):
+                _say(message)
+            previous = message
+
+    def _replace(self, name: str) -> None:
+        """Load a run, try it, and answer with it from the next batch on; or say why not."""
+        began = time.perf_counter()
+        try:
+            responder = self._make(self._folder / name)
+            _require_alike(responder.trained, self.trained)
+            (outcome,) = responder.answers([Request(user_id="")])
+            if isinstance(outcome, InputError) and not responder.trained.record.observation_size:
+                raise outcome
+        except Exception as error:
+            # Whatever is wrong with the new run, the old one goes on.
+            self._refused = name, str(error) or type(error).__name__
+            _say(f"{name} is not used: {self._refused[1]}; {self._arms[0].name} goes on")
+            return
+        with self._lock:
+            old, self._arms = self._arms, [_Arm(name, 1.0, responder)]
+        self._refused = None
+        for arm in old:
+            arm.responder.close()
+        _say(f"{name} answers from now on, loaded in {time.perf_counter() - began:.1f} s")
+
+
+def _require_alike(new: TrainedPolicy, old: TrainedPolicy) -> None:
+    """Check that exposures of both can be in one file: that items are text in both, or numbers."""
+    of_new, of_old = (trained.items.ids.dtype.kind in "iu" for trained in (new, old))
+    if of_new != of_old:
+        raise InputError(f"{new.folder}: items are not of the same type as in {old.folder}")
+
+
+def _say(message: str) -> None:
+    print(f"ucfrec serve: {message}", file=sys.stderr, flush=True)

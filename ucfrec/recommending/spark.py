@@ -10,7 +10,7 @@ import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arguments import require_whole
-from ucfrec.episodes.earlier import LONGEST_HISTORY
+from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.histories import read_histories

@@ -5,17 +5,32 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from ipaddress import IPv6Address
-from typing import Annotated, Any, Final, NotRequired
+from typing import Annotated, Any, Final, NamedTuple, NotRequired
 
 from fastapi import FastAPI, Response
 from fastapi import Request as HTTPRequest
 from fastapi_offline import FastAPIOffline
-from prometheus_client import CONTENT_TYPE_LATEST
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+)
+from prometheus_client.metrics_core import Metric
+from prometheus_client.multiprocess import MultiProcessCollector
+from prometheus_client.registry import Collector
+from prometheus_client.samples import Sample
 from pydantic import Field
 from starlette.exceptions import HTTPException
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -25,18 +40,45 @@ from typing_extensions import TypedDict
 from ucfrec import __version__
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import json_text
-from ucfrec.recommending.batcher import Batcher, QueueFullError
 from ucfrec.recommending.exposures import ExposureLog
-from ucfrec.recommending.metrics import ServingMetrics
 from ucfrec.recommending.requests import Request, parse
-from ucfrec.recommending.responder import Answer, Responder
-from ucfrec.recommending.served import Served
-from ucfrec.recommending.server import AllowedHosts
+from ucfrec.recommending.responder import Answer, Mean, Responder, Served
 from ucfrec.settings import settings_table
 
 _HOST: Final = re.compile(r"\*|(\*\.)?[\w.-]+")
 _PATH: Final = "/recommendations"
 _JSON: Final = "application/json"
+_FAULTS: Final = {
+    400: "Not JSON, no such request, or beyond a limit.",
+    408: "The request's body did not arrive in time.",
+    413: "The body is too large.",
+    431: "Too many headers, or too long ones.",
+    500: "A bug, or out of memory; see the server's standard error.",
+    503: "Too many requests wait; try again later.",
+    504: "No answer in time.",
+}
+_MOST_HEADERS: Final = 100
+_MOST_HEADER_BYTES: Final = 2**16
+"""Of the address, names and values of a request. The server itself stops reading a head that is not
+whole by then."""
+_HUNG_UP: Final = 499
+"""For the metrics, as no client receives it; nginx calls it so."""
+_SECONDS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+_SIZES: Final = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+_DRIFT: Final = "ucfrec_drift"
+_WEIGHT: Final = "ucfrec_drift_weight"
+
+
+@settings_table("")
+class ServerLimits:
+    """What the server as a whole takes on."""
+
+    batch: Annotated[int, Field(ge=1, le=4096)] = 64
+    """Requests of a forward pass."""
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1024
+    """Requests that may wait."""
+    timeout: Annotated[float, Field(gt=0, le=3600)] = 5.0
+    """Seconds for a request to arrive and to be answered."""
 
 
 class _Error(TypedDict):
@@ -63,85 +105,185 @@ class _Recommendations(TypedDict):
     items: Annotated[list[_Item], Field(description="In the order to show.")]
 
 
-_FAULTS: Final = {
-    400: "Not JSON, no such request, or beyond a limit.",
-    408: "The request's body did not arrive in time.",
-    413: "The body is too large.",
-    431: "Too many headers, or too long ones.",
-    500: "A bug, or out of memory; see the server's standard error.",
-    503: "Too many requests wait; try again later.",
-    504: "No answer in time.",
-}
-_MOST_HEADERS: Final = 100
-_MOST_HEADER_BYTES: Final = 2**16
-"""Of the address, names and values of a request. The server itself stops reading a head that is not
-whole by then."""
-_ALLOW: Final = (
-    "start the server with --allowed-hosts and this host, or ask for one that it answers"
-)
-_HUNG_UP: Final = 499
-"""For the metrics, as no client receives it; nginx calls it so."""
+class _Metrics:
+    """What a server has done, in a registry of its own."""
 
-
-@settings_table("")
-class ServerLimits:
-    """What the server as a whole takes on."""
-
-    batch: Annotated[int, Field(ge=1, le=4096)] = 64
-    """Requests of a forward pass."""
-    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1024
-    """Requests that may wait."""
-    timeout: Annotated[float, Field(gt=0, le=3600)] = 5.0
-    """Seconds for a request to arrive and to be answered."""
-
-
-def _host(host: str) -> str:
-    """A host as the header `Host` has it: addresses of IP version 6 are in brackets."""
-    with suppress(ValueError):
-        return f"[{IPv6Address(host.strip('[]'))}]"
-    if not _HOST.fullmatch(host):
-        raise InputError(
-            f"--allowed-hosts: {host!r} is not a host; write names or addresses without a port, "
-            "*.example.org, or *"
+    def __init__(self, drift: Callable[[], Mapping[str, Mean]], shared: bool) -> None:
+        """
+        Args:
+            drift: returns what is different in requests, or in the logs of the last update, by
+                name.
+            shared: the text has the totals of all processes that share the folder
+                PROMETHEUS_MULTIPROC_DIR.
+        """
+        registry = CollectorRegistry()
+        self._measure_drift, self._shared = drift, shared
+        self._collector: Collector = registry
+        text = "Requests for recommendations, by HTTP status."
+        self._requests = Counter("ucfrec_requests", text, ["status"], registry=registry)
+        text = "Time from the request's first byte to its answer."
+        self._seconds = Histogram(
+            "ucfrec_request_seconds", text, buckets=_SECONDS, registry=registry
         )
-    return host
+        text = "Requests of a forward pass."
+        self._sizes = Histogram("ucfrec_batch_requests", text, buckets=_SIZES, registry=registry)
+        text = "Time of reading and scoring the requests of a forward pass."
+        self._passes = Histogram("ucfrec_batch_seconds", text, buckets=_SECONDS, registry=registry)
+        live: dict[str, Any] = {"registry": registry, "multiprocess_mode": "livesum"}
+        text = "Requests that wait for a forward pass."
+        self.waiting = Gauge("ucfrec_waiting_requests", text, **live)
+        text = (
+            "Unknown items and users of requests, shares since the run began to answer; and the "
+            "drift that the run's update found (update_…)."
+        )
+        self._totals = Gauge(_DRIFT, text, ["measure"], **live)
+        self._weights = Gauge(_WEIGHT, text, ["measure"], **live)
+        self._drift: dict[str, Mean] = {}
+        self._used, self._cpu = 0.0, None
+        if shared:
+            self._collector = MultiProcessCollector(None)  # type: ignore[no-untyped-call]
+            # `ProcessCollector` would describe whichever process is asked.
+            text = "Total user and system CPU time spent in seconds."
+            self._cpu = Counter("process_cpu_seconds", text, registry=registry)
+            self._update()
+        else:
+            ProcessCollector(registry=registry)
+
+    def count_request(self, status: int, seconds: float) -> None:
+        """Count a request that was answered."""
+        self._requests.labels(str(status)).inc()
+        self._seconds.observe(seconds)
+
+    def count_batch(self, requests: int, seconds: float) -> None:
+        """Count a forward pass."""
+        self._sizes.observe(requests)
+        self._passes.observe(seconds)
+        if self._shared:
+            self._update()
+
+    def write_text(self) -> bytes:
+        """All metrics in Prometheus' text format."""
+        self._update()
+        return generate_latest(self)
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics, as `prometheus_client` asks for them."""
+        metrics = {metric.name: metric for metric in self._collector.collect()}
+        totals, weights = (
+            {sample.labels["measure"]: sample.value for sample in metrics[name].samples}
+            for name in (_DRIFT, _WEIGHT)
+        )
+        del metrics[_WEIGHT]
+        # A measure of a run that answered before is not removed from the files.
+        metrics[_DRIFT].samples = [
+            Sample(_DRIFT, {"measure": name}, Mean(totals[name], weights[name]).value)
+            for name in self._drift
+        ]
+        yield from metrics.values()
+
+    def _update(self) -> None:
+        """Bring up to date what nothing else reports."""
+        previous, self._drift = self._drift, dict(self._measure_drift())
+        for name, mean in self._drift.items():
+            if previous.get(name) != mean:
+                self._totals.labels(name).set(mean.total)
+                self._weights.labels(name).set(mean.weight)
+        if self._cpu is not None:
+            seconds, self._used = self._used, time.process_time()
+            self._cpu.inc(self._used - seconds)
 
 
-class _HeaderLimits:
-    """ASGI middleware that answers 431 to requests with too many or too long headers."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = scope.get("headers", ())
-        size = len(scope.get("raw_path", b"")) + len(scope.get("query_string", b""))
-        size += sum(len(name) + len(value) for name, value in headers)
-        if len(headers) <= _MOST_HEADERS and size <= _MOST_HEADER_BYTES:
-            await self._app(scope, receive, send)
-            return
-        most = f"{_MOST_HEADERS} headers and {_MOST_HEADER_BYTES:,} bytes of them are allowed"
-        refusal = _response(431, {"error": most}, {"connection": "close"})
-        await refusal(scope, receive, send)
+class _Waiting(NamedTuple):
+    request: Request
+    outcome: "asyncio.Future[Answer | InputError]"
 
 
-class _Direct:
-    """ASGI middleware that answers requests for recommendations. The framework's routing would take
-    as long as computing one of many that share a forward pass."""
+class _Batcher:
+    """Answers requests of concurrent callers in one thread, as many at once as have come.
+
+    A request that comes while nothing is computed starts at once; those that come meanwhile wait
+    for the end of the forward pass and share the next.
+    """
+
+    def __init__(
+        self,
+        answers: Callable[[Sequence[Request]], list[Answer | InputError]],
+        metrics: _Metrics,
+        limits: ServerLimits,
+    ) -> None:
+        self._answers, self._metrics, self._limits = answers, metrics, limits
+        self._queue: deque[_Waiting] = deque()
+        self._thread = ThreadPoolExecutor(1, "forward")
+        self._running: asyncio.Task[None] | None = None
+
+    async def answer(self, request: Request) -> Answer | InputError:
+        """The answer to a request, or what is wrong with it; a cancelled one has no one waiting.
+
+        Raises:
+            HTTPException: too many requests wait.
+        """
+        if len(self._queue) >= self._limits.queue:
+            raise HTTPException(503, "too many requests wait; try again later")
+        outcome: asyncio.Future[Answer | InputError] = asyncio.get_running_loop().create_future()
+        self._queue.append(_Waiting(request, outcome))
+        self._metrics.waiting.set(len(self._queue))
+        if self._running is None or self._running.done():
+            self._running = asyncio.create_task(self._run())
+        return await outcome
+
+    async def close(self) -> None:
+        """Answer what waits, and end the thread."""
+        if self._running is not None:
+            await self._running
+        self._thread.shutdown()
+
+    async def _run(self) -> None:
+        while batch := self._take_batch():
+            began, requests = time.perf_counter(), [waiting.request for waiting in batch]
+            outcomes: Sequence[Answer | Exception]
+            try:
+                outcomes = await asyncio.get_running_loop().run_in_executor(
+                    self._thread, self._answers, requests
+                )
+            except Exception as error:  # a bug, or out of memory; every caller receives it
+                outcomes = [error] * len(batch)
+            self._metrics.count_batch(len(batch), time.perf_counter() - began)
+            for waiting, outcome in zip(batch, outcomes, strict=True):
+                if waiting.outcome.done():
+                    continue
+                if isinstance(outcome, (Answer, InputError)):
+                    waiting.outcome.set_result(outcome)
+                else:
+                    waiting.outcome.set_exception(outcome)
+
+    def _take_batch(self) -> list[_Waiting]:
+        batch: list[_Waiting] = []
+        while self._queue and len(batch) < self._limits.batch:
+            waiting = self._queue.popleft()
+            if not waiting.outcome.done():
+                batch.append(waiting)
+        self._metrics.waiting.set(len(self._queue))
+        return batch
+
+
+class _Entrance:
+    """ASGI middleware that answers 431 to requests with too many or too long headers, and answers
+    requests for recommendations: the framework's routing would take as long as computing one of
+    many that share a forward pass."""
 
     def __init__(self, app: ASGIApp, answer: Callable[[HTTPRequest], Awaitable[Response]]) -> None:
         self._app, self._answer = app, answer
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope.get("path") == _PATH and scope.get("method") == "POST":
-            response = await self._answer(HTTPRequest(scope, receive))
-            await response(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
-
-
-class _TooLargeError(Exception):
-    """The body of a request has too many bytes."""
+        headers, respond = scope.get("headers", ()), self._app
+        size = len(scope.get("raw_path", b"")) + len(scope.get("query_string", b""))
+        size += sum(len(name) + len(value) for name, value in headers)
+        if len(headers) > _MOST_HEADERS or size > _MOST_HEADER_BYTES:
+            most = f"{_MOST_HEADERS} headers and {_MOST_HEADER_BYTES:,} bytes of them are allowed"
+            respond = _respond(431, {"error": most}, {"connection": "close"})
+        elif scope.get("path") == _PATH and scope.get("method") == "POST":
+            respond = await self._answer(HTTPRequest(scope, receive))
+        await respond(scope, receive, send)
 
 
 def application(
@@ -157,14 +299,14 @@ def application(
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
             addresses, *.example.org for all names below, or * for any.
         exposures: gets every answer; None for none.
-        shared_metrics: `/metrics` has the totals of several processes; see `ServingMetrics`.
+        shared_metrics: `/metrics` has the totals of several processes.
 
     Raises:
         InputError: a host is written otherwise.
     """
-    hosts = [_host(host) for host in allowed_hosts]
-    metrics = ServingMetrics(responder.drift, shared_metrics)
-    batcher = Batcher(responder.answers, metrics, limits.batch, limits.queue)
+    hosts = [_read_host(host) for host in allowed_hosts]
+    metrics = _Metrics(responder.drift, shared_metrics)
+    batcher = _Batcher(responder.answers, metrics, limits)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -178,7 +320,7 @@ def application(
 
     @app.exception_handler(HTTPException)
     async def refuse(_: HTTPRequest, error: HTTPException) -> Response:
-        return _response(error.status_code, {"error": str(error.detail)}, error.headers)
+        return _respond(error.status_code, {"error": str(error.detail)}, error.headers)
 
     faults: dict[int | str, dict[str, Any]] = {
         status: {"description": text, "model": _Error} for status, text in _FAULTS.items()
@@ -189,12 +331,11 @@ def application(
         """The next items for one user."""
         began = time.perf_counter()
         status, body = await _answer_http(http, responder, batcher, limits, exposures)
-        metrics.request(status, time.perf_counter() - began)
-        return _response(status, body, {"Retry-After": "1"} if status == 503 else None)
+        metrics.count_request(status, time.perf_counter() - began)
+        return _respond(status, body, {"Retry-After": "1"} if status == 503 else None)
 
-    app.add_middleware(_Direct, answer=recommendations)
-    app.add_middleware(AllowedHosts, allowed=hosts, remedy=_ALLOW)
-    app.add_middleware(_HeaderLimits)  # the last one added comes first
+    app.add_middleware(_Entrance, answer=recommendations)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
 
     @app.get("/health")
     async def health() -> dict[str, Any]:
@@ -204,15 +345,27 @@ def application(
     @app.get("/metrics", response_class=Response)
     async def prometheus() -> Response:
         """Metrics in Prometheus' text format."""
-        return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
+        return Response(metrics.write_text(), media_type=CONTENT_TYPE_LATEST)
 
     return app
+
+
+def _read_host(host: str) -> str:
+    """A host as the header `Host` has it: addresses of IP version 6 are in brackets."""
+    with suppress(ValueError):
+        return f"[{IPv6Address(host.strip('[]'))}]"
+    if not _HOST.fullmatch(host):
+        raise InputError(
+            f"--allowed-hosts: {host!r} is not a host; write names or addresses without a port, "
+            "*.example.org, or *"
+        )
+    return host
 
 
 async def _answer_http(
     http: HTTPRequest,
     responder: Responder | Served,
-    batcher: Batcher,
+    batcher: _Batcher,
     limits: ServerLimits,
     exposures: ExposureLog | None,
 ) -> tuple[int, dict[str, Any]]:
@@ -220,16 +373,14 @@ async def _answer_http(
     arrived = False
     try:
         async with asyncio.timeout(limits.timeout):
-            body = await _body(http, responder.limits.bytes)
+            body = await _read_body(http, responder.limits.bytes)
             arrived = True
             request: Request = parse(Request, body, responder.limits)
             outcome = await batcher.answer(request)
-    except _TooLargeError as error:
-        return 413, {"error": str(error)}
+    except HTTPException as error:
+        return error.status_code, {"error": error.detail}
     except InputError as error:
         return 400, {"error": str(error)}
-    except QueueFullError:
-        return 503, {"error": "too many requests wait; try again later"}
     except TimeoutError:
         status = 504 if arrived else 408
         return status, {"error": f"not done within {limits.timeout:g} s; try again later"}
@@ -238,16 +389,16 @@ async def _answer_http(
     except Exception:
         traceback.print_exc(file=sys.stderr)
         return 500, {"error": "internal error (a bug, or out of memory); see the server's log"}
-    if isinstance(outcome, Answer):
-        if exposures is not None:
-            exposures.add(request.user_id, outcome)
-        return 200, outcome.as_dict(request.user_id)
-    return 400, {"error": str(outcome)}
+    if isinstance(outcome, InputError):
+        return 400, {"error": str(outcome)}
+    if exposures is not None:
+        exposures.add(request.user_id, outcome)
+    return 200, outcome.as_dict(request.user_id)
 
 
-async def _body(http: HTTPRequest, most: int) -> bytes:
+async def _read_body(http: HTTPRequest, most: int) -> bytes:
     """The body of a request, of which no more than `most` bytes are read."""
-    too_large = _TooLargeError(f"the body has more than {most:,} bytes; send fewer rows")
+    too_large = HTTPException(413, f"the body has more than {most:,} bytes; send fewer rows")
     stated = http.headers.get("content-length", "")
     if stated.isdecimal() and int(stated[:20]) > most:
         raise too_large
@@ -259,12 +410,12 @@ async def _body(http: HTTPRequest, most: int) -> bytes:
     return bytes(body)
 
 
-def _response(status: int, body: Any, headers: Any = None) -> Response:
+def _respond(status: int, body: Any, headers: Any = None) -> Response:
     # One-line errors may quote text that is not Unicode; \u escapes can carry it.
     return Response(json_text(body), status, headers, media_type=_JSON)
 
 
-def _inline(schema: dict[str, Any]) -> dict[str, Any]:
+def _inline(schema: dict[str, Any]) -> Any:
     """A JSON schema without references, which lie elsewhere in OpenAPI."""
     definitions = schema.pop("$defs", {})
 
@@ -275,8 +426,7 @@ def _inline(schema: dict[str, Any]) -> dict[str, Any]:
             return {name: inline(entry) for name, entry in value.items()}
         return [inline(entry) for entry in value] if isinstance(value, list) else value
 
-    result: dict[str, Any] = inline(schema)
-    return result
+    return inline(schema)
 
 
 _DESCRIBED: Final = {

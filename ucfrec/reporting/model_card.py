@@ -8,7 +8,7 @@ import os
 from collections.abc import Container, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.files.atomic import atomic_file, read_json, write_json
@@ -16,12 +16,14 @@ from ucfrec.files.locks import claim
 from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.off_policy.evaluate import OffPolicyReport
 from ucfrec.provenance import config_hash, shorten_paths
 from ucfrec.reporting.tables import Table, format_value, markdown_table
 from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record
 from ucfrec.runs.trained_policy import RULE, read_rule
+
+if TYPE_CHECKING:
+    from ucfrec.off_policy.evaluate import OffPolicyReport
 
 
 def write_card(run: Path) -> Path:
@@ -84,7 +86,7 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
-def add_estimates(run: Path, logs: Iterable[str], report: OffPolicyReport) -> None:
+def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> None:
     """Add the estimate that the verdict of `ucfrec ope` is of to the card of the run."""
     rows = {row.method: row for row in report.rows}
     row = rows.get(report.verdict.estimator or LOGGED, rows[LOGGED])

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ucfrec.arrays import IntArray
-from ucfrec.episodes.augmented import AugmentedEpisodes, TrainingEpisodes
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Windows
+from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors

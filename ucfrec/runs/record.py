@@ -38,6 +38,8 @@ from ucfrec.user_model.session_end import SessionEndReport
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
+STORE_SUFFIX: Final = "-store"
+"""Added to the name of a run, it is the default name of its own store beside it."""
 CANDIDATES: Final = "candidates.json"
 """File of the decision rules that the choice tried."""
 

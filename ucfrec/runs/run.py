@@ -24,9 +24,8 @@ from ucfrec.counterfactual.augmentation import (
 )
 from ucfrec.counterfactual.generators import CSGConfig
 from ucfrec.counterfactual.reward_model import CRMConfig
-from ucfrec.episodes.augmented import AUGMENTED, AugmentedEpisodes
-from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
 from ucfrec.files.atomic import write_json
 from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_within
 from ucfrec.fitting import distributed
@@ -259,7 +258,7 @@ def _newest(record: RunRecord, train: EpisodeStore) -> IntArray | None:
 
 def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
-    views = of_people(run.logged), of_people(run.held_out)
+    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
     inputs["simulated"] = simulated = run.record.return_to_go.per_session
     inputs_of_fit = *views, run.out / REWARD_MODEL, run.config.seed
@@ -276,7 +275,7 @@ def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRe
     scorer = Scorer(run.policy, trained.rule, *parts)
     config = run.config.rule
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
-    views = of_people(run.logged), of_people(run.held_out)
+    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     start = None if initial is None else rule_to_start_from(initial, trained)
     problem = targets, *views, config, run.config.seed, start
     choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking

@@ -14,9 +14,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.augmentation import require_rewards_vary
-from ucfrec.episodes.item_counts import TrainingCounts
-from ucfrec.episodes.long_sessions import of_people
 from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder, write_json
@@ -168,7 +167,7 @@ def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array
     spaced order statistics are kept, the lowest and highest too.
     """
     if train.has_items:
-        train = of_people(train)
+        train = train.without_long_sessions()
     returns = train.returns
     if not definition.per_session:
         returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)

@@ -15,10 +15,9 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
-from ucfrec.episodes.item_counts import TrainingCounts
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.returns import ReturnToGo
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json

@@ -111,11 +111,9 @@ def read_space(path: Path) -> Space:
         if table not in TABLES or not isinstance(fields, dict):
             raise InputError(f"{path}: no table is called {table!r}; use {', '.join(TABLES)}")
         for field, values in fields.items():
-            name = f"{table}.{field}"
+            name, listed = f"{table}.{field}", not isinstance(values, dict)
             try:
-                if not isinstance(values, dict):
-                    values = {"choices": values}
-                space[name] = Dimension(**{**values, "choices": tuple(values.get("choices", ()))})
+                space[name] = Dimension(tuple(values)) if listed else Dimension(**values)
             except TypeError:
                 raise InputError(
                     f"{path}: {name}: write a list of choices, or {{low = …, high = …, log = true}}"

@@ -3,6 +3,7 @@ validation rows; the best settings as TOML, and a page of all trials.
 """
 
 import json
+import math
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -15,8 +16,7 @@ import numpy as np
 import torch
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_baselines import PolicyRanker
@@ -121,13 +121,10 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
         workers: processes that train trials side by side.
 
     Raises:
-        InputError: Optuna is not installed, the folder holds another search, the metric or the
-            numbers are out of range, the policies have no such metric on this store, or no trial
-            could be measured.
+        InputError: the folder holds another search, the numbers are out of range, the policies have
+            no such metric on this store, or no trial could be measured.
     """
     optuna = _optuna()
-    if plan.metric not in METRICS:
-        raise InputError(f"the metric is {plan.metric!r}; use {', '.join(METRICS)}")
     if trials < 1 or workers < 1:
         raise InputError(f"{trials} trials and {workers} workers; give 1 or more of each")
     store = EpisodeStore.open(plan.store)
@@ -178,10 +175,8 @@ def config_of(plan: Plan, trial: "FrozenTrial") -> Config:
 
 
 def _optuna() -> Any:
-    try:
-        import optuna
-    except ModuleNotFoundError:
-        raise InputError("a search needs Optuna; install ucfrec[tune]") from None
+    import optuna
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     return optuna
@@ -249,34 +244,30 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
 
     policy, values = plan.search.suggest(trial)
     trial.set_user_attr(POLICY, policy)
-    run: Path | None = None
+    run = plan.out / TRIAL
     try:
         config = plan.search.config(policy, values)
-        run = plan.out / f"{TRIAL}{config_hash(asdict(config))}"
-        shared, heard = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
+        run = _name_run(plan, config)
+        shared, callbacks = SharedStages(plan.out / STAGES), Callbacks(on_validation=stop_hopeless)
         with label_progress(f"trial {trial.number}"):
-            train_run(store, run, config, shared=shared, callbacks=heard)
+            train_run(store, run, config, shared=shared, callbacks=callbacks)
             value = measure_run(TrainedPolicy.load(run), store, plan.metric, plan.k)
-    except InputError as error:
-        trial.set_user_attr("error", str(error))
-        _remove(run)
+    except (InputError, optuna.TrialPruned) as error:
+        if isinstance(error, InputError):
+            trial.set_user_attr("error", str(error))
+        shutil.rmtree(run, ignore_errors=True)
         raise
-    except optuna.TrialPruned:
-        _remove(run)
-        raise
-    if any(
-        earlier.value is not None and earlier.value >= value for earlier in _complete(trial.study)
-    ):
-        _remove(run)
+    earlier = [other.value for other in _list_measured(trial.study) if other.value is not None]
+    if value <= max(earlier, default=-math.inf):
+        shutil.rmtree(run, ignore_errors=True)
     return value
 
 
-def _remove(run: Path | None) -> None:
-    if run is not None:
-        shutil.rmtree(run, ignore_errors=True)
+def _name_run(plan: Plan, config: Config) -> Path:
+    return plan.out / f"{TRIAL}{config_hash(asdict(config))}"
 
 
-def _complete(study: "Study") -> "list[FrozenTrial]":
+def _list_measured(study: "Study") -> "list[FrozenTrial]":
     return [trial for trial in study.trials if trial.state.name == "COMPLETE"]
 
 
@@ -300,16 +291,16 @@ def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
 
 def _keep_best(study: "Study", plan: Plan) -> None:
     """Move the best run to its place and delete those of the other trials."""
-    if not _complete(study):
+    if not _list_measured(study):
         errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
-    name = f"{TRIAL}{config_hash(asdict(config_of(plan, study.best_trial)))}"
-    if (plan.out / name).is_dir():
-        _remove(plan.out / BEST)
-        (plan.out / name).rename(plan.out / BEST)
+    run = _name_run(plan, config_of(plan, study.best_trial))
+    if run.is_dir():
+        shutil.rmtree(plan.out / BEST, ignore_errors=True)
+        run.rename(plan.out / BEST)
     for folder in plan.out.glob(f"{TRIAL}*"):
-        _remove(folder)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def importances(study: "Study") -> dict[str, float]:
@@ -320,8 +311,7 @@ def importances(study: "Study") -> dict[str, float]:
     """
     import optuna
 
-    values = {trial.value for trial in study.trials if trial.state.name == "COMPLETE"}
-    if len(values) < 4:
+    if len({trial.value for trial in _list_measured(study)}) < 4:
         return {}
     try:
         evaluator = optuna.importance.FanovaImportanceEvaluator(seed=0)

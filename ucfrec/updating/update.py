@@ -9,15 +9,14 @@ from typing import Final
 import numpy as np
 
 from ucfrec import schema
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.files.locks import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
 from ucfrec.runs.config import Config, config_from_dict
-from ucfrec.runs.record import RUN, RunRecord, Update
+from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import without_columns
@@ -26,8 +25,6 @@ from ucfrec.runs.warm_start import SHARE, warm_settings
 from ucfrec.updating.drift import measure_drift
 from ucfrec.updating.verdict import compare_runs
 
-STORE_SUFFIX: Final = "-store"
-"""Added to the name of the run, it is the default name of the grown store beside it."""
 _COUNTS: Final = (
     *("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps"),
     "expired_steps",

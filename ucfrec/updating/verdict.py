@@ -7,9 +7,8 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.episodes.earlier import UserRows
-from ucfrec.episodes.item_counts import liked_rewards
-from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.states import liked_rewards
+from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_intervals
 from ucfrec.off_policy.score import score_steps
 from ucfrec.off_policy.verdict import OTHERS_REMOVED, check_mean_weight

@@ -11,10 +11,9 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.item_counts import least_liked
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 
 LONGEST: Final = 8
 """Largest length of a run, and largest number of steps that it lasts, that are tried."""

@@ -1,7 +1,6 @@
 """The user model, reward of every item, session ends and fatigue, and sessions simulated in it."""
 
-import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,9 +10,8 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.sessions import Sessions
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Sessions, Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.processes import require_blas_memory
@@ -43,10 +41,8 @@ class UserModel:
     reward: ItemRewardModel
     """Expected reward of every item, as acting knows it."""
     reward_report: ItemRewardReport
-    """Its quality on validation rows."""
     training_users: TrainingUsers | None
-    """Users with fixed tastes, who reward what simulated sessions show; nothing that acts learns of
-    them but by their rewards. None where no sessions are simulated."""
+    """Who reward what simulated sessions show; None where no sessions are simulated."""
     calibration: tuple[float, float]
     """Slope and intercept of the scores that rewards are drawn from, on held-out rows."""
     session_end: SessionEnd
@@ -57,6 +53,8 @@ class UserModel:
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new, whose tastes
     no one knows."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What simulated sessions are drawn from, as a JSON object."""
 
     @classmethod
     def fit(
@@ -86,28 +84,26 @@ class UserModel:
             users = fit_training_users(train, folder, seed, report.new_users, first)
         tags, path = MainTags.of(validation.item_states), folder / SESSIONS
         if not path.exists():
-            fatigue = None
+            fatigue = calibration = None
             if reward.binary:
-                runs, held_out_runs = (
-                    LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS)
-                    for view in (train, validation)
-                )
-                fatigue = fit_fatigue(runs, held_out_runs)
+                views = train, validation
+                runs = [LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS) for view in views]
+                fatigue = fit_fatigue(runs[0], runs[1])
             logged, held_out = (
-                LoggedEnds.of(view, reward.lags, _MOST_STEPS, seed)
+                LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
             )
             end, end_report = SessionEnd.fit(reward.likeness, logged, held_out, seed)
-            line, calibration = users.report.calibration if users else (1.0, 0.0), None
+            line = users.report.calibration if users else (1.0, 0.0)
             if users is None or not report.new_users:
                 model = users.model if users else reward
                 calibration = UserCalibration.fit(model, validation, _MOST_STEPS, seed)
                 line = calibration.line
             fitted: dict[str, Any] = {
                 "calibration": line,
-                "calibration_report": calibration and dataclasses.asdict(calibration),
-                "session_end": dataclasses.asdict(end_report),
-                "fatigue": fatigue and dataclasses.asdict(fatigue),
+                "calibration_report": calibration and asdict(calibration),
+                "session_end": asdict(end_report),
+                "fatigue": fatigue and asdict(fatigue),
             }
             save_tensors(path, dict(end.tensors), fitted)
         tensors, metadata = load_tensors(path)
@@ -124,6 +120,7 @@ class UserModel:
                 fatigue=of_fatigue and Fatigue(**of_fatigue),
                 main_tags=tags,
                 calibration_report=of_calibration and UserCalibration(**of_calibration),
+                report={**metadata, "users": users and asdict(users.report)},
             )
 
     @property
@@ -145,25 +142,9 @@ class UserModel:
         tired = self.fatigue.is_tired(self.main_tags.runs(history)).numpy()
         return np.where(tired, low + self.fatigue.factor * (rewards - low), rewards)
 
-    def report(self) -> dict[str, Any]:
-        """What simulated sessions are drawn from, as a JSON object."""
-        users = self.training_users
-        return {
-            "calibration": list(self.calibration),
-            "calibration_report": self.calibration_report
-            and dataclasses.asdict(self.calibration_report),
-            "users": users and dataclasses.asdict(users.report),
-            "session_end": dataclasses.asdict(self.session_end_report),
-            "fatigue": self.fatigue and dataclasses.asdict(self.fatigue),
-        }
-
 
 def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
-    """The model of session ends in the folder of a user model; None if there is none.
-
-    Raises:
-        InputError: its file is damaged.
-    """
+    """The model of session ends in the folder of a user model; None if there is none."""
     path = folder / SESSIONS
     if reward is None or not path.exists():
         return None

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
+from ucfrec.episodes.windows import Shown
 
 MEMORY: Final = 50
 """Steps of a session that show tastes, the latest ones."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import Shown
+from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
@@ -337,7 +337,7 @@ def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a fit to older or fewer rows found, where a search or a fit begins."""
+    """What a fit to older or fewer rows found, where a search or a fit begins; nothing at first."""
 
     spreads: dict[str, int]
     """Numbers of the spreads of the effects that it kept."""
@@ -345,11 +345,11 @@ class Beginning:
     """Its effects; those of new users and items are 0."""
 
     @classmethod
-    def of(cls, file: Path, design: Design) -> "Beginning | None":
-        """Read what `save_fit` wrote, in the sizes of `design`; None if it is not there."""
-        if not file.exists():
-            return None
+    def of(cls, folder: Path | None, name: str, design: Design) -> "Beginning":
+        """Read what `save_fit` wrote, if there is any, in the sizes of `design`."""
         effects = Effects()
+        if folder is None or not (file := folder / name).exists():
+            return cls({}, effects)
         with damage_explained(file, REMEDY):
             entries = [EffectTried(**effect) for effect in load_tensors(file)[1]["effects"]]
             for name, old in load_tensors(place_effects(file))[0].items():
@@ -375,9 +375,7 @@ class EffectSearch:
     """Where users are new: the model, whose `tastes` are set on the way, and what the sessions of
     training and of held-out rows showed before them."""
 
-    def __init__(
-        self, design: Design, held_out: Design | None, begin: Beginning | None = None
-    ) -> None:
+    def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""
         if held_out is None:
             rows = len(design.items)
@@ -424,7 +422,7 @@ class EffectSearch:
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
         near, strides = _FIRST, _STRIDES.get(name, (2,))
-        if self._begin is not None:
+        if self._begin.effects:
             spreads = self._begin.spreads
             near, strides = spreads.get(name, _FIRST), (1,) if name in spreads else ()
         number, effects, losses = self._find_best(name, near, strides)
@@ -445,14 +443,12 @@ class EffectSearch:
 
     def take(self, search: "EffectSearch") -> None:
         """Fit the effects that `search` keeps, with its spreads, to all training rows."""
-        self._tried, numbers = list(search._tried), search.kept
-        if "item" in numbers:
-            _, _, losses = self._find_best("item", numbers["item"], ())
-            self.item_loss = float(losses.mean())
-        self.kept |= numbers
-        if numbers:
-            name, number = [*numbers.items()][-1]
-            _, self.effects, self.losses = self._find_best(name, number, ())
+        self._tried = list(search._tried)
+        self.kept = {name: number for name, number in search.kept.items() if name == "item"}
+        self.fit_to(self.design)
+        self.item_loss = float(self.losses.mean())
+        self.kept = dict(search.kept)
+        self.fit_to(self.design)
 
     def forget_users(self) -> None:
         """Fit further effects as for new users, with the effects of items as they are."""
@@ -500,8 +496,7 @@ class EffectSearch:
 
     def fit_to(self, design: Design) -> None:
         """Fit the effects that were kept to other rows, from those of an earlier state if any."""
-        start = design.mean_effect() | ({} if self._begin is None else self._begin.effects)
-        self.design = design
+        start, self.design = design.mean_effect() | self._begin.effects, design
         self.effects = fit_effects(design, start, self._spreads, self._fixed)
         self.losses = self._losses(self.effects)
 
@@ -522,11 +517,9 @@ class EffectSearch:
             if not 0 <= index < len(_SPREADS):
                 return float("inf")
             if index not in fits:
-                start = self.effects
-                if self._begin is not None:
-                    start = self._begin.effects | start
-                    if fits:
-                        start = fits[min(fits, key=lambda i: abs(i - index))][0]
+                start = self._begin.effects | self.effects
+                if self._begin.effects and fits:
+                    start = fits[min(fits, key=lambda i: abs(i - index))][0]
                 spreads = self._spreads | {name: _SPREADS[index]}
                 effects = fit_effects(self.design, start, spreads, self._fixed)
                 fits[index] = effects, self._losses(effects)
@@ -546,12 +539,7 @@ class EffectSearch:
         return self.held_out.loss(self.held_out.predictor(effects)).double()
 
 
-def save_fit(
-    file: Path,
-    model: ItemRewardModel,
-    effects: Effects,
-    report: Any,
-) -> None:
+def save_fit(file: Path, model: ItemRewardModel, effects: Effects, report: Any) -> None:
     """Write a fitted model with its report, and its effects beside it; `file` is complete last."""
     file.parent.mkdir(parents=True, exist_ok=True)
     save_tensors(place_effects(file), effects, {})

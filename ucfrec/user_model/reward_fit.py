@@ -127,12 +127,12 @@ def fit_item_reward_model(
     rows, held_out = (RewardRows.of(v, model.lags, _MAX_ROWS, seed) for v in (train, validation))
     set_statistics(model, rows, held_out, states)
     design = Design.of(model, rows)
-    begin = None if first is None else Beginning.of(first / FITTED, design)
+    begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, Design.of(model, held_out), begin)
     if search.of_new_users:
         rows, held_out = (RewardRows.of(v, MEMORY, _MAX_ROWS, seed) for v in (train, validation))
         search.sessions = model, rows.history, held_out.history
-    elif begin is not None:
+    elif begin.effects:
         search = EffectSearch(_select_some(design, seed), search.held_out, begin)
     with progress(len(EFFECTS), "item rewards", "effects") as bar:
         lasting = EffectSearch(design, None, begin) if search.of_new_users else search
@@ -142,7 +142,7 @@ def fit_item_reward_model(
                 search.forget_users()
                 lasting = search
             lasting.add(name)
-            if name == CHEAP[-1] and begin is None:
+            if name == CHEAP[-1] and not begin.effects:
                 lasting.adjust()
             bar.update()
     if len(search.design.items) < len(rows):
@@ -172,8 +172,7 @@ def refit_item_reward_model(
     rows = RewardRows.of(store, lags, _MAX_ROWS, seed)
     set_statistics(model, rows, rows, store.item_states)
     design = Design.of(model, rows)
-    begin = Beginning.of(first / FITTED, design)
-    assert begin is not None
+    begin = Beginning.of(first, FITTED, design)
     search = EffectSearch(design, design, begin)
     search.kept = dict(begin.spreads)
     if report.new_users:
@@ -221,8 +220,8 @@ def fit_training_users(
     if weighted:
         weights = weigh_by_propensity(sessions, episodes, steps, len(model.item))
     design = Design.of(model, rows, weights)
-    begin = None if first is None else Beginning.of(first / _USERS_FITTED, design)
-    fewer = begin is not None and not weighted
+    begin = Beginning.of(first, _USERS_FITTED, design)
+    fewer = begin.effects and not weighted
     search = EffectSearch(_select_some(design, seed) if fewer else design, None, begin)
     with progress(len(EFFECTS), "training users", "effects") as bar:
         for name in EFFECTS:

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.episodes.exposure import Shown
-from ucfrec.episodes.item_counts import least_liked
-from ucfrec.episodes.states import ItemStates
+from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 

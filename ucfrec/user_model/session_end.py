@@ -17,8 +17,9 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
-from ucfrec.episodes.exposure import Likeness, Shown
+from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import Shown
 from ucfrec.user_model.reward import compare_to_history
 from ucfrec.user_model.reward_report import SAVED
 
@@ -55,23 +56,19 @@ _SPLITS: Final = LEAVES - 1
 
 @dataclass(frozen=True)
 class LoggedEnds:
-    """Logged steps, what was shown before each, and whether it ended its session."""
+    """Logged steps, and whether they ended their sessions."""
 
-    history: Shown
-    """The items shown before, (N, L)."""
-    items: Tensor
-    """(N,) int64 items shown at the step."""
-    rewards: Float64Array
-    """(N,) in reward units."""
-    steps: IntArray
-    """(N,) number of the step in its session."""
+    inputs: Tensor
+    """(N, F) of `describe_steps`."""
     ended: BoolArray
     """(N,)."""
     followed: BoolArray
     """(N,) whether another session of the same user follows; true where users are not named."""
 
     @classmethod
-    def of(cls, store: EpisodeStore, lags: int, most: int, seed: int) -> "LoggedEnds":
+    def of(
+        cls, store: EpisodeStore, likeness: Likeness, lags: int, most: int, seed: int
+    ) -> "LoggedEnds":
         """Steps of a view of a store of items, at most `most` of them, drawn at random; without the
         last one of a session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
@@ -82,27 +79,17 @@ class LoggedEnds:
             numbers = np.sort(sample)
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - usable)[episodes]
-        followed = ~last_sessions(store) if store.has_users else np.ones(len(store), dtype=bool)
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
-        return cls(
-            history=Shown.before(store, episodes, steps, lags),
-            items=torch.from_numpy(items),
-            rewards=store.step_values(schema.REWARD, episodes, steps).astype(np.float64),
-            steps=steps,
-            ended=steps == store.lengths[episodes] - 1,
-            followed=followed[episodes],
-        )
+        rewards = store.step_values(schema.REWARD, episodes, steps).astype(np.float64)
+        history = Shown.before(store, episodes, steps, lags)
+        inputs = describe_steps(likeness, history, torch.from_numpy(items), rewards, steps)
+        followed = ~last_sessions(store) if store.has_users else np.ones(len(store), dtype=bool)
+        return cls(inputs, steps == store.lengths[episodes] - 1, followed[episodes])
 
     def select(self, rows: BoolArray) -> "LoggedEnds":
         """Some of the steps."""
-        return LoggedEnds(
-            self.history.at(torch.from_numpy(rows)),
-            self.items[torch.from_numpy(rows)],
-            self.rewards[rows],
-            self.steps[rows],
-            self.ended[rows],
-            self.followed[rows],
-        )
+        inputs = self.inputs[torch.from_numpy(rows)]
+        return LoggedEnds(inputs, self.ended[rows], self.followed[rows])
 
 
 def last_sessions(store: EpisodeStore) -> BoolArray:
@@ -211,8 +198,7 @@ class SessionEnd:
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
         """The best kind, fitted to all of `logged`."""
-        ended = logged.ended
-        inputs = _inputs(likeness, logged.history, logged.items, logged.rewards, logged.steps)
+        inputs, ended = logged.inputs, logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
         if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
             kinds["logistic"] = _logistic(inputs, ended)
@@ -230,17 +216,15 @@ class SessionEnd:
 
     def _losses(self, rows: LoggedEnds) -> Tensor:
         """Log losses (N,) of logged steps."""
-        inputs = _inputs(self._likeness, rows.history, rows.items, rows.rewards, rows.steps)
-        odds = self._log_odds(inputs)
-        return F.softplus(
-            torch.where(torch.from_numpy(rows.ended), -odds, odds).clamp(max=_HIGHEST)
-        )
+        odds = self._log_odds(rows.inputs)
+        signed = torch.where(torch.from_numpy(rows.ended), -odds, odds)
+        return F.softplus(signed.clamp(max=_HIGHEST))
 
     def probabilities(
         self, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
     ) -> Float64Array:
-        """Probabilities (M,) that sessions end with a step; arguments as in `LoggedEnds`."""
-        inputs = _inputs(self._likeness, history, items, rewards, steps)
+        """Probabilities (M,) that sessions end with a step; see `describe_steps`."""
+        inputs = describe_steps(self._likeness, history, items, rewards, steps)
         return torch.sigmoid(self._log_odds(inputs)).numpy()
 
     def score_items(
@@ -307,10 +291,10 @@ def _pad(items: Tensor) -> Tensor:
     return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
 
-def _inputs(
+def describe_steps(
     likeness: Likeness, history: Shown, items: Tensor, rewards: Float64Array, steps: IntArray
 ) -> Tensor:
-    """(M, F) inputs of steps as of `LoggedEnds`."""
+    """(M, F) inputs of steps at which items (M,) were shown, after what was shown before."""
     alike = compare_to_history(likeness, _pad(history.items), items)
     repeated = history.items == items.unsqueeze(1)
     columns = _columns(alike, repeated, torch.from_numpy(rewards), torch.from_numpy(steps))

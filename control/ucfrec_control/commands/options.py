@@ -91,9 +91,7 @@ class ControlGridOptions(GridOptions):
     seeds: Annotated[int | None, "N"] = None
     """Training seeds of every method, from 0 (default: set by --budget)"""
     out: Path = Path("runs/control")
-    """Folder for logs, stores, runs and result rows; resumed."""
     workers: int = 1
-    """Parallel processes, one thread each."""
 
     def require_data(self) -> Path:
         """The folder of the HDF5 files.

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ucfrec.episodes.distractor import logged_observations, reward_bit, with_observations
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
 from ucfrec.errors import InputError
 from ucfrec_control.data.d4rl import read_d4rl
 
@@ -31,7 +31,7 @@ def add_distractor(
     """Write a copy of `store` with a reward-indicating bit appended to every observation.
 
     Args:
-        flip, early: as of `ucfrec.episodes.distractor.reward_bit`.
+        flip, early: as of `ucfrec.episodes.writer.reward_bit`.
 
     Raises:
         InputError: `reward_bit` rejects the arguments, the store holds item logs, or `out` exists.

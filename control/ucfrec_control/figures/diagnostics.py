@@ -17,9 +17,8 @@ from ucfrec.counterfactual.generators import (
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel
 from ucfrec.counterfactual.reward_model_fit import sample_transitions
-from ucfrec.episodes.augmented import AUGMENTED, AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Transitions
+from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy

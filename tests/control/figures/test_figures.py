@@ -10,8 +10,8 @@ import torch
 
 from tests.support.control_files import TINY, control, set_options, write_made
 from tests.support.result_rows import result_row
-from ucfrec.episodes.augmented import AugmentedEpisodes
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import AugmentedEpisodes
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.results.rows import append_rows

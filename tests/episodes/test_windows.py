@@ -1,4 +1,4 @@
-"""Augmented episodes, against what a slow reader makes of their sources."""
+"""Windows of running sessions are those of a store; augmented episodes against a slow reader."""
 
 import tempfile
 from collections import Counter
@@ -14,7 +14,10 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from tests.support.episodes import (
+    LENGTHS,
+    N_ITEMS,
     Logged,
+    all_windows,
     random_action_copies,
     random_edits,
     random_episodes,
@@ -22,12 +25,54 @@ from tests.support.episodes import (
     state_before,
     write_store,
 )
-from ucfrec.episodes.augmented import AugmentedEpisodes, TrainingEpisodes
+from ucfrec import schema
 from ucfrec.episodes.returns import ReturnToGo
+from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.episodes.windows import AugmentedEpisodes, Sessions, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 
-LENGTHS = (3, 1, 7, 2, 5, 9, 1, 4)
+USERS = 3
+
+
+@pytest.mark.parametrize("context", [1, 4, 20])
+@pytest.mark.parametrize("observation", [0, 2])
+def test_windows_are_those_of_a_store(context: int, observation: int) -> None:
+    rng, states = np.random.default_rng(context), some_states(USERS, 5)
+    counts = np.array([0, 1, 30, 3, 7])
+    owner = np.repeat(np.arange(len(counts)), counts)
+    items, rewards = rng.integers(N_ITEMS, size=41), rng.normal(size=41).astype(np.float32)
+    users = rng.integers(-1, USERS, size=len(counts))
+    seen = rng.normal(size=(len(counts), observation)).astype(np.float32)
+    # The store has the step to decide too, whose item and reward count for nothing.
+    ends = np.cumsum(counts)
+    columns = {schema.ITEM: np.insert(items, ends, 0), schema.REWARD: np.insert(rewards, ends, 0)}
+    if observation:
+        columns[schema.OBSERVATION] = np.repeat(seen, counts + 1, axis=0)
+    store = EpisodeStore.from_arrays(columns, counts + 1, {schema.USER: users}, states)
+    expected = store.windows(np.arange(len(counts)), counts, context)
+    observations = torch.from_numpy(seen).unsqueeze(1).expand(-1, 25, -1) if observation else None
+    at = store, np.arange(len(counts)), counts
+    for length in (context - 1 + states.window, 60):
+        requested = Sessions.from_rows(owner, items, rewards, users, length, observations)
+        logged = Sessions.from_store(*at, context, length)
+        for sessions in (requested, logged):
+            _compare(sessions, states, context, expected)
+            collected = np.bincount(owner, rewards, minlength=len(counts))
+            np.testing.assert_allclose(sessions.collected.numpy(), collected)
+            assert sessions.shown.items[2, :3].tolist() == items[30:27:-1].tolist()
+
+
+def _compare(sessions: Sessions, states: ItemStates, context: int, expected: Windows) -> None:
+    """The windows are the expected ones but for the step to decide."""
+    windows = sessions.windows(states, context)
+    for name in ("states", "timesteps", "mask"):
+        assert torch.equal(getattr(windows, name), getattr(expected, name))
+    for name in ("actions", "rewards"):
+        assert torch.equal(getattr(windows, name)[:, :-1], getattr(expected, name)[:, :-1])
+        assert not getattr(windows, name)[:, -1].any()
+
+
 definitions = st.one_of(
     st.just(ReturnToGo()),
     st.sampled_from([0.25, 0.5, 1.0]).map(lambda gamma: ReturnToGo("discounted", gamma)),
@@ -45,10 +90,6 @@ def make_store(
 
 def both_kinds(store: EpisodeStore) -> AugmentedEpisodes:
     return random_edits(store, 4, seed=1)[0].join(random_action_copies(store, 3, seed=5))
-
-
-def all_windows(store: EpisodeStore, length: int) -> dict[str, torch.Tensor]:
-    return vars(store.windows(*store.all_steps(), length))
 
 
 @given(
@@ -113,7 +154,7 @@ def test_action_copies_are_their_source_up_to_their_own_last_step(
     with tempfile.TemporaryDirectory() as name:
         store = write_store(Path(name) / "store", episodes, states, shard_steps=6)
         store = store.with_return_to_go(definition)
-        logged = all_windows(store, length)
+        logged = vars(all_windows(store, length))
         augmented = random_action_copies(store, 4, seed)
         training = TrainingEpisodes(store, random_edits(store, edits, seed)[0].join(augmented))
         first = len(store) + edits
@@ -137,7 +178,7 @@ def test_action_copies_are_their_source_up_to_their_own_last_step(
                 assert value.dtype == torch.int64 or not torch.signbit(value[0][~valid]).any()
         # The logged episodes do not notice the copies.
         drawn = training.windows(*store.all_steps(), length)
-        for windows in (all_windows(store, length), vars(drawn)):
+        for windows in (vars(all_windows(store, length)), vars(drawn)):
             assert all(torch.equal(values, logged[name]) for name, values in windows.items())
 
 

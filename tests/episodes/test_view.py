@@ -1,0 +1,389 @@
+"""Windows and columns of a store against plain Python readers of the same episodes."""
+
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chisquare
+
+from tests.support.episodes import (
+    LENGTHS,
+    SHARDS,
+    Logged,
+    all_windows,
+    are_equal,
+    random_episodes,
+    some_states,
+    state_before,
+    write_store,
+)
+from ucfrec import schema
+from ucfrec.episodes import view as view_module
+from ucfrec.episodes.store import EpisodeStore
+from ucfrec.errors import InputError
+from ucfrec.files.atomic import read_json, write_json
+
+lengths_of_episodes = st.lists(st.integers(1, 8), min_size=1, max_size=6)
+
+
+@given(
+    lengths=lengths_of_episodes,
+    length=st.integers(1, 10),
+    window=st.integers(1, 5),
+    users=st.integers(0, 2),
+    observation=st.integers(0, 2),
+    items=st.booleans(),
+    shard_steps=st.sampled_from(SHARDS),
+    data=st.data(),
+)
+def test_windows_equal_a_row_by_row_reading(
+    lengths: list[int],
+    length: int,
+    window: int,
+    users: int,
+    observation: int,
+    items: bool,
+    shard_steps: int,
+    data: st.DataObject,
+) -> None:
+    observation = observation if items else observation + 1
+    episodes = random_episodes(lengths, seed=len(lengths), observation=observation, items=items)
+    states = some_states(users, window) if items else None
+    episode = st.integers(0, len(lengths) - 1)
+    chosen = data.draw(st.lists(episode, min_size=1, max_size=8))
+    ends = [data.draw(st.integers(0, lengths[e] - 1)) for e in chosen]
+    with tempfile.TemporaryDirectory() as name:
+        store = write_store(Path(name) / "store", episodes, states, shard_steps)
+        got = store.windows(np.array(chosen), np.array(ends), length)
+
+    assert got.states.shape == (len(chosen), length, store.state_size)
+    assert got.states.dtype == got.rewards.dtype == got.returns_to_go.dtype == torch.float32
+    assert got.timesteps.dtype == torch.int64
+    assert got.actions.dtype == (torch.int64 if items else torch.float32)
+    for b, (number, end) in enumerate(zip(chosen, ends, strict=True)):
+        logged = episodes[number]
+        for k in range(length):
+            step = end - (length - 1) + k
+            assert got.mask[b, k] == (step >= 0)
+            if step < 0:
+                continue
+            assert got.rewards[b, k] == logged.rewards[step]
+            assert got.returns_to_go[b, k] == logged.return_to_go(step)
+            assert got.timesteps[b, k] == step
+            if logged.actions is None:
+                assert got.actions[b, k] == logged.items[step]
+            else:
+                assert np.array_equal(got.actions[b, k], logged.actions[step])
+            expected = state_before(logged, step, states)
+            np.testing.assert_allclose(got.states[b, k], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_documented_example(tmp_path: Path) -> None:
+    steps = {schema.REWARD: np.array([9.0, 5, 6, 7, 8]), schema.ACTION: np.zeros((5, 1))}
+    steps[schema.OBSERVATION] = np.zeros((5, 1))
+    store = EpisodeStore.write(tmp_path / "store", steps, np.array([1, 4]))
+    window = store.windows(np.array([1]), np.array([1]), 3)
+    assert window.rewards.tolist() == [[0, 5, 6]]
+    assert window.mask.tolist() == [[False, True, True]]
+    assert window.timesteps.tolist() == [[0, 0, 1]]
+    assert window.returns_to_go.tolist() == [[0, 26, 21]]
+
+
+@pytest.mark.parametrize("items", [True, False])
+def test_padding_is_zero_with_a_plus_sign(tmp_path: Path, items: bool) -> None:
+    episodes = random_episodes(LENGTHS, items=items)
+    for episode in episodes:  # all signs negative: a product with the mask would leave −0.0
+        episode.rewards = [-1.0] * len(episode)
+        episode.observations = -np.abs(episode.observations)
+        if episode.actions is not None:
+            episode.actions = -np.abs(episode.actions)
+    store = write_store(tmp_path / "store", episodes, some_states() if items else None)
+    windows = all_windows(store, 12)
+    padding = ~windows.mask
+    assert padding.sum() > 100
+    for name, values in vars(windows).items():
+        padded = values[padding]
+        assert not padded.any(), name
+        assert padded.dtype == torch.bool or not torch.signbit(padded).any(), name
+
+    moved = store.transitions(*store.all_steps())
+    beyond = moved.next_states[moved.last]
+    assert len(beyond) == store.n_episodes
+    assert not beyond.any()
+    assert not torch.signbit(beyond).any()
+
+
+def test_a_window_of_no_rows_is_empty(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
+    none = np.empty(0, dtype=np.int64)
+    assert store.windows(none, none, 4).states.shape == (0, 4, store.state_size)
+
+
+@pytest.mark.parametrize("shard_steps", SHARDS)
+def test_views_see_their_episodes_only(tmp_path: Path, shard_steps: int) -> None:
+    episodes = random_episodes(LENGTHS)
+    store = write_store(tmp_path / "store", episodes, some_states(), shard_steps)
+    view = store.select(np.array([6, 2, 4])).select(np.array([2, 0]))
+    assert view.episode_ids.tolist() == [4, 6]
+    assert view.lengths.tolist() == [LENGTHS[4], LENGTHS[6]]
+    assert view.episode_values(schema.USER).tolist() == [episodes[4].user, episodes[6].user]
+    assert view.returns.tolist() == [episodes[4].return_to_go(0), episodes[6].return_to_go(0)]
+    at = np.array([0, 0, 1]), np.array([1, 4, 0])
+    assert are_equal(view.windows(*at, 5), store.windows(np.array([4, 4, 6]), at[1], 5))
+    walked = view.all_steps()
+    assert np.array_equal(view.locate(np.arange(view.n_steps)), walked)
+    assert walked[0].tolist() == [0] * LENGTHS[4] + [1] * LENGTHS[6]
+    assert walked[1].tolist() == [*range(LENGTHS[4]), *range(LENGTHS[6])]
+
+
+@pytest.mark.parametrize("shard_steps", SHARDS)
+@pytest.mark.parametrize("items", [True, False])
+def test_a_view_leaves_out_some_of_what_was_observed(
+    tmp_path: Path, items: bool, shard_steps: int
+) -> None:
+    episodes = random_episodes(LENGTHS, observation=3, items=items)
+    store = write_store(tmp_path / "store", episodes, some_states() if items else None, shard_steps)
+    view = store.select(np.array([6, 2, 4])).without_observation_dimensions([1])
+    assert (view.observation_size, view.state_size) == (2, store.state_size - 1)
+    for part in (view, view.select(np.array([2, 0]))):
+        seen, whole = (all_windows(each, 4) for each in (part, store.select(part.episode_ids)))
+        # What is observed comes last in a state.
+        assert torch.equal(seen.states[..., :-2], whole.states[..., :-3])
+        assert torch.equal(seen.states[..., -2:], whole.states[..., [-3, -1]])
+        assert are_equal(replace(seen, states=whole.states), whole)
+    last = all_windows(view.without_observation_dimensions([0]), 4)
+    assert torch.equal(last.states[..., -1], all_windows(view, 4).states[..., -1])
+    assert last.states.shape[-1] == view.state_size - 1
+    assert store.observation_size == 3
+
+
+def test_splits_part_the_episodes(tmp_path: Path) -> None:
+    episodes = random_episodes(LENGTHS * 4)
+    store = write_store(tmp_path / "store", episodes, shard_steps=6)
+    views = [store.split(name) for name in schema.SPLITS]
+    for number, view in enumerate(views):
+        assert view.episode_ids.tolist() == [
+            i for i, episode in enumerate(episodes) if episode.split == number
+        ]
+        assert (view.episode_values(schema.SPLIT) == number).all()
+    everything = np.concatenate([view.episode_ids for view in views])
+    assert sorted(everything.tolist()) == list(range(len(episodes)))
+
+
+def test_draws_are_uniform_over_steps(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
+    store = store.select(np.array([0, 2, 3, 5]))
+    episodes, steps = store.draw_steps(np.random.default_rng(0), 40_000)
+    assert (steps >= 0).all()
+    assert (steps < store.lengths[episodes]).all()
+    starts = np.cumsum(store.lengths) - store.lengths
+    counts = np.bincount(starts[episodes] + steps, minlength=store.n_steps)
+    assert len(counts) == store.n_steps
+    assert chisquare(counts).pvalue > 1e-3
+
+    again = store.draw_steps(np.random.default_rng(0), 40_000)
+    assert np.array_equal(episodes, again[0])
+    assert np.array_equal(steps, again[1])
+    other = store.draw_steps(np.random.default_rng(1), 40_000)
+    assert not np.array_equal(steps, other[1])
+
+
+def test_steps_that_an_episode_does_not_have_are_refused(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
+    for episodes, ends, length, message in (
+        ([0], [LENGTHS[0]], 2, "episode 0 has 3 steps, none numbered 3"),
+        ([0], [-1], 2, "episode 0 has 3 steps, none numbered -1"),
+        ([-1], [0], 2, "no episodes -1 to -1"),
+        ([0, len(LENGTHS)], [0, 0], 2, f"no episodes 0 to {len(LENGTHS)}"),
+        ([0, 1], [0], 2, "two arrays of the same length"),
+        ([[0]], [[0]], 2, "two arrays of the same length"),
+        ([0], [0], 0, "at least 1 step"),
+    ):
+        with pytest.raises(InputError, match=message):
+            store.windows(np.array(episodes), np.array(ends), length)
+    with pytest.raises(InputError, match="no split is called 'training'; there are train, valid"):
+        store.split("training")
+
+
+def test_opening_reads_the_record_only(tmp_path: Path) -> None:
+    write_store(tmp_path / "store", random_episodes(LENGTHS), shard_steps=6)
+    for column in tmp_path.glob("store/shard-*/*"):
+        column.write_bytes(bytes(column.stat().st_size))
+    store = EpisodeStore.open(tmp_path / "store")
+    assert store.record.n_steps == sum(LENGTHS)
+
+
+def test_columns_are_mapped_not_read(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS, items=False))
+    at = np.array([0]), np.array([0])
+    before = float(store.step_values(schema.REWARD, *at)[0])
+    column = np.load(tmp_path / "store" / "shard-00000" / "reward.npy", mmap_mode="r+")
+    column[0] = before + 1
+    column.flush()
+    assert store.step_values(schema.REWARD, *at)[0] == before + 1
+
+
+def change_reward_name(path: Path) -> None:
+    path.write_text(path.read_text().replace('"reward": "reward"', '"reward": "reword"'))
+
+
+RECORDS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "newer": (
+        lambda path: path.write_text(json.dumps({"version": schema.STORE_VERSION + 1})),
+        "upgrade ucfrec",
+    ),
+    "cut": (lambda path: path.write_text("{"), r"meta\.json"),
+    "no object": (lambda path: path.write_text("[]"), r"meta\.json"),
+    "nothing in it": (lambda path: path.write_text("{}"), r"meta\.json"),
+    "another type": (lambda path: path.write_text('{"version": "1"}'), r"meta\.json"),
+    "no text": (lambda path: path.write_bytes(b"\xff"), r"meta\.json"),
+    "missing": (Path.unlink, r"not an episode store.*meta\.json"),
+    "changed": (change_reward_name, r"meta\.json was changed after ucfrec wrote it"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), RECORDS.values(), ids=RECORDS)
+def test_a_damaged_record_is_named(
+    tmp_path: Path, damage: Callable[[Path], object], message: str
+) -> None:
+    write_store(tmp_path / "store", random_episodes(LENGTHS))
+    damage(tmp_path / "store" / "meta.json")
+    with pytest.raises(InputError, match=message):
+        EpisodeStore.open(tmp_path / "store")
+
+
+def use(store: EpisodeStore) -> None:
+    store.episode_values(schema.USER)
+    all_windows(store, 3)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "missing": Path.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "cut in the header": lambda path: path.write_bytes(path.read_bytes()[:50]),
+    "cut in the data": lambda path: path.write_bytes(path.read_bytes()[:-3]),
+    "not numpy": lambda path: path.write_bytes(b"PK or something else entirely" * 9),
+    "a flipped bit": lambda path: path.write_bytes(flip(path.read_bytes())),
+}
+
+
+COLUMNS = ("reward", "item", "return_to_go", "offsets", "user")
+
+
+def flip(content: bytes) -> bytes:
+    return content[:-1] + bytes([content[-1] ^ 16])
+
+
+@pytest.mark.parametrize(
+    ("column", "damage"), [*product(COLUMNS, ["a flipped bit"]), *product(["item"], DAMAGE)]
+)
+def test_a_damaged_column_is_named_when_it_is_used(
+    tmp_path: Path, column: str, damage: str
+) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
+    DAMAGE[damage](tmp_path / "store" / "shard-00001" / f"{column}.npy")
+    with pytest.raises(InputError, match=rf"shard-00001/{column}\.npy") as caught:
+        use(EpisodeStore.open(store.path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_column_of_another_length_is_named(tmp_path: Path) -> None:
+    write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
+    path = tmp_path / "store" / "shard-00001" / "reward.npy"
+    np.save(path, np.load(path)[:-1])
+    with pytest.raises(InputError, match=r"reward\.npy is truncated: 152 of 156 bytes"):
+        use(EpisodeStore.open(tmp_path / "store"))
+    without_checksums(tmp_path / "store")
+    with pytest.raises(InputError, match="'reward' has 31 of 32 steps"):
+        use(EpisodeStore.open(tmp_path / "store"))
+
+
+def without_checksums(store: Path) -> None:
+    """Let other content of its files pass."""
+    write_json(store / "meta.json", {**read_json(store / "meta.json"), "files": {}})
+
+
+@pytest.mark.parametrize("middle", [[2**63 - 1, -(2**63)], [3, 3], [4, 2]])
+def test_offsets_that_do_not_ascend_are_damage(tmp_path: Path, middle: list[int]) -> None:
+    """Differences of the first wrap around to positive numbers."""
+    write_store(tmp_path / "store", random_episodes([3, 3, 3]))
+    path = tmp_path / "store" / "shard-00000" / "offsets.npy"
+    np.save(path, np.array([0, *middle, np.load(path)[-1]]))
+    without_checksums(tmp_path / "store")
+    with pytest.raises(InputError, match="do not ascend from 0"):
+        use(EpisodeStore.open(tmp_path / "store"))
+
+
+def test_an_item_that_the_catalogue_lacks_is_named(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
+    without_checksums(store.path)
+    path = store.path / "shard-00000" / "item.npy"
+    items = np.load(path)
+    items[3] = 10**6
+    np.save(path, items)
+    with pytest.raises(InputError, match="'item' has items from 0 to 1000000, there are 11"):
+        use(EpisodeStore.open(store.path))
+
+
+def test_a_column_that_was_never_logged_is_named(tmp_path: Path) -> None:
+    steps = {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))}
+    store = EpisodeStore.write(tmp_path / "store", steps, np.array([3]))
+    with pytest.raises(InputError, match="no column 'propensity'"):
+        store.step_values(schema.PROPENSITY, np.array([0]), np.array([0]))
+
+
+@pytest.mark.parametrize("shard_steps", SHARDS)
+def test_steps_beyond_the_store_are_refused(tmp_path: Path, shard_steps: int) -> None:
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), shard_steps=shard_steps)
+    with pytest.raises(IndexError):
+        store.step_values(schema.REWARD, np.array([7]), np.array([LENGTHS[7]]))
+
+
+@pytest.mark.parametrize("long_enough", [1, 1000])
+def test_steps_in_batches_are_all_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, long_enough: int
+) -> None:
+    """Also where they are read as slices across shards."""
+    monkeypatch.setattr(view_module, "_BATCH_STEPS", 7)
+    monkeypatch.setattr(view_module, "_LONG_ENOUGH", long_enough)
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
+    for view in (store, store.select(np.array([2, 0, 2])), store.select(np.array([1, 2, 0]))):
+        episodes, steps = zip(*view.step_batches(), strict=True)
+        assert len(episodes) == -(-view.n_steps // 7)
+        listed = view.all_steps()
+        np.testing.assert_array_equal(np.concatenate(episodes), listed[0])
+        np.testing.assert_array_equal(np.concatenate(steps), listed[1])
+        rewards, items = (view.step_values(n, *listed) for n in (schema.REWARD, schema.ITEM))
+        np.testing.assert_array_equal(view.column(schema.REWARD), rewards)
+        counts = np.bincount(items, minlength=len(view.item_states.embeddings))
+        np.testing.assert_array_equal(view.item_counts(), counts)
+    assert store.select(np.array([], dtype=np.int64)).column(schema.REWARD).shape == (0,)
+
+
+def test_views_share_mapped_columns_with_their_store(tmp_path: Path) -> None:
+    """A view costs no second mapping; its windows are those of the store it was taken from."""
+    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
+    whole = all_windows(store, 3)
+    for column in tmp_path.glob("store/shard-*/reward.npy"):
+        column.unlink()
+    assert are_equal(all_windows(store.select(np.arange(len(LENGTHS))), 3), whole)
+
+
+def test_user_rows_are_those_of_the_source(tmp_path: Path) -> None:
+    states = some_states(users=2)
+    logged = [
+        Logged([1.0], np.zeros((1, 0)), items=[0], user=3),
+        Logged([1.0], np.zeros((1, 0)), items=[0], user=-1),
+    ]
+    store = write_store(tmp_path / "store", logged, states)
+    seen = all_windows(store, 1).states[:, 0, -2:]
+    assert torch.equal(seen[0], states.user_features[3])
+    assert not seen[1].any()

@@ -1,0 +1,422 @@
+"""What `prepare`, mappings and tables of items and users refuse: one clear error each."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tests.support.logs import START, random_log, write
+from ucfrec.errors import InputError
+from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files, read_columns, read_mapping
+from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
+
+Act = Callable[[Path], Any]
+Change = Callable[[pd.DataFrame], pd.DataFrame]
+
+
+def refuse(act: Act, folder: Path, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        act(folder)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+    assert not (folder / "store").exists()
+
+
+def log_with(name: str = "log.parquet", mapping: LogMapping | None = None, **values: Any) -> Act:
+    """`prepare` of a log in which some columns have other values, or are options."""
+    options = {n: values.pop(n) for n in [*values] if n in PrepareOptions.__dataclass_fields__}
+    if "changed_reward" in values:
+        values["reward"] = values.pop("changed_reward")
+
+    def act(folder: Path) -> None:
+        log = random_log().assign(propensity=0.5)
+        path = write(log.assign(**values), folder / name)
+        how = mapping or LogMapping()
+        prepare([path], how, folder / "store", PrepareOptions(**options))
+
+    return act
+
+
+def lines_with(change: Callable[[list[str]], list[str]]) -> Act:
+    """`prepare` of a CSV file with changed lines."""
+
+    def act(folder: Path) -> None:
+        lines = random_log(40).to_csv(index=False).splitlines()
+        (folder / "log.csv").write_text("\n".join(change(lines)) + "\n")
+        prepare([folder / "log.csv"], LogMapping(), folder / "store")
+
+    return act
+
+
+def bytes_with(change: Callable[[bytes], bytes]) -> Act:
+    """`prepare` of a damaged Parquet file."""
+
+    def act(folder: Path) -> None:
+        path = write(random_log(), folder / "log.parquet")
+        path.write_bytes(change(path.read_bytes()))
+        prepare([path], LogMapping(), folder / "store")
+
+    return act
+
+
+def parts_with(*parts: pd.DataFrame, names: str = "{}.csv", **mapping: Any) -> Act:
+    """`validate` of several files."""
+
+    def act(folder: Path) -> None:
+        for n, part in enumerate(parts):
+            write(part, folder / names.format(n))
+        validate(log_files([folder]), LogMapping(**mapping))
+
+    return act
+
+
+def twice(name: str) -> Act:
+    """`validate` of a file with two columns of one name."""
+
+    def act(folder: Path) -> None:
+        log, file = random_log(), folder / name
+        columns = [*log.columns, "REWARD" if name == "log.csv" else "reward"]
+        log = log.assign(again=1 - log.reward)
+        if name.endswith("parquet"):
+            pq.write_table(pa.table([*map(pa.array, log.to_numpy().T)], names=columns), file)
+        else:
+            log.set_axis(columns, axis=1).to_csv(file, index=False)
+        validate([file], LogMapping())
+
+    return act
+
+
+def encoded(encoding: str) -> Act:
+    def act(folder: Path) -> None:
+        log = random_log()
+        log.assign(item_id="é" + log.item_id.astype(str)).to_csv(
+            folder / "log.csv", index=False, encoding=encoding
+        )
+        validate([folder / "log.csv"], LogMapping())
+
+    return act
+
+
+def observed(value: float | None) -> Act:
+    observations = [np.array([1.0, 2.0]) for _ in range(400)]
+    observations[9] = None if value is None else np.array([1.0, value])  # type: ignore[call-overload]
+    return log_with(observation=observations)
+
+
+def dated(form: str, first: str = "2024-03-01", days: int = 11) -> pd.DataFrame:
+    times = pd.Timestamp(first) + pd.to_timedelta(np.arange(400) * days // 400, unit="D")
+    return random_log().assign(timestamp=times.strftime(form))
+
+
+LOGS: dict[str, tuple[Act, str]] = {
+    "missing column": (
+        lambda folder: prepare(
+            [write(random_log().rename(columns={"item_id": "itemid"}), folder / "log.parquet")],
+            LogMapping(),
+            folder / "store",
+        ),
+        r"log\.parquet has no column 'item_id'.*nearest: itemid",
+    ),
+    "missing reward": (log_with(reward="least(rewrd, 1)"), r"no column 'rewrd'.*nearest: reward"),
+    "text time": (log_with(timestamp="noon"), r"timestamp\) is 'noon', no ISO 8601 time"),
+    "real ids": (
+        log_with(user_id=0.5),
+        r"user_id \(user_id\) is DOUBLE.*BIGINT.*at most 15 digits: others would be rounded",
+    ),
+    "text reward": (log_with(changed_reward="much"), r"reward \(reward\) is VARCHAR"),
+    "seconds": (
+        log_with(timestamp=START // 1000 + np.arange(400)),
+        r"no row is left \(400 rows: time before 2000.*milliseconds.*--earliest 1990-01-01, or ear",
+    ),
+    "percentages": (
+        log_with(propensity=60.0),
+        r"propensity is above 1, up to 60, in 400 of 400 rows.*propensity / 100",
+    ),
+    "logarithms of propensities": (
+        log_with(propensity=-0.7),
+        r"propensity is not above 0, down to -0.7, in 400 of 400 rows.*exp\(propensity\)",
+    ),
+    "unknown propensities as -1": (
+        log_with(propensity=[0.5] * 390 + [-1] * 10),
+        r"is not above 0, down to -1, in 10 of 400 rows.*nullif\(propensity, -1\)",
+    ),
+    "a propensity of 0": (
+        log_with(propensity=[0.5] * 399 + [0]),
+        r"is not above 0, down to 0, in 1 of 400 rows.*nullif\(propensity, 0\)",
+    ),
+    "equal rewards": (log_with(changed_reward=1.0), r"all 400 rewards equal 1.*another reward"),
+    "equal rewards before the test": (
+        log_with(changed_reward=np.arange(400) // 399),
+        r"all 320 rewards of the training split equal 0",
+    ),
+    "no finite reward": (log_with(changed_reward=np.nan), r"no row is left .*NaN"),
+    "a reward beyond float32": (
+        log_with(changed_reward=[0.0, 1] * 199 + [2e38, -1e13]),
+        r"2 of 400 rewards are beyond ±1e\+12 \(up to 2e\+38\), too large.*divide them",
+    ),
+    "no session": (log_with(min_steps=1000), r"no session is left: none of the 400 clean rows"),
+    "no training": (log_with(split=(5.0, 6.0)), r"no row is in the training split, before 1970"),
+    "aggregate": (log_with(reward="sum(reward)"), r"not a scalar SQL"),
+    "window": (log_with(reward="lag(reward) OVER ()"), r"not a scalar SQL"),
+    "subquery": (log_with(reward="(SELECT 1)"), r"not a scalar SQL"),
+    "broken SQL": (log_with(reward="reward +"), r"not a scalar SQL"),
+    "unequal lists": (
+        log_with(observation=[[1.0] * (1 + (i == 7)) for i in range(400)]),
+        r"observation has lists of unequal length: 399 rows of 1, 1 rows of 2",
+    ),
+    "an observation that is NaN": (observed(np.nan), r"observation is missing .* in 1 of 400 rows"),
+    "an infinite observation": (observed(np.inf), r"observation is missing .* in 1 of 400 rows"),
+    "no observation": (observed(None), r"observation is missing .* in 1 of 400 rows"),
+    "no sessions": (log_with(session_by="session_id"), r"no column 'session_id'"),
+    "real sessions": (
+        log_with(session_by="session_id", session_id=0.5),
+        r"session_id \(session_id\) is DOUBLE; use integers or text",
+    ),
+    "line breaks in a name": (
+        lambda folder: validate(
+            [write(random_log().rename(columns={"reward": "a\n\x1b[31mb"}), folder / "l.parquet")],
+            LogMapping(),
+        ),
+        "no column 'reward'",
+    ),
+    "truncated": (bytes_with(lambda b: b[: len(b) // 2]), r"cannot be read.*truncated"),
+    "damaged": (
+        bytes_with(lambda b: b[:40] + b"\xff" * 1000 + b[1040:]),
+        r"log\.parquet cannot be read",
+    ),
+    "no bytes": (bytes_with(lambda b: b""), r"log\.parquet is empty \(0 bytes\)"),
+    "no rows": (parts_with(random_log(0), names="{}.parquet"), r"is empty \(0 rows\)"),
+    "headers only": (
+        parts_with(random_log(0), random_log(0)),
+        r"0\.csv and 1 more is empty \(0 rows\)",
+    ),
+    "a word in a late line": (
+        lines_with(lambda lines: [lines[0], *lines[1:] * 600, "1,2,soon,1.0"]),
+        r"log\.csv, line 24002: column timestamp: .*soon.*Parquet",
+    ),
+    "too many fields": (
+        lines_with(lambda lines: [*lines[:20], lines[20] + ",1"]),
+        r"log\.csv, line 21 has 5 fields, the",
+    ),
+    "too few fields": (
+        lines_with(lambda lines: [*lines[:20], "1,2"]),
+        r"log\.csv, line 21 has 2 fields, the header 4;",
+    ),
+    "no header": (
+        lines_with(lambda lines: lines[1:]),
+        r"log\.csv, line 1 has values \(\d+, .*instead of the names",
+    ),
+    **{f"two rewards in {name}": (twice(name), r"(?i)more than one column reward; rename or")
+       for name in ("log.parquet", "log.csv", "log.csv.gz")},
+    "latin-1": (encoded("latin-1"), "not in UTF-8; convert it"),
+    "utf-16": (encoded("utf-16"), "not in UTF-8; convert it"),
+    "a backslash in a pattern": (log_with(name="a\\[b].parquet"), r"backslash and .*; rename it"),
+    **{f"a folder and its file in {suffix}": (
+        parts_with(random_log(), names=f"user_id=8/log{{}}{suffix}", partitions=True),
+        "in the file, but its folder says another value",
+    ) for suffix in (".csv", ".parquet")},
+    "columns in folders": (
+        parts_with(random_log().drop(columns="user_id"), names="user_id=8/{}.csv"),
+        "has no column 'user_id'",
+    ),
+    "vectors of a part only": (
+        parts_with(
+            random_log(9).assign(observation=[[1.0]] * 9),
+            random_log(9).assign(observation=pd.Series([None] * 9, dtype="string")),
+            names="{}.parquet",
+        ),
+        r"observation is missing .* in 9 of 18 rows",
+    ),
+    **{f"unsettled {form}": (
+        parts_with(dated(form), names=f"{{}}{suffix}"),
+        f"3 January or 1 March\\? .*--time-format '%d{form[2]}%m{form[2]}%Y …' or '%m{form[2]}%d",
+    ) for form, suffix in (
+        ("%m/%d/%Y", ".csv"),
+        ("%m.%d.%Y %H:%M", ".parquet"),
+        ("%m/%d/%Y, %H:%M:%S", ".csv"),
+        ("%m-%d-%Y %I:%M:%S %p", ".parquet"),
+    )},
+    "a part that does not settle its dates": (
+        parts_with(dated("%m/%d/%Y", days=31), dated("%m/%d/%Y", "2024-04-01")),
+        r"1\.csv: timestamp is '04/01/2024': 4 January or",
+    ),
+    "parts with other dates": (
+        parts_with(dated("%m/%d/%Y", days=31), dated("%d/%m/%Y", days=31)),
+        "the day first in some files and the month in others",
+    ),
+    "a part with both dates": (
+        parts_with(random_log().assign(timestamp=["03/13/2024", "13/03/2024"] * 200)),
+        "neither day/month nor month/day reads every row",
+    ),
+    **{f"other times in {name}": (
+        parts_with(dated("%d %b %Y %H:%M"), names=name),
+        "no ISO 8601 time nor milliseconds; say how it is written",
+    ) for name in ("{}.csv", "{}.parquet")},
+    "dates in an expression": (
+        log_with("log.csv", made="03/01/2024", reward="month(made)"), "not a scalar SQL expression"
+    ),
+    "a condition that is none": (
+        log_with(mapping=LogMapping(where="user_id")),
+        r"--where \(user_id\) is BIGINT; write a condition",
+    ),
+    "a condition on nothing": (
+        log_with(mapping=LogMapping(where="visitor = 1")), "has no column 'visitor'"
+    ),
+    "a condition that reads": (
+        log_with(mapping=LogMapping(where="read_text('/etc/passwd') = ''")), "it calls 'read_text'"
+    ),
+    "a condition that selects": (
+        log_with(mapping=LogMapping(where="(SELECT true)")), "it has a subquery"
+    ),
+    "a limit that is none": (log_with(memory_limit="much"), "'much' is not a size; write e.g. 2GB"),
+    "a missing file": (lambda f: log_files([f / "a.parquet"]), "a.parquet does not exist"),
+    "a pattern of nothing": (lambda f: log_files([f / "*.parquet"]), r"\*\.parquet matches no"),
+    "another kind of file": (lambda f: log_files([write(random_log(1), f / "log.txt")]),
+                             r"log\.txt is not a .parquet or"),
+    "no file at all": (lambda f: log_files([]), "no log was named"),
+    "a frame": (lambda f: prepare(random_log(), LogMapping(), f / "store"), "paths is a frame"),  # type: ignore[arg-type]
+    "a store like no store": (
+        lambda f: prepare([write(random_log(), f / "l.csv")], LogMapping(), f / "store", like=f),
+        "neither an episode store nor a run",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_logs_that_cannot_be_prepared(tmp_path: Path, name: str) -> None:
+    refuse(LOGS[name][0], tmp_path, LOGS[name][1])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        *(({"gap_minutes": value}, "gap_minutes is") for value in (np.inf, np.nan, -1.0)),
+        *(({name: np.nan}, f"{name} is nan; it must") for name in ("min_steps", "embedding_size")),
+        *(({"split": (0.0, value)}, "split is") for value in (np.inf, np.nan, -1.0)),
+        ({"split": (0.5, 0.1, 0.1)}, "three shares that add up to 1"),
+        ({"max_session": 1, "min_steps": 2}, "max_session is below min_steps"),
+        ({"duplicates": "any"}, "must be 'highest', 'lowest', 'first' or 'last'"),
+        ({"session_by": "visit"}, "must be 'session_id', 'gap' or 'user', or unset"),
+        ({"engine": "pandas"}, "must be 'duckdb' or 'spark'"),
+    ],
+)
+def test_options_that_are_none(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PrepareOptions(**values)
+
+
+def test_splits_that_are_none() -> None:
+    for text in ("0.5", "a,b,c", "2024-01-01", "soon,later"):
+        with pytest.raises(InputError, match="write shares as"):
+            parse_split(text)
+    with pytest.raises(InputError, match="write NAME=COLUMN"):
+        read_columns(["user_id"])
+
+
+TABLE = "[[item_features]]\nkey = 'x'\nfiles = "
+MAPPINGS = {
+    "[[items_features]]\nkey = 'x'": "there is no key 'items_features'; did you mean 'item_",
+    "zzz = 1": "there is no key 'zzz'; there are columns, reward, session_by, item_feat",
+    "remembered = 1": "there is no key 'remembered'; there are",
+    "rewards = 'x'": "rewards",
+    "[[item_features]]\nfile = ['x']": r"\[\[item_features\]\]: there is no key 'file'; did you",
+    "[[user_features]]\nfiles = ['x']": "it has no key 'key'; add it",
+    "[item_features]\nfiles = ['x']": r"\[\[item_features\]\]: write it in double brackets",
+    f"{TABLE}'price'": "files of features is price; write a list",
+    f"{TABLE}['x']\ncolumns = 'price'": "columns of features is price; write a list",
+    "[columns]\nitem = 'x'": "'item' is not a log column",
+    "earliest = 'soon'": "earliest is 'soon'; write a date",
+    "reward = 3": "is not text",
+    "[columns]\nuser_id = 3": "is not text",
+    "[columns]\nuser_id = ['a']": "is not text",
+    **{f"session_by = {value}": r"session_by is .*; use session_id, gap, user" for value in
+       ("'gpa'", "'Gap'", "''", "'visit'", "3", "['gap']")},
+    "reward = ": "m.toml",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lines", MAPPINGS)
+def test_mappings_that_cannot_be_used(tmp_path: Path, lines: str) -> None:
+    (tmp_path / "m.toml").write_text(f"{lines}\n")
+    refuse(lambda folder: read_mapping(folder / "m.toml"), tmp_path, MAPPINGS[lines])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"columns": {"item": "x"}}, "'item' is not a log column"),
+        ({"session_by": "visit"}, "use session_id, gap, user"),
+        ({"earliest": "soon"}, "earliest is 'soon'; write a date"),
+        ({"item_features": (pd.DataFrame(),)}, "takes a list of FeatureTable"),
+    ],
+)
+def test_mappings_of_python_that_cannot_be_used(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        LogMapping(**values)
+
+
+def table_with(ids: list[Any], keys: list[Any], **columns: Any) -> Act:
+    """`prepare` of a log of items `ids` with features of items `keys`."""
+
+    def act(folder: Path) -> None:
+        log = random_log(len(ids) * 10).assign(item_id=ids * 10)
+        table = pd.DataFrame({"key": keys, "price": range(len(keys)), **columns})
+        names = tuple(name for name in table.columns if name != "key")
+        file = write(table, folder / "table.parquet")
+        mapping = LogMapping(item_features=(FeatureTable((file,), "key", names),))
+        prepare([write(log, folder / "log.parquet")], mapping, folder / "store")
+
+    return act
+
+
+def feature(column: str, key: str = "item_id") -> Act:
+    """`prepare` with a feature, or a key, that no table has."""
+
+    def act(folder: Path) -> None:
+        file = write(pd.DataFrame({"item_id": range(20)}), folder / "table.csv")
+        mapping = LogMapping(item_features=(FeatureTable((file,), key, (column,)),))
+        prepare([write(random_log(), folder / "log.parquet")], mapping, folder / "store")
+
+    return act
+
+
+def text_parts(folder: Path) -> None:
+    for n, price in enumerate((1.0, "many")):
+        table = pd.DataFrame({"item_id": range(n * 10, 10 + n * 10), "price": price})
+        write(table, folder / "items" / f"{n}.parquet")
+    mapping = LogMapping(item_features=(FeatureTable((folder / "items",), "item_id"),))
+    validate([write(random_log(), folder / "log.parquet")], mapping)
+
+
+NONE = r"table\.parquet: no row belongs to a item_id of the log"
+NEVER = rf"{NONE}.*key is never such an id; let the key be"
+TABLES: dict[str, tuple[Act, str]] = {
+    "other ids": (table_with([1, 2, 12], [21]), rf"{NONE}, which are 1, 2, 12, …, and key is 21"),
+    "text ids": (table_with([1, 2], ["i1", "i2"]), NEVER),
+    "real ids": (table_with([1, 2, 12], [1.4, 2.4, 11.6]), NEVER),
+    "rounded ids": (table_with([2**53, 2**53 + 2], [2.0**53, 2.0**53 + 2]), NEVER),
+    "numbers of text": (
+        table_with(["a1", "a2", "a12"], [1, 2, 12]),
+        rf"{NONE}.*'a1', 'a12', 'a2', …, and key is '1', '12'",
+    ),
+    "zeros before": (table_with(["1", "2", "12"], ["01", "02"]), rf"{NONE}.*key is '01', '02', …"),
+    "repeated ids": (table_with([1, 2], [1, 2, 2, 2]), "2 of 4 rows repeat a key; keep one row"),
+    "a record": (table_with([1], [1], group=[{"a": 1}]), r"feature \(group\) is STRUCT.*cast it"),
+    "vectors": (
+        table_with([1, 2], [1, 2], v=[np.ones(1), np.ones(2)]), "feature has lists of unequal"
+    ),
+    "no such feature": (feature("price"), r"no column 'price' \(item_id feature\)"),
+    "no such key": (feature("item_id", "iid"), r"no column 'iid'"),
+    "an aggregate": (feature("sum(item_id)"), "not a scalar SQL expression"),
+    "parts of other types": (text_parts, r"price is VARCHAR here and DOUBLE in .*0\.parquet"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_that_cannot_be_used(tmp_path: Path, name: str) -> None:
+    refuse(TABLES[name][0], tmp_path, TABLES[name][1])

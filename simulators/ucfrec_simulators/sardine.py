@@ -33,8 +33,7 @@ class SardineEnvironment(GymnasiumCatalog):
     """N sessions of a SARDINE environment of single items.
 
     Args:
-        variant: the part of the identifier that names the environment, `Static` or `BoredInf`.
-        num_envs: N.
+        variant: `Static` or `BoredInf`.
 
     Raises:
         InputError: `sardine-rec` is not installed.
@@ -81,8 +80,6 @@ class GreedyOracle:
     because the draw of ε does not depend on what happens in the session.
 
     Args:
-        env: the environment that it acts in.
-        seed: seed of its draws.
         epsilons: values of ε, all equally likely.
 
     Raises:

@@ -67,9 +67,8 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
-    assert planted.record.source.others["distractor"]["rate"] == pytest.approx(
-        observed[:, 0].mean()
-    )
+    rate = planted.record.source.others["distractor"]["rate"]
+    assert rate == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -157,9 +156,8 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     folder = kuairand_folder / "environment"
     for rate in (0.0, 1.0):
         environment = DistractorEnvironment(name, folder, rate)
-        assert (
-            evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))["episodes"] == 20
-        )
+        row = evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))
+        assert row["episodes"] == 20
         env = environment.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         steps_played, states_shown = _play_and_watch(env, trained, ids)

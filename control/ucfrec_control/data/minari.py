@@ -22,7 +22,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec_control.data.d4rl import convert_singles, first_line, require_inside
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
+from ucfrec_control.environments.environments import antmaze_settings, is_antmaze
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
 _ROOT = "MINARI_DATASETS_PATH"

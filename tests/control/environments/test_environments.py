@@ -29,8 +29,7 @@ from ucfrec.results.rows import read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
-from ucfrec_control.environments.antmaze import antmaze_settings
-from ucfrec_control.environments.environments import make_env, mismatches
+from ucfrec_control.environments.environments import antmaze_settings, make_env, mismatches
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.training.evaluate import load_run, open_environment
 

@@ -18,8 +18,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from measured_rows import append_row, make_parser
@@ -72,8 +72,7 @@ def make_wide_log(folder: Path, rows: int, seed: int) -> None:
     writer.close()
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """What a command took."""
 
     wall_s: float

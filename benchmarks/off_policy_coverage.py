@@ -33,13 +33,13 @@ replications (seeds from 5000 on), DR held the truth in 35, SNIPS in 37, logged 
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from measured_rows import make_parser
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.estimators import Estimate, estimate
+from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.models import fit_models
 from ucfrec.off_policy.verdict import conclude
@@ -155,8 +155,7 @@ def drawn(probabilities: Float64Array, rng: np.random.Generator) -> IntArray:
     return np.asarray(np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1))
 
 
-@dataclass(frozen=True)
-class Replication:
+class Replication(NamedTuple):
     """What one set of logs says."""
 
     stands: bool
@@ -168,18 +167,14 @@ class Replication:
 def replication(environment: Environment, seed: int) -> Replication:
     steps, (truth, as_logged) = environment.logged(seed), environment.value(seed)
     verdict, found = conclude(steps, seed), estimate(steps, seed)
-    holds: dict[str, bool] = {}
-    for name in SHOWN[:-1]:
-        holds[name] = held(found.get(name), as_logged if name == "logged" else truth)
-    low, high = verdict.lift_low, verdict.lift_high
-    holds["lift"] = low is not None and high is not None and low <= truth - as_logged <= high
+    intervals = {name: (one.low, one.high, truth) for name, one in found.items()}
+    intervals["lift"] = (verdict.lift_low, verdict.lift_high, truth - as_logged)
+    if "logged" in found:
+        intervals["logged"] = (found["logged"].low, found["logged"].high, as_logged)
+    holds = dict.fromkeys(SHOWN, False)
+    for name, (low, high, value) in intervals.items():
+        holds[name] = low is not None and high is not None and low <= value <= high
     return Replication(verdict.reliable, holds)
-
-
-def held(found: Estimate | None, truth: float) -> bool:
-    if found is None or found.low is None or found.high is None:
-        return False
-    return found.low <= truth <= found.high
 
 
 @dataclass(frozen=True)

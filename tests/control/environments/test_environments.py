@@ -197,14 +197,10 @@ def test_minari_mazes_are_those_of_the_data(
         env = gymnasium.make("AntMaze_UMaze-v4", maze_map=maze, continuing_task=True)
         seen = [env.reset(seed=0)[0]]
         seen += [env.step(np.zeros(8))[0] for _ in range(3)]
-        buffer = EpisodeBuffer(
-            observations={name: np.array([s[name] for s in seen]) for name in seen[0]},
-            actions=np.zeros((3, 8)),
-            rewards=[0.0] * 3,
-            terminations=[False] * 3,
-            truncations=[False, False, True],
-            infos={},
-        )
+        columns = {name: np.array([s[name] for s in seen]) for name in seen[0]}
+        ends = {"terminations": [False] * 3, "truncations": [False, False, True], "infos": {}}
+        steps = {"actions": np.zeros((3, 8)), "rewards": [0.0] * 3, **ends}
+        buffer = EpisodeBuffer(observations=columns, **steps)
         minari.create_dataset_from_buffers(
             "D4RL/antmaze/umaze-v1", [buffer], env=env, requirements=["gymnasium-robotics==1.2.0"]
         )

@@ -274,13 +274,20 @@ def _choose(
 
 def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
     replay = training.sac.replay(training.evaluations[medium]["steps"])
-    ends = np.flatnonzero(replay["terminals"] | replay["timeouts"])
+    return _trajectories(replay, replay["terminals"], replay["timeouts"], env_id)
+
+
+def _trajectories(
+    columns: Mapping[str, Array], terminated: BoolArray, truncated: BoolArray, env_id: str
+) -> Trajectories:
+    """Steps of whole episodes, one after another."""
+    ends = np.flatnonzero(terminated | truncated)
     return Trajectories(
-        **{name: replay[name] for name in _COLUMNS},
+        **{name: columns[name].astype(np.float32) for name in _COLUMNS},
         lengths=np.diff(ends, prepend=-1),
-        terminated=replay["terminals"][ends],
-        final_observations=replay["next_observations"][ends],
-        source=_source(env_id),
+        terminated=terminated[ends],
+        final_observations=columns["next_observations"][ends].astype(np.float32),
+        source={"where": f"episodes of {env_id}", "env_id": env_id},
     )
 
 
@@ -317,32 +324,17 @@ def roll_out(
 def _sort_by_episode(steps: list[Step], env_id: str) -> Trajectories:
     """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
     order = np.argsort(np.concatenate([step.episodes for step in steps]), kind="stable")
-
-    def column(name: str) -> Array:
-        return np.concatenate([getattr(step, name) for step in steps])[order]
-
-    terminated = column("terminated")
-    ends = np.flatnonzero(terminated | column("truncated"))
-    return Trajectories(
-        **{
-            name: column(name).astype(np.float32) for name in ("observations", "actions", "rewards")
-        },
-        lengths=np.diff(ends, prepend=-1),
-        terminated=terminated[ends],
-        final_observations=column("next_observations")[ends].astype(np.float32),
-        source=_source(env_id),
-    )
+    names = (*_COLUMNS, "next_observations", "terminated", "truncated")
+    columns = {
+        name: np.concatenate([getattr(step, name) for step in steps])[order] for name in names
+    }
+    return _trajectories(columns, columns["terminated"], columns["truncated"], env_id)
 
 
 def _join(*parts: Trajectories) -> Trajectories:
     """Concatenate trajectories; the source is that of the first."""
-
-    def column(name: str) -> Any:
-        return np.concatenate([getattr(part, name) for part in parts])
-
     names = (*_COLUMNS, "lengths", "terminated", "final_observations")
-    return Trajectories(**{name: column(name) for name in names}, source=parts[0].source)
-
-
-def _source(env_id: str) -> dict[str, Any]:
-    return {"where": f"episodes of {env_id}", "env_id": env_id}
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
+    return Trajectories(**columns, source=parts[0].source)

@@ -13,14 +13,7 @@ import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
 
-from tests.support.control_files import (
-    TINY,
-    control,
-    hopper_like,
-    refused,
-    set_options,
-    write_hdf5,
-)
+from tests.support.control_files import TINY, control, hopper_like, refused, set_options, write_hdf5
 from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source

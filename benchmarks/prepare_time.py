@@ -208,7 +208,7 @@ def main() -> None:
         return
     from measured_rows import make_parser
 
-    from ucfrec.files.locks import scratch_folder
+    from ucfrec.files.atomic import scratch_folder
     from ucfrec.reporting.tables import markdown_table
 
     parser = make_parser(__doc__, SUITE)

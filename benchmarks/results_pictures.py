@@ -6,12 +6,12 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ucfrec.reporting.charts import OURS, PAGE, PLAIN, save, styled
+from ucfrec.reporting.charts import OURS, PAGE, PLAIN, file_style, save
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import grouped, summary
 
 
-@styled
+@file_style()
 def draw(files: Mapping[str, Sequence[ResultRow]], order: Sequence[str], folder: Path) -> None:
     """Draw the returns in each simulator of Table 2, control's scores, and those of checkpoints.
 

@@ -17,7 +17,7 @@ PACKAGES = {
 }
 ORDER = (
     {"arrays", "schema", "errors", "processes"},
-    {"files", "progress", "plugins", "provenance", "settings", "arguments"},
+    {"files", "plugins", "settings"},
     {"results", "fitting"},
     {"episodes"},
     {"logs", "user_model"},

@@ -1,10 +1,13 @@
 """Processes end with one line when interrupted, and with their parent; random states are kept."""
 
 import os
+import pty
 import random
+import re
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +27,13 @@ from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
+from ucfrec.processes import (
+    Interrupted,
+    command_line,
+    interruptions_raised,
+    random_state_kept,
+    shorten_paths,
+)
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import new_policy
@@ -310,3 +319,105 @@ def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(
         train_run(store, tmp_path / str(seed), config)
         weights.append(TrainedPolicy.load(tmp_path / str(seed)).policy.state_dict())
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
+
+
+@pytest.mark.parametrize(
+    ("argument", "written"),
+    [
+        ("/home/me/data/log.parquet", "log.parquet"),
+        ("/home/me/data/", "data"),
+        ("--out=/home/me/runs", "--out=runs"),
+        ("/home/a=b/runs", "runs"),
+        ("~/runs", "runs"),
+        (r"C:\Users\me\runs", "runs"),
+        ("runs/benchmark", "runs/benchmark"),
+        ("train.learning_rate=1e-3", "train.learning_rate=1e-3"),
+        ("is_click / 2", "is_click / 2"),
+        ("--reward=is_click/2", "--reward=is_click/2"),
+        ("/", "/"),
+        ("", ""),
+    ],
+)
+def test_folders_of_a_machine_are_not_written_down(argument: str, written: str) -> None:
+    assert shorten_paths(argument) == written
+
+
+def test_a_command_is_its_name_and_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/opt/bin/ucfrec", "train", "/home/me/store", "--seed", "3"])
+    assert command_line() == "ucfrec train store --seed 3"
+
+
+_PEAKS = """
+import numpy as np
+from ucfrec.processes import peak_memory_mib, reset_peak_memory
+reset_peak_memory()
+print(peak_memory_mib())
+large = np.ones(2**25)
+print(peak_memory_mib())
+del large
+reset_peak_memory()
+print(peak_memory_mib())
+"""
+
+
+def test_peak_memory_is_of_what_was_done_since() -> None:
+    """In a process of its own: a test session's heap has free pages to hide an array in."""
+    printed = subprocess.run(
+        [sys.executable, "-c", _PEAKS], capture_output=True, text=True, check=True
+    ).stdout
+    before, during, after = map(float, printed.split())
+    assert during - before > 0.9 * 256
+    if sys.platform == "linux":
+        assert after < during - 100
+
+
+JOB = """
+import sys, time
+from ucfrec import processes
+processes.FIRST_LINE, processes.NEXT_LINE = {first}, 0.05
+with processes.progress({total}, "train", "steps", done=5) as bar:
+    for step in range(5, 10):
+        time.sleep(0.1)
+        bar.set_postfix(loss=1 / (step + 1), refresh=False)
+        bar.update()
+"""
+
+
+def lines_of(first: float, total: int | None) -> list[str]:
+    """Lines on stderr of a job of half a second."""
+    command = [sys.executable, "-c", JOB.format(first=first, total=total)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return ended.stderr.splitlines()
+
+
+def test_a_log_file_gets_plain_lines_with_rate_and_time_left() -> None:
+    lines = lines_of(0.05, 10)
+    assert 4 <= len(lines) <= 7
+    pattern = r"train:  60% 6/10 \[00:00<00:00, +([\d.]+) steps/s, loss=0.167\]"
+    line = re.fullmatch(pattern, lines[0])
+    assert line, lines
+    assert float(line[1]) <= 10  # 1 step of this start in 0.1 s or more, not 6
+    assert lines[-1].startswith("train: 100% 10/10 [")
+    assert all(re.match(r"train: [\d.]+ steps \[", line) for line in lines_of(0.05, None))
+
+
+def test_a_short_job_prints_nothing_without_a_terminal() -> None:
+    assert lines_of(30, 10) == []
+
+
+def test_a_terminal_shows_a_bar() -> None:
+    ours, theirs = pty.openpty()
+    termios.tcsetwinsize(theirs, (24, 100))
+    code = JOB.format(first=30, total=10)
+    with subprocess.Popen([sys.executable, "-c", code], stderr=theirs) as process:
+        os.close(theirs)
+        shown = b""
+        try:
+            while chunk := os.read(ours, 4096):
+                shown += chunk
+        except OSError:  # the other end is closed
+            pass
+        assert process.wait() == 0
+    os.close(ours)
+    assert b"train: 100%" in shown
+    assert b"loss=0.1" in shown

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,11 @@ class InputError(ValueError):
 
 class InputNote(UserWarning):
     """Something about an input that a user should know; the command line prints it as one line."""
+
+
+def warn_user(message: str) -> None:
+    """Warn of something about an input, on behalf of the caller's caller."""
+    warnings.warn(message, InputNote, stacklevel=3)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The process: how it ends, by Ctrl-C or TERM at any moment and with its parent; random state."""
+"""The process: how it ends, with its parent too; random state; provenance; progress on stderr."""
 
 import io
 import mmap
@@ -7,20 +7,30 @@ import random
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from importlib import import_module
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
 
 ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+FIRST_LINE = 10.0
+"""Seconds before the first line of progress without a terminal; a shorter job prints nothing."""
+NEXT_LINE = 30.0
+"""Seconds between lines."""
 _AGAIN: Final = 0.1
 """Seconds after which an interruption that a library swallowed is raised again."""
 _BLAS: Final = 128 * 2**20
 """Bytes that OpenBLAS asks the operating system for at its first use, and some more."""
+_PACKAGES: Final = ("ucfrec", "torch", "numpy", "gymnasium")
+_LABEL: ContextVar[str] = ContextVar("label", default="")
+"""Which of several jobs at the same time this is; empty for the only one."""
+_PHASE: ContextVar[str] = ContextVar("phase", default="")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -198,3 +208,160 @@ def random_state_kept() -> Iterator[None]:
     finally:
         random.setstate(python_state)
         np.random.set_state(numpy_state)  # noqa: NPY002
+
+
+def versions(packages: Sequence[str] = ()) -> dict[str, str]:
+    """Installed versions of Python and of the packages that results depend on.
+
+    Args:
+        packages: further distributions to include if they are installed, e.g. of a simulator.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    installed = {"python": sys.version.split()[0]}
+    for name in (*_PACKAGES, *packages):
+        with suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return installed
+
+
+def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
+    """Command, commit and `versions` of this process, as every result row records them.
+
+    The commit is that of the checkout that ucfrec is imported from; None for an installed wheel.
+    """
+    import subprocess
+
+    root, commit = Path(__file__).resolve().parent.parent, None
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        commit = result.stdout.strip() or None
+    return {"command": command_line(), "commit": commit, "versions": versions(packages)}
+
+
+def command_line() -> str:
+    """The command of this process, with absolute paths shortened to their last component.
+
+    Result rows are published and must not reveal the folders of a machine.
+    """
+    return " ".join([Path(sys.argv[0]).name, *map(shorten_paths, sys.argv[1:])])
+
+
+def shorten_paths(argument: str) -> str:
+    """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
+    option, equals, value = "", "", argument
+    if not _is_absolute(argument):
+        option, equals, value = argument.rpartition("=")
+    name = PureWindowsPath(value).name
+    return f"{option}{equals}{name}" if name and _is_absolute(value) else argument
+
+
+def _is_absolute(path: str) -> bool:
+    """Whether `path` is absolute on POSIX or Windows, or relative to a home folder."""
+    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
+    return rooted or path.startswith("~")
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """The first 12 hexadecimal digits of the SHA-256 of a configuration as JSON, keys sorted."""
+    import hashlib
+    import json
+
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def reset_peak_memory() -> None:
+    """Make `peak_memory_mib` measure from now on; has no effect on systems other than Linux."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory_mib() -> float:
+    """Peak resident memory of this process since `reset_peak_memory`, in MiB.
+
+    On systems other than Linux: since the process began.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    import resource  # not on Windows
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+class Progress(Protocol):
+    """The display that `progress` yields, a bar of tqdm."""
+
+    def update(self, n: float = 1) -> object:
+        """Count `n` more units as done."""
+
+    def set_postfix(self, *, refresh: bool | None, **metrics: Any) -> None:
+        """Display `metrics` next to them, e.g. `loss=0.3`."""
+
+
+@contextmanager
+def progress(
+    total: float | None, job: str, unit: str, done: float = 0, shown: bool = True
+) -> Iterator[Progress]:
+    """Display on stderr the finished share of a job, its rate and the estimated time left.
+
+    On a terminal this is a bar; elsewhere, plain lines at intervals.
+
+    Args:
+        total: units of the whole job; None if unknown.
+        job: name of the job, e.g. "train".
+        unit: what is counted, in the plural, e.g. "steps".
+        done: units that were finished before this process resumed the job; they do not count
+            towards the rate.
+        shown: whether this process displays anything.
+    """
+    from tqdm import tqdm
+
+    label = _LABEL.get()
+    # Bars of several processes would overwrite each other.
+    layout: dict[str, Any] = {}
+    if label or not sys.stderr.isatty():
+        tqdm.monitor_interval = 0  # no thread: every update looks at the clock
+        layout = {"delay": FIRST_LINE, "mininterval": NEXT_LINE, "miniters": 1}
+        layout |= {"ncols": 0, "file": _Lines()}
+    layout["unit_scale"] = total is None or total >= 100_000
+    name = ": ".join(part for part in (label, _PHASE.get(), job) if part)
+    with tqdm(
+        total=total, desc=name, unit=f" {unit}", initial=done, disable=not shown, **layout
+    ) as bar:
+        yield bar
+
+
+@contextmanager
+def label_progress(name: str) -> Iterator[None]:
+    """Name this job in the progress of all that it does, as one of several at the same time."""
+    token = _LABEL.set(name)
+    try:
+        yield
+    finally:
+        _LABEL.reset(token)
+
+
+@contextmanager
+def phase(doing: str, number: int, of: int) -> Iterator[None]:
+    """Name the phase of a long job, e.g. `Fitting the reward model (2 of 5)`, in its progress."""
+    token = _PHASE.set(f"{doing} ({number} of {of})")
+    try:
+        yield
+    finally:
+        _PHASE.reset(token)
+
+
+class _Lines:
+    """Stderr of a job without a terminal: every state of tqdm's bar is a line of its own."""
+
+    def write(self, text: str) -> None:
+        if text := text.strip("\r\n "):
+            print(text, file=sys.stderr)
+
+    def flush(self) -> None:
+        sys.stderr.flush()

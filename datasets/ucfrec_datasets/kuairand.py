@@ -70,8 +70,7 @@ def _resolve(
 ) -> tuple[tuple[Path, ...], LogMapping]:
     """All given logs, with user and basic video features of the same paths or the logs' folder.
 
-    Logs may have any name if none is called as in the releases. Video statistics are used only if a
-    path names their file.
+    Logs may have any name if none is called as in the releases.
     """
     files = log_files(paths)
     plain = tuple(file for file in files if not file.name.startswith(FEATURES))
@@ -82,8 +81,8 @@ def _resolve(
             f"features; name the log too, e.g. {LOGS[0]}*"
         )
     candidates = (*files, *log_files([logs[0].parent]))
-    statistic_paths = [path for path in paths if Path(path).name.startswith(STATISTIC)]
-    statistics = log_files(statistic_paths) if statistic_paths else ()
+    # Video statistics are used only if a path names their file.
+    statistics = [Path(path) for path in paths if Path(path).name.startswith(STATISTIC)]
     defaults = LogMapping(
         item_features=(
             *official_table(candidates, BASIC, "video_id", BASIC_COLUMNS),

@@ -39,10 +39,7 @@ def _resolve(
 
 
 def _convert_100k(folder: Path) -> None:
-    """Write the files of the 100K release in the form of the later ones.
-
-    They are `u.data` (tabs), `u.item` and `u.user` (bars, Latin-1), without heads.
-    """
+    """Write `u.data` (tabs), `u.item` and `u.user` (bars, Latin-1) as later releases have them."""
     import pandas as pd
 
     source = folder / "ml-100k"

@@ -38,16 +38,26 @@ def _resolve(
 
     Items are called `<campaign>/<number>`, so that no run of one campaign reads the logs of another
     as its own.
-
-    Raises:
-        InputError: no log is named, or its campaign is not known, or there are several.
     """
     files = log_files(paths)
     logs = tuple(file for file in files if not file.name.startswith(ITEMS))
     if not logs:
         raise InputError(f"{files[0]} has features, not impressions; name a log, e.g. all.csv")
     item_id = mapping.columns.get(schema.ITEM_ID)
-    campaign = None if item_id is not None else _only_campaign(logs)
+    campaigns = {} if item_id else {_campaign(log): log for log in reversed(logs)}
+    if None in campaigns:
+        raise InputError(
+            f"{campaigns[None]}: neither the file nor its folder is named after a campaign "
+            f"({', '.join(CAMPAIGNS)}), whose items have numbers of their own; rename the file,"
+            " e.g. random_men.csv"
+        )
+    if len(campaigns) > 1:
+        raise InputError(
+            f"{' and '.join(map(str, campaigns.values()))} are of the campaigns "
+            f"{' and '.join(map(str, campaigns))}, which share no item; prepare one campaign at a "
+            "time"
+        )
+    campaign = next(iter(campaigns), None)
     item_id = item_id or f"concat('{campaign}/', item_id)"
     items = [
         file
@@ -61,25 +71,6 @@ def _resolve(
         user_features=(FeatureTable(logs, USER, USER_FEATURES, first_by='"timestamp"'),),
     )
     return logs, mapping.over(defaults).over(MAPPING)
-
-
-def _only_campaign(logs: Sequence[Path]) -> str:
-    campaigns: dict[str, Path] = {}
-    for log in logs:
-        campaign = _campaign(log)
-        if campaign is None:
-            raise InputError(
-                f"{log}: neither the file nor its folder is named after a campaign "
-                f"({', '.join(CAMPAIGNS)}), whose items have numbers of their own; rename the file,"
-                " e.g. random_men.csv"
-            )
-        campaigns.setdefault(campaign, log)
-    if len(campaigns) > 1:
-        raise InputError(
-            f"{' and '.join(map(str, campaigns.values()))} are of the campaigns "
-            f"{' and '.join(campaigns)}, which share no item; prepare one campaign at a time"
-        )
-    return next(iter(campaigns))
 
 
 def _campaign(file: Path) -> str | None:

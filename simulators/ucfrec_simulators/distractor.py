@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from ucfrec.acting.rollout import Actor, Informed
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
+from ucfrec.episodes.writer import read_observations, reward_bit, write_observations
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment, Simulator
 from ucfrec_simulators.kuai import kuairand
@@ -44,9 +44,9 @@ def plant_distractor(
         InputError: as `ucfrec.episodes.writer.reward_bit`, or `out` exists.
     """
     distractor = reward_bit(store, flip, seed)
-    planted = np.column_stack([distractor, logged_observations(store)])
+    planted = np.column_stack([distractor, read_observations(store)])
     record = {"flip": flip, "seed": seed, "rate": float(distractor.mean())}
-    return with_observations(store, out, planted, {"distractor": record})
+    return write_observations(store, out, planted, {"distractor": record})
 
 
 class DistractorEnv(VectorWrapper[Float32Array, Array, Array]):

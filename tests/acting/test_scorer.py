@@ -35,7 +35,7 @@ from ucfrec.episodes.store import UserRows
 from ucfrec.episodes.windows import Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
+from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.logs import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.policies.baselines import ItemKNNPolicy

@@ -12,7 +12,13 @@ from tests.support.logs import store_of
 from tests.support.tagged import tagged_log, tagged_mapping, tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import logged_scores
-from ucfrec.choosing.by_ranking import SHOWN, LoggedEvidence, choose_by_ranking
+from ucfrec.choosing.by_ranking import (
+    SHOWN,
+    LoggedEvidence,
+    _Candidate,
+    _choose_best,
+    choose_by_ranking,
+)
 from ucfrec.choosing.by_simulation import RuleSearch, choose_by_simulation
 from ucfrec.choosing.choice import Problem, RankedRule, RuleChoice, RuleConfig
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
@@ -106,6 +112,18 @@ def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -
     level = [each for each in ranked if each.gain >= most.gain - most.gain_error]
     assert found.rule in [each.rule for each in level]
     assert "WARNING" in found.warning
+
+
+def test_of_rules_of_the_highest_rate_the_one_with_the_most_hits_is_chosen() -> None:
+    rows = np.arange(40)
+
+    def candidate(weight: float, rate: float, hits: np.ndarray) -> _Candidate:
+        rule, liked = DecisionRule(1.0, reward_weight=weight), np.ones(40, dtype=bool)
+        return _Candidate(rule, rows, np.full(40, rate), liked, hits, hits.astype(np.float64))
+
+    few, many = candidate(0.0, 0.5, rows % 4 == 0), candidate(1.0, 0.5, rows % 2 == 0)
+    poor = candidate(2.0, 0.1, rows >= 0)
+    assert _choose_best([few, many, poor]) is _choose_best([poor, many, few]) is many
 
 
 RULE = ["rule.sessions=20", "rule.least_items=2.0", "rule.least_impressions=1"]

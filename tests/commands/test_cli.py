@@ -24,7 +24,7 @@ from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
 from ucfrec.logs import LogMapping, PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
-from ucfrec.provenance import provenance
+from ucfrec.processes import provenance
 from ucfrec.results.rows import ResultRow, ResultTable, read_results
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.screened import screen_store

@@ -37,7 +37,7 @@ from ucfrec.counterfactual.augmentation import (
     augment_episodes,
     edit_states,
     interventions,
-    logged_actions,
+    read_actions,
 )
 from ucfrec.counterfactual.generators import (
     ActionSupport,
@@ -46,8 +46,13 @@ from ucfrec.counterfactual.generators import (
     make_generator,
     state_clusters,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
-from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    CRMReport,
+    fit_crm,
+    read_transitions,
+)
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions
@@ -264,8 +269,8 @@ def others() -> ActionGenerator:
     steps = view().all_steps()
     training = view().transitions(*steps)
     clusters = state_clusters(training, crm, CSGConfig(), 0)
-    labels = clusters.nearest(crm.normalised_states(training.states)).numpy()
-    support = ActionSupport(labels, logged_actions(view(), *steps))
+    labels = clusters.nearest(crm.normalise_states(training.states)).numpy()
+    support = ActionSupport(labels, read_actions(view(), *steps))
     epsilon_r, delta = 0.1 * float(crm.reward_std), report.delta["0.95"]
     return ActionGenerator(view(), crm, clusters, support, epsilon_r, delta)
 
@@ -313,12 +318,12 @@ def test_only_other_actions_of_the_same_cluster_are_asked_about() -> None:
     copies, _ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
     crm, clusters = small_model()[0], others().clusters
     logged = view().transitions(*view().all_steps())
-    near = clusters.nearest(crm.normalised_states(logged.states)).tolist()
+    near = clusters.nearest(crm.normalise_states(logged.states)).tolist()
     cluster_of = {
         action.tobytes(): n for action, n in zip(logged.actions.numpy(), near, strict=True)
     }
     at = planted_store().transitions(copies.action_source, copies.action_step)
-    own = clusters.nearest(crm.normalised_states(at.states)).tolist()
+    own = clusters.nearest(crm.normalise_states(at.states)).tolist()
     assert [cluster_of[action.tobytes()] for action in copies.action] == own
     assert (copies.action != at.actions.numpy()).any(axis=1).all()
     assert set(copies.action_source) <= set(view().episode_ids)

@@ -25,8 +25,7 @@ from ucfrec.counterfactual.generators import (
     _products,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
-from ucfrec.counterfactual.reward_model_fit import fit_crm
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm
 from ucfrec.episodes.windows import Transitions
 from ucfrec.errors import InputError
 

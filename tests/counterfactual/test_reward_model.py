@@ -9,8 +9,14 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, Posterior, kl_to_prior
-from ucfrec.counterfactual.reward_model_fit import fit_crm, fit_warning
+from ucfrec.counterfactual.reward_model import (
+    CausalRewardModel,
+    CRMConfig,
+    Posterior,
+    fit_crm,
+    fit_warning,
+    kl_to_prior,
+)
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 
@@ -77,7 +83,7 @@ def test_dimensions_that_never_vary_are_inert(tmp_path: Path) -> None:
     train = planted(2_000, 0).transitions
     crm, _ = fit_crm(train, planted(500, 1).transitions, QUICK, tmp_path, seed=0)
     assert crm.state_std[CONSTANT] == 0
-    normalised = crm.normalised_states(train.states)
+    normalised = crm.normalise_states(train.states)
     assert normalised[:, CONSTANT].abs().max() < 1e-6
     torch.testing.assert_close(
         normalised.std(0)[:CONSTANT], torch.ones(CONSTANT), rtol=0.01, atol=0

@@ -17,6 +17,11 @@ from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec_datasets.kuairand import DATASET
 
 KEYS = ["user_id", "video_id", "time_ms"]
+FEEDBACK = "is_click is_like is_follow is_comment is_forward is_hate long_view"
+NUMBERS = (
+    "is_lowactive_period is_live_streamer is_video_author follow_user_num fans_user_num "
+    "friend_user_num register_days"
+)
 
 
 def real_log() -> tuple[Path, pd.DataFrame]:
@@ -28,27 +33,14 @@ def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
     """Small CSV files in the official schema, cut into as many parts as the release has."""
     generator = np.random.default_rng(0)
     rows, videos, users = 300, 30, 20
-    feedback = [
-        "is_click",
-        "is_like",
-        "is_follow",
-        "is_comment",
-        "is_forward",
-        "is_hate",
-        "long_view",
-    ]
     log = {
         "user_id": generator.integers(users, size=rows),
         "video_id": generator.integers(videos, size=rows),
-        "date": 20220410,
-        "hourmin": 1200,
         "time_ms": 1_649_500_000_000 + generator.integers(10**9, size=rows),
-        **{name: generator.integers(2, size=rows) for name in feedback},
+        **{name: generator.integers(2, size=rows) for name in FEEDBACK.split()},
         "play_time_ms": generator.integers(9000, size=rows),
         "duration_ms": generator.integers(1, 9000, size=rows),
-        **dict.fromkeys(("profile_stay_time", "comment_stay_time"), 0),
-        **dict.fromkeys(("is_profile_enter", "is_rand"), 0),
-        "tab": 1,
+        **{"date": 20220410, "hourmin": 1200, "profile_stay_time": 0, "is_rand": 0, "tab": 1},
     }
     ids = np.arange(videos)
     basic = {
@@ -57,18 +49,13 @@ def official(folder: Path, suffix: str, parts: dict[str, int]) -> None:
         "video_type": "NORMAL",
         "upload_dt": "2022-04-10",
         "upload_type": np.where(ids % 2, "Web", "LongImport"),
-        "visible_status": 0.0,
         "video_duration": 1000.0 * ids,
-        "server_width": 720.0,
-        "server_height": 1280.0,
-        "music_id": ids,
-        "music_type": 9.0,
+        **{"visible_status": 0.0, "server_width": 720.0, "server_height": 1280.0},
+        **{"music_id": ids, "music_type": 9.0},
         "tag": [f"{i % 3},{i % 5}" if i % 7 else None for i in ids],
     }
     people = {"user_id": np.arange(users), "user_active_degree": "full_active"}
-    numbers = "is_lowactive_period is_live_streamer is_video_author follow_user_num fans_user_num "
-    numbers += "friend_user_num register_days"
-    names = numbers.split() + [f"onehot_feat{i}" for i in range(18)]
+    names = NUMBERS.split() + [f"onehot_feat{i}" for i in range(18)]
     people |= {name: generator.integers(5, size=users) for name in names}
     tables = {
         f"log_random_4_22_to_5_08_{suffix}": {**log, "time_ms": log["time_ms"] + 1, "is_rand": 1},

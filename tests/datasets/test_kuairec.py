@@ -64,27 +64,21 @@ def official(folder: Path) -> Path:
     users.to_csv(folder / "user_features.csv", index=False)
     social = pd.DataFrame({"user_id": [1], "friend_list": ["[2, 3]"]})
     social.to_csv(folder / "social_network.csv", index=False)
-    daily = pd.DataFrame(
-        [
-            {
-                "video_id": video,
-                "date": 20200705 + day,
-                "author_id": video // 3,
-                "video_type": "NORMAL",
-                "upload_dt": f"2020-03-{1 + video % 28:02d}",
-                "upload_type": "LongImport" if video % 2 else "Web",
-                "visible_status": "public",
-                "video_duration": 1000.0 * video if video % 5 else np.nan,
-                "video_width": 720,
-                "video_height": 1280 if video % 3 else 400,
-                "music_id": video,
-                "video_tag_id": video % 4,
-                "video_tag_name": "tag",
-                "show_cnt": day,
-            }
-            for day in range(3)
-            for video in range(VIDEOS)
-        ]
+    video = np.tile(np.arange(VIDEOS), 3)
+    daily = pd.DataFrame({"video_id": video, "date": 20200705 + np.repeat(range(3), VIDEOS)})
+    daily = daily.assign(
+        author_id=video // 3,
+        video_type="NORMAL",
+        upload_dt=[f"2020-03-{1 + n % 28:02d}" for n in video],
+        upload_type=np.where(video % 2, "LongImport", "Web"),
+        visible_status="public",
+        video_duration=np.where(video % 5, 1000.0 * video, np.nan),
+        video_width=720,
+        video_height=np.where(video % 3, 1280, 400),
+        music_id=video,
+        video_tag_id=video % 4,
+        video_tag_name="tag",
+        show_cnt=daily.date - 20200705,
     )
     daily.to_csv(folder / "item_daily_features.csv", index=False)
     return folder

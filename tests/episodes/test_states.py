@@ -51,7 +51,7 @@ def acted(episodes: list[Logged], states: ItemStates, rows: int) -> list[Tensor]
         current = sessions.latest_states(states, observations)
         for row in live:
             seen[playing[row]].append(current[row])
-        sessions = sessions.with_step(torch.from_numpy(items), torch.from_numpy(rewards))
+        sessions = sessions.add_step(torch.from_numpy(items), torch.from_numpy(rewards))
         ended = []
         for row in live:
             step[row] += 1
@@ -148,7 +148,7 @@ def after(states: ItemStates, items: Tensor, rewards: Tensor) -> Tensor:
     """(N, S) after one item each."""
     sessions = Sessions.begun(len(items), states.window)
     assert not sessions.latest_states(states, torch.zeros(len(items), 0)).any()
-    sessions = sessions.with_step(items, rewards)
+    sessions = sessions.add_step(items, rewards)
     return sessions.latest_states(states, torch.zeros(len(items), 0))
 
 
@@ -194,7 +194,7 @@ def test_an_unknown_user_has_zero_features() -> None:
 def test_a_session_that_begins_afresh_forgets() -> None:
     states, sessions = some_states(), Sessions.begun(2, 10)
     for _ in range(3):
-        sessions = sessions.with_step(torch.tensor([1, 2]), torch.tensor([1.0, 1.0]))
+        sessions = sessions.add_step(torch.tensor([1, 2]), torch.tensor([1.0, 1.0]))
     before = sessions.latest_states(states, torch.zeros(2, 0))
     sessions.begin(np.array([1]))
     seen = sessions.latest_states(states, torch.zeros(2, 0))

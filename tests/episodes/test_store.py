@@ -442,7 +442,7 @@ def test_the_rows_before_a_step_are_those_of_the_user(
     parts = [log[rows].sort_values(["user", "timestamp"]) for rows in (early, ~early)]
     earlier, later = (store_of(part, gap) for part in parts)
     rows = UserRows.of(later, later.episode_values(schema.USER), earlier)
-    view = rows.continued(gap)
+    view = rows.continue_sessions(gap)
 
     assert view.n_steps == later.n_steps
     for long_enough in (1, 1000):
@@ -487,6 +487,6 @@ def test_users_that_are_not_known_have_no_earlier_rows() -> None:
     log = pd.DataFrame({"user": 0, "item": range(8), "reward": 1.0, "timestamp": range(8)})
     unknown = store_of(log[4:].assign(user=-1), None)
     rows = UserRows.of(unknown, np.array([7]), store_of(log, None))
-    assert rows.continued(None) is unknown
+    assert rows.continue_sessions(None) is unknown
     with pytest.raises(IndexError):
         rows.recent(np.array([4]), 1)

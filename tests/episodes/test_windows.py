@@ -257,6 +257,8 @@ def test_a_forged_file_or_one_of_another_store_is_refused(tmp_path: Path) -> Non
         {"action": good.action + 11},
         {"action": good.action - 11},
         {"action": np.zeros((3, 3), dtype=np.float32)},
+        {"edit_copy": good.edit_copy[::-1].copy()},
+        {"edit_step": good.edit_step[np.lexsort((-good.edit_step, good.edit_copy))]},
         {"edit_copy": good.edit_copy + len(good.copy_source)},
         {"edit_copy": good.edit_copy - len(good.copy_source)},
     ]

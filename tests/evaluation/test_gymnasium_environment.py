@@ -15,9 +15,8 @@ from tests.support.gymnasium_environments import ITEMS, LENGTH
 from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import environment_items
 from ucfrec.evaluation.gymnasium_environment import GymnasiumEnvironment, item_table
-from ucfrec.evaluation.simulator import Environment
+from ucfrec.evaluation.simulator import Environment, environment_items
 from ucfrec.results.rows import read_results
 from ucfrec.schema import USER_IDS
 

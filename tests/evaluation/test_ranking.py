@@ -34,8 +34,8 @@ from ucfrec.evaluation.ranking import (
     measure,
     rank_steps,
 )
-from ucfrec.evaluation.ranking_baselines import ItemNeighbours, PolicyRanker, baselines
-from ucfrec.files.atomic import write_sealed_json
+from ucfrec.evaluation.ranking_table import ItemNeighbours, PolicyRanker, baselines
+from ucfrec.files.atomic import write_json
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
@@ -454,7 +454,7 @@ def test_ope_without_logs_says_why_it_cannot(
     shutil.copytree(folder / "run", moved)
     record = json.loads((moved / "run.json").read_text())
     record |= {"store": str(tmp_path / "gone"), "store_from_run": None}
-    write_sealed_json(moved / "run.json", {k: v for k, v in record.items() if k != "checksum"})
+    write_json(moved / "run.json", {k: v for k, v in record.items() if k != "checksum"}, seal=True)
     for run, says in ((refit, "is a refit"), (str(moved), "is gone or has changed")):
         for command in ("ope", "rank"):
             assert main([command, run]) == 2

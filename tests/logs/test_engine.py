@@ -19,8 +19,7 @@ from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
-from ucfrec.files.locks import SCRATCH
+from ucfrec.files.atomic import SCRATCH, read_json
 from ucfrec.logs.engine import engine
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import FeatureTable, LogMapping
@@ -29,6 +28,11 @@ from ucfrec.logs.tables import open_tables, quote
 
 SECRET = "the content of a file that was not named"
 
+READERS = "read_text read_blob read_csv read_json read_ndjson sniff_csv"
+SWITCHES = (
+    "enable_external_access allow_community_extensions autoload_known_extensions "
+    "python_enable_replacements"
+)
 REFUSED = (
     "COPY (SELECT 1) TO '{out}'",
     "COPY (SELECT 1) TO '{out}' (FORMAT parquet, USE_TMP_FILE false)",
@@ -42,16 +46,11 @@ REFUSED = (
     "ATTACH '{secret}' AS x (READ_ONLY)",
     "ATTACH 'http://127.0.0.1:1/x.db' AS x",
     "FROM '{secret}'",
-    "FROM read_text('{secret}')",
+    *(f"FROM {r}('{{secret}}')" for r in READERS.split()),
     "FROM read_text('{input}/../secret.csv')",
     "FROM read_text('{work}/../secret.csv')",
-    "FROM read_blob('{secret}')",
-    "FROM read_csv('{secret}')",
     "FROM read_csv(['{input}', '{secret}'])",
-    "FROM read_json('{secret}')",
-    "FROM read_ndjson('{secret}')",
     "FROM read_parquet('{folder}/*.parquet')",
-    "FROM sniff_csv('{secret}')",
     "FROM glob('{folder}/*')",
     "FROM glob('/*')",
     "FROM parquet_metadata('{folder}/other.parquet')",
@@ -71,20 +70,14 @@ REFUSED = (
     "FROM postgres_scan('', '', '')",
     "CALL start_ui()",
     "CREATE PERSISTENT SECRET s (TYPE http, BEARER_TOKEN 'x')",
-    "SET enable_external_access = true",
+    *(f"SET {name} = true" for name in SWITCHES.split()),
     "RESET enable_external_access",
     "PRAGMA enable_external_access = true",
     "SET GLOBAL allowed_directories = ['/']",
     "SET allowed_paths = ['{secret}']",
     "SET lock_configuration = false",
-    "SET allow_community_extensions = true",
-    "SET autoload_known_extensions = true",
-    "SET extension_directory = '{folder}'",
-    "SET home_directory = '{folder}'",
-    "SET secret_directory = '{folder}'",
-    "SET temp_directory = '{folder}'",
+    *(f"SET {d}_directory = '{{folder}}'" for d in ("extension", "home", "secret", "temp")),
     "SET memory_limit = '100GB'",
-    "SET python_enable_replacements = true",
     "SET log_query_path = '{out}'",
     "SET profile_output = '{out}'",
     "PRAGMA profile_output = '{out}'",

@@ -30,76 +30,55 @@ from ucfrec_datasets import kuairand, kuairec, obd
 SECRET = "the content of a file that was not named"
 HONEST = (
     "is_click",
-    "IS_CLICK",
-    "is_click * 2 + 1",
     "least(play_ms / duration_ms, 5)",
     "greatest(play_ms // duration_ms, 1, 2)",
     "least(coalesce(nullif(duration_ms, 0), 2), 5)",
-    "seconds * 1000",
     "ln(1 + play_ms)",
     "-play_ms ** 2 % 7",
     "is_click = 1 AND NOT (play_ms > 5 OR tag IS NULL)",
-    "(is_click)",
     "is_click -- the reward",
     "is_click /* ; COPY */ + 1",
     "CASE WHEN is_click = 1 THEN 1.5 WHEN play_ms > 100 THEN 0.5 ELSE 0 END",
     "CASE is_click WHEN 1 THEN 'yes' WHEN 0 THEN 'no' END",
     " + ".join(f"CASE tag WHEN '{n}' THEN {n} WHEN 'x{n}' THEN 0 ELSE -1 END" for n in range(6)),
-    "if(is_click = 1, 2, 3)",
-    "ifnull(play_ms, 0)",
     "try(1 / play_ms)",
     "try_cast(tag AS DOUBLE)",
-    "tag::VARCHAR",
     "tag::TEXT || '!'",
     "play_ms::DECIMAL(10, 2)",
     "play_ms::BIGINT & 255",
-    "CAST(user_id AS BIGINT)",
-    "is_click IN (1, 2, 3)",
     "tag NOT IN ('a', 'b')",
     "play_ms BETWEEN 0 AND 5 AND is_click IS NOT NULL",
     "is_click IS DISTINCT FROM 0",
-    "is_click IS TRUE",
     "tag LIKE 'a%' OR tag NOT ILIKE 'B_'",
     "tag LIKE 'a!%' ESCAPE '!'",
     "tag ~ '^[a-z]+$'",
     "try_cast(regexp_extract(tag, '([0-9]+)', 1) AS INT)",
     "lower(trim(tag))",
-    "length(tag)",
-    "left(tag, 8)",
     "substring(tag FROM 1 FOR 2)",
     "split_part(tag, ',', 1)",
-    "string_split(tag, ',')",
     "concat_ws('-', left(tag, 8), user_id)",
     "md5(concat(tag, user_id))",
     "tag = 'it''s; COPY x TO y'",
     "tag = $$a;b$$",
-    "epoch_ms(clock)",
     "epoch_ms(strptime(day, '%Y-%m-%d'))",
     "strptime(day, ['%Y-%m-%d', '%d.%m.%Y'])",
-    "day::DATE",
     "day::TIMESTAMPTZ AT TIME ZONE 'UTC'",
     "TIMESTAMP '2024-01-01' + INTERVAL 1 DAY",
     "clock - INTERVAL '2 hours'",
-    "date_trunc('day', clock)",
     "extract(hour FROM clock)",
     "date_diff('second', TIMESTAMP '2024-01-01', clock)",
-    "to_timestamp(seconds)",
     "[play_ms, seconds]::FLOAT[]",
     "[is_click = 1, is_click = 2]::FLOAT[]",
-    "numbers[1]",
     "numbers[1:2]",
     "list_sum(numbers) / len(numbers)",
     "list_contains(numbers, 1)",
     "1 IN numbers",
-    "list_distinct(numbers)",
     "feedback.rating * 2",
     "feedback['rating']",
     "json ->> '$.like'",
     "json_extract(json, '$.like')::INT",
     '"a column, with ""quotes"""',
     'abs("a column, with ""quotes""")',
-    "user = 1",
-    "round(play_ms, 2)",
     "isfinite(play_ms / duration_ms)",
     "sqrt(abs(play_ms)) + pow(2, is_click)",
 )
@@ -319,12 +298,11 @@ def test_messages_say_where_the_expression_is_and_what_is_allowed(
     assert f"{tmp_path / 'run' / 'run.json'}: for the reward: 'sum(is_click)'" in by_run
 
 
-@pytest.mark.parametrize("name", ["copy behind the expression"])
 def test_a_store_of_somebody_else_brings_no_program(
-    trained: Path, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "secret.txt").write_text(SECRET)
-    text = attack(name, str(tmp_path / "out"), str(tmp_path / "secret.txt"))
+    text = attack("copy behind the expression", str(tmp_path / "out"), str(tmp_path / "secret.txt"))
     shutil.copytree(trained / "store", tmp_path / "store")
     meta = read_json(tmp_path / "store" / "meta.json")
     (tmp_path / "store" / "meta.json").write_text(json.dumps({**meta, "reward": text}))

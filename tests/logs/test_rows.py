@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.support.equal_times import tie_key
+from tests.support.logs import START, faulty_log
 from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputNote
@@ -20,34 +21,6 @@ from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import validate
 from ucfrec.logs.rows import DUPLICATES, choose_rows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
-
-START = 1_700_000_000_000
-
-
-def make_log(seed: int, text: bool) -> pd.DataFrame:
-    """Few keys, many duplicates that differ in some column, and every fault."""
-    generator = np.random.default_rng(seed)
-    n = 400
-    log = pd.DataFrame(
-        {
-            "user_id": generator.integers(-2, 6, n),
-            "item_id": generator.integers(5, size=n),
-            "timestamp": START + generator.integers(8, size=n),
-            "reward": generator.choice([0, 1, 2, np.nan, np.inf, -np.inf], n),
-            "propensity": generator.choice([0.25, 0.5, np.nan], n),
-            "is_random": generator.integers(2, size=n),
-            "session_id": generator.integers(3, size=n),
-        }
-    )
-    log["user_id"], log["item_id"] = log["user_id"].astype("Int64"), log["item_id"].astype("Int64")
-    if text:
-        log["user_id"] = "u" + log["user_id"].astype("string")
-        log["item_id"] = "i" + log["item_id"].astype("string")
-        log["session_id"] = "s" + log["session_id"].astype("string")
-    log.loc[generator.integers(n, size=4), "user_id"] = None
-    log.loc[generator.integers(n, size=4), "item_id"] = None
-    log.loc[generator.integers(n, size=4), "timestamp"] = 5
-    return log
 
 
 def kept_by_pandas(log: pd.DataFrame, duplicates: str) -> tuple[pd.DataFrame, dict[str, int], int]:
@@ -82,7 +55,7 @@ def test_the_rows_that_are_kept_are_those_of_pandas(
 ) -> None:
     monkeypatch.setattr("ucfrec.logs.typed.BATCH_ROWS", 64)
     path = tmp_path / "log.parquet"
-    given = make_log(len(duplicates), text)
+    given = faulty_log(400, text, len(duplicates))
     given.to_parquet(path)
     expected, dropped, conflicts = kept_by_pandas(given, duplicates)
     folder = None if in_memory else tmp_path

@@ -10,36 +10,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import faulty_log
 from ucfrec.errors import InputError
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
-START = 1_700_000_000_000
+NAMES = {"user_id": "user", "item_id": "item", "timestamp": "seconds"}
 
 
 def make_log(rows: int, text: bool, seed: int) -> pd.DataFrame:
-    """In no order, with repeated keys, missing and undefined values, and wrong times."""
-    generator = np.random.default_rng(seed)
-    log = pd.DataFrame(
-        {
-            "user": generator.integers(-3, 25, rows),
-            "item": generator.integers(12, size=rows),
-            "seconds": START // 1000 + generator.integers(300, size=rows) * 60,
-            "played": generator.choice([0, 1, 2, np.nan, np.inf], rows),
-            "length": generator.integers(3, size=rows),
-            "propensity": generator.choice([0.25, 0.5, 1.0, np.nan], rows),
-            "is_random": generator.integers(2, size=rows),
-            "session_id": generator.integers(6, size=rows),
-        }
-    )
-    log = log.astype({"user": "Int64", "item": "Int64"})
-    if text:
-        for name in ("user", "item", "session_id"):
-            log[name] = "é" + log[name].astype("string")
-    log.loc[generator.random(rows) < 0.02, "user"] = None
-    log.loc[generator.random(rows) < 0.02, "item"] = None
-    log.loc[generator.random(rows) < 0.02, "seconds"] = 7
-    return log
+    log = faulty_log(rows, text, seed)
+    return log.assign(timestamp=log.timestamp // 1000).rename(columns=NAMES)
 
 
 MAPPING = LogMapping({"user_id": "user", "item_id": "item", "timestamp": "seconds * 1000"})
@@ -71,7 +52,7 @@ def test_stores_are_the_same(tmp_path: Path, spark: Any, text: bool, session_by:
         tmp_path,
         MAPPING,
         # 1 / 0 is undefined, and an undefined part makes `least` undefined, to DuckDB only.
-        reward="least(played / length, 1)",
+        reward="least(reward / length, 1)",
         session_by=session_by,
         duplicates="last" if text else "highest",
     )

@@ -274,16 +274,12 @@ def test_the_behavior_itself_is_its_own_mean() -> None:
     steps = random_steps([3, 1, 4] * 50)
     found = estimate(replace(steps, target=steps.propensity), seed=5)
     returns = np.array([steps.reward[steps.session == s].sum() for s in range(150)])
-    error = returns.std() / 149**0.5
-    for name in (LOGGED, "IPS", "SNIPS", "PDIS"):
-        one = found[name]
-        assert one.value == pytest.approx(returns.mean())
-        assert one.effective_sessions == pytest.approx(150)
+    mean, error = returns.mean(), returns.std() / 149**0.5
+    for one in (found[name] for name in (LOGGED, "IPS", "SNIPS", "PDIS")):
+        assert (one.value, one.effective_sessions) == pytest.approx((mean, 150))
         assert one.error == pytest.approx(error)
-        assert one.low is not None
-        assert one.high is not None
-        assert one.low == pytest.approx(returns.mean() - 1.98 * error, abs=0.3 * error)
-        assert one.high == pytest.approx(returns.mean() + 1.98 * error, abs=0.3 * error)
+        ends = mean - 1.98 * error, mean + 1.98 * error
+        assert (one.low, one.high) == pytest.approx(ends, abs=0.3 * error)
 
 
 def test_a_few_missing_propensities_leave_their_sessions_out() -> None:
@@ -431,9 +427,9 @@ def test_more_clusters_than_are_drawn_from_change_no_error() -> None:
 
 
 def test_means_have_clustered_errors() -> None:
-    values = np.repeat([0.0, 1.0, 5.0], 4)
-    mean, error = cluster_mean(values, np.repeat([7, 3, 9], 4))
+    values, cluster = np.repeat([0.0, 1.0, 5.0], 4), np.repeat([7, 3, 9], 4)
+    mean, error = cluster_mean(values, cluster)
     assert mean == pytest.approx(2.0)
     assert error == pytest.approx(np.std([0, 1, 5], ddof=1) / 3**0.5)
     weights = np.repeat([1.0, 1.0, 0.0], 4)
-    assert cluster_mean(values, np.repeat([7, 3, 9], 4), weights)[0] == pytest.approx(0.5)
+    assert cluster_mean(values, cluster, weights)[0] == pytest.approx(0.5)

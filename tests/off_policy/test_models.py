@@ -71,17 +71,6 @@ def test_context_is_the_state_the_return_left_and_the_window(
     assert not torch.allclose(seen[0].window[:, 1:], seen[1].window[:, 1:])
 
 
-def test_features_are_those_that_the_scores_are_made_from(
-    trained: TrainedPolicy, logged: LoggedSessions
-) -> None:
-    batch = next(score_steps(trained, logged.store, DecisionRule(3.0)))
-    assert batch.features is not None
-    if trained.policy.head.exposure is None:
-        predicted = trained.policy.head.predict(batch.features)  # type: ignore[call-arg]
-        torch.testing.assert_close(batch.scores, predicted.detach())
-    assert batch.features.shape == (len(batch.steps), trained.policy.config.dim)
-
-
 def test_scores_are_of_the_item_and_their_mean_over_what_is_shown(
     trained: TrainedPolicy, logged: LoggedSessions
 ) -> None:
@@ -175,15 +164,17 @@ def test_users_are_predicted_by_models_of_others() -> None:
     np.testing.assert_array_equal(models[0].item[same], models[1].item[same])
 
 
-def test_unknown_items_are_left_alone() -> None:
+@pytest.mark.parametrize("groups", [GROUP_OF, 0 * GROUP_OF])
+def test_unknown_items_are_left_alone(groups: IntArray) -> None:
     states, _ = behavior()
     item = np.where(np.arange(STEPS) % 5 == 0, -1, np.arange(STEPS) % 9)
-    model = fit_behavior(
-        lambda: iter([states]), item, GROUP_OF[np.maximum(item, 0)], np.arange(STEPS), 0
-    )
+    group = groups[np.maximum(item, 0)]
+    model = fit_behavior(lambda: iter([states]), item, group, np.arange(STEPS), 0)
     assert (model.item[item < 0] == 1).all()
     # Items do not follow the state: each of nine, whatever it is.
     np.testing.assert_allclose(model.item[item >= 0], 1 / 9, rtol=0.1)
+    if not groups.any():
+        np.testing.assert_allclose(model.group, 1)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -194,16 +185,6 @@ def test_one_user_with_known_items_is_predicted_by_equal_shares() -> None:
     model = fit_behavior(lambda: iter([states]), item, GROUP_OF[item], session, 0)
     np.testing.assert_allclose(model.group[:40], 1 / 3)
     np.testing.assert_array_equal(model.group[40:], 1.0)
-
-
-def test_one_group_is_certain() -> None:
-    states, _ = behavior()
-    item = np.arange(STEPS) % 9
-    model = fit_behavior(
-        lambda: iter([states]), item, np.zeros(STEPS, dtype=np.int64), np.arange(STEPS), 0
-    )
-    np.testing.assert_allclose(model.group, 1)
-    np.testing.assert_allclose(model.item, 1 / 9, rtol=0.1)
 
 
 def test_groups_are_the_clusters_of_embeddings() -> None:
@@ -288,3 +269,16 @@ def test_q_that_runs_away_is_stopped_and_said() -> None:
     assert not report.converged
     assert report.iterations < 400
     assert np.isfinite(report.td_loss)
+
+
+def test_users_are_never_judged_by_models_that_saw_them() -> None:
+    rng = np.random.default_rng(0)
+    user, session = np.repeat(np.arange(20), 5), np.arange(100)
+    features = np.column_stack([np.ones(100), rng.normal(size=(100, 3))]).astype(np.float32)
+    mine, reward = user == 7, rng.normal(size=100)
+    before, after = (
+        fit_models(lambda: iter([(features, features)]), rewards, session, 3, user)[0].q
+        for rewards in (reward, np.where(mine, 50.0, reward))
+    )
+    np.testing.assert_array_equal(after[mine], before[mine])
+    assert not np.allclose(after[~mine], before[~mine])

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from tests.policies.test_ucf import (
     CATALOG,
@@ -121,32 +120,6 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
         )
         noisy = torch.where(windows.mask, windows.actions, other(windows.actions))
         torch.testing.assert_close(policy.act(replace(windows, actions=noisy)), policy.act(windows))
-
-
-def reference_loss(policy: SequencePolicy, windows: Any) -> Tensor:
-    """The action loss as it was without shared components."""
-    features = policy.features(policy.normalize(windows))
-    return policy.head.loss(features[windows.mask], windows.actions[windows.mask])
-
-
-@kinds
-@policies
-def test_without_additions_the_action_loss_is_that_of_the_head(
-    name: str, sizes: dict[str, int]
-) -> None:
-    policy, windows = build(name, sizes).eval(), random_windows(sizes)
-    if name == "edt4rec":  # it shows returns-to-go that fall by the rewards
-        windows = replace(windows, rewards=torch.zeros_like(windows.rewards))
-        held = windows.returns_to_go[:, -1:].expand_as(windows.returns_to_go)
-        windows = replace(windows, returns_to_go=held * windows.mask)
-    torch.manual_seed(3)
-    _, scalars = policy.loss(windows)
-    torch.manual_seed(3)
-    assert float(scalars["action_loss"]) == float(reference_loss(policy, windows).detach())
-    assert policy.values is None
-    assert "value_loss" not in scalars
-    if name in ("dt", "dc", "lsdt"):
-        assert torch.equal(policy.loss(windows)[0], reference_loss(policy, windows))
 
 
 @kinds

@@ -13,7 +13,7 @@ import torch
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
-from ucfrec.fitting.checkpoint import load_trained
+from ucfrec.fitting.loop import load_trained
 from ucfrec.policies.registry import BUILT_IN, note_ignored, policy_class, policy_names
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run

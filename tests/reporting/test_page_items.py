@@ -30,7 +30,7 @@ from tests.support.report_page import (
 )
 from ucfrec.acting.scorer import logged_scores
 from ucfrec.commands.cli import main
-from ucfrec.counterfactual.reward_model_fit import fit_warning
+from ucfrec.counterfactual.reward_model import fit_warning
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.reporting.page import write_report

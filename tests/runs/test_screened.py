@@ -11,15 +11,15 @@ from tests.support.causes import planted_items, planted_vectors
 from ucfrec.commands.cli import main
 from ucfrec.counterfactual.screening import DimensionReport, ScreeningReport
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.writer import logged_observations, with_observations
+from ucfrec.episodes.writer import read_observations, write_observations
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.refit import refit
+from ucfrec.runs.run import SharedStages
 from ucfrec.runs.screened import train_screened
-from ucfrec.runs.shared_stages import SharedStages
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SETTINGS = ["train.steps=4", "train.validate_every=2", "policy.dim=8", "policy.context=3"]
@@ -50,8 +50,8 @@ def _known_verdicts(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_dropped_might_never_have_been_logged(items: bool, tmp_path: Path) -> None:
     plant = planted_items if items else planted_vectors
     store = plant(tmp_path / "store", 30, 8)
-    kept = np.delete(logged_observations(store), FLAGGED, axis=1)
-    never = with_observations(store, tmp_path / "never", kept, {})
+    kept = np.delete(read_observations(store), FLAGGED, axis=1)
+    never = write_observations(store, tmp_path / "never", kept, {})
     config = resolve_config("ucf", None, SETTINGS)
     record = train_screened(store, tmp_path / "dropped", config, "drop")
     plain = train_screened(never, tmp_path / "plain", config, None)

@@ -10,7 +10,6 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
-from tests.support.causes import QUICK as QUICK_SCREENING
 from tests.support.single_session import SingleSession
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
@@ -186,7 +185,7 @@ def test_screening_finds_the_distractor_among_items_and_its_value_changes_no_ret
 ) -> None:
     """That what is dropped might never have been logged is tested with `ucfrec.runs.screened`."""
     store = EpisodeStore.open(kuairand_folder / "log" / "store")
-    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK_SCREENING)
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     planted = plant_distractor(store, tmp_path / "planted")
     record = train_screened(planted, tmp_path / "run", resolve_config("bc", overrides=TINY), "drop")
     assert record.dropped_observations == (0,)

@@ -7,11 +7,9 @@ import torch
 
 from ucfrec import schema
 from ucfrec.arrays import Float64Array
-from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 
-QUICK = MeasurementConfig(trees=25)
 SOURCE = {"where": "planted", "dataset": "planted", "env_id": None, "versions": {}}
 
 

@@ -26,6 +26,30 @@ def random_log(
     return log
 
 
+def faulty_log(rows: int, text: bool, seed: int) -> pd.DataFrame:
+    """Few keys, in no order, many duplicates that differ in some column, and every fault."""
+    generator = np.random.default_rng(seed)
+    log = pd.DataFrame(
+        {
+            "user_id": generator.integers(-2, 6, rows),
+            "item_id": generator.integers(5, size=rows),
+            "timestamp": START + generator.integers(8, size=rows) * 60_000,
+            "reward": generator.choice([0, 1, 2, np.nan, np.inf, -np.inf], rows),
+            "length": generator.integers(3, size=rows),
+            "propensity": generator.choice([0.25, 0.5, np.nan], rows),
+            "is_random": generator.integers(2, size=rows),
+            "session_id": generator.integers(3, size=rows),
+        }
+    )
+    log = log.astype({"user_id": "Int64", "item_id": "Int64"})
+    if text:
+        for name in ("user_id", "item_id", "session_id"):
+            log[name] = "é" + log[name].astype("string")
+    for name, value in (("user_id", None), ("item_id", None), ("timestamp", 5)):
+        log.loc[generator.integers(rows, size=4), name] = value
+    return log
+
+
 def write(frame: pd.DataFrame, path: Path) -> Path:
     """Write a CSV or Parquet file, as its name says."""
     path.parent.mkdir(parents=True, exist_ok=True)

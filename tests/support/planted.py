@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig
-from ucfrec.counterfactual.reward_model_fit import CRMReport, fit_crm
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, CRMReport, fit_crm
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 

@@ -177,11 +177,11 @@ def run_fresh(*arguments: object, number: int, moment: float) -> End:
 
 def leftovers(*folders: Path) -> list[str]:
     """Locks and scratch in the folders."""
-    from ucfrec.files.locks import is_lock_or_scratch
+    from ucfrec.files.atomic import LOCK, SCRATCH
 
     return [
         str(path)
         for folder in folders
         for path in folder.rglob(".*")
-        if is_lock_or_scratch(path.name)
+        if path.name.endswith((LOCK, SCRATCH))
     ]

@@ -191,7 +191,7 @@ def _write_file(path: Path, content: bytes) -> None:
 
 def _reseal(place: Path, file: str) -> None:
     """Put the checksum of a changed file into the record of its folder, if that lists it."""
-    from ucfrec.files.atomic import read_json, write_sealed_json
+    from ucfrec.files.atomic import read_json, write_json
     from ucfrec.files.record import file_checksum
 
     for record in (place / "run.json", place / "meta.json"):
@@ -201,7 +201,7 @@ def _reseal(place: Path, file: str) -> None:
                 path = place / file
                 value["files"][file] = [path.stat().st_size, file_checksum(path)]
                 record.unlink()
-                write_sealed_json(record, value)
+                write_json(record, value, seal=True)
 
 
 def _mutate(generator: random.Random, content: bytes, path: Path, number: int) -> bytes:
@@ -304,8 +304,7 @@ def _mutate_bytes(generator: random.Random, content: bytes) -> bytes:
 def list_readers(inputs: Inputs) -> list[Reader]:
     """The readers of every kind of file."""
     from ucfrec.files.parquet import read_ids
-    from ucfrec.fitting.checkpoint import load_tensors
-    from ucfrec.fitting.metrics_log import read_metrics
+    from ucfrec.fitting.checkpoint import load_tensors, read_metrics
     from ucfrec.logs.mapping import read_mapping
     from ucfrec.logs.prepare import validate
     from ucfrec.reporting.page import write_report
@@ -412,7 +411,7 @@ def read_store(path: Path) -> list[Any]:
 
 def read_run(path: Path) -> list[Any]:
     """All that ucfrec reads of a run."""
-    from ucfrec.fitting.metrics_log import read_metrics
+    from ucfrec.fitting.checkpoint import read_metrics
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     parts: list[Any] = []

@@ -7,15 +7,28 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.later import later_log, later_mapping
 from tests.support.logs import store_of
+from tests.support.served import trained_run
+from tests.support.tagged import ITEMS
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import EpisodeStore, UserRows
+from ucfrec.logs.append import append_logs
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.updating.verdict import _doubt, compare_runs, describe
+from ucfrec.updating.verdict import (
+    _doubt,
+    compare_runs,
+    describe,
+    describe_drift,
+    popularity_index,
+    restrict_to_run,
+    reward_index,
+    stability_index,
+)
 
-ITEMS = 12
+LOGGED_ITEMS = 12
 
 
 @pytest.fixture(scope="module")
@@ -23,10 +36,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedPolicy:
     """A policy of item rates on a log of uniform draws, in which low items are liked."""
     rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("verdict")
     rows = 4000
-    log = pd.DataFrame({"user_id": np.arange(rows) // 5, "item_id": rng.integers(ITEMS, size=rows)})
+    log = pd.DataFrame(
+        {"user_id": np.arange(rows) // 5, "item_id": rng.integers(LOGGED_ITEMS, size=rows)}
+    )
     log["timestamp"] = 1_700_000_000_000 + np.arange(rows) * 1000
     log["reward"] = (rng.random(rows) < 0.8 - 0.06 * log.item_id) * 1.0
-    log["propensity"] = 1 / ITEMS
+    log["propensity"] = 1 / LOGGED_ITEMS
     store_of(log, folder, split=(0.6, 0.1, 0.3))
     Recommender("item-rate").fit(EpisodeStore.open(folder / "store"), folder / "run")
     return TrainedPolicy.load(folder / "run")
@@ -43,7 +58,7 @@ def reversed_of(trained: TrainedPolicy) -> TrainedPolicy:
     """A run that shows the items which are liked least."""
     policy = TrainedPolicy.load(trained.folder).policy
     for name, value in policy.state_dict().items():
-        if value.shape == (ITEMS,) and value.is_floating_point() and "count" not in name:
+        if value.shape == (LOGGED_ITEMS,) and value.is_floating_point() and "count" not in name:
             value.copy_(-value)
     return replace(trained, policy=policy)
 
@@ -95,10 +110,10 @@ def test_what_was_served_without_seen_items_is_compared_without_them(
 ) -> None:
     rng, users = np.random.default_rng(0), 400
     log = pd.DataFrame({"user_id": np.repeat(np.arange(users), 5)})
-    log["item_id"] = np.concatenate([rng.permutation(ITEMS)[:5] for _ in range(users)])
+    log["item_id"] = np.concatenate([rng.permutation(LOGGED_ITEMS)[:5] for _ in range(users)])
     log["timestamp"] = 1_700_000_000_000 + np.arange(len(log)) * 1000
     log["reward"] = (rng.random(len(log)) < 0.8 - 0.06 * log.item_id) * 1.0
-    log["propensity"] = 1 / (ITEMS - log.groupby("user_id").cumcount())
+    log["propensity"] = 1 / (LOGGED_ITEMS - log.groupby("user_id").cumcount())
     store_of(log, tmp_path, split=(0.2, 0.2, 0.6))
     store = EpisodeStore.open(tmp_path / "store")
     rows, others = store.split("test"), store.split("train")
@@ -126,3 +141,52 @@ def test_the_cause_of_missing_weight_fits_the_filter() -> None:
     filtered = _doubt(weights, user, filter_seen=True)
     assert "update with" not in filtered
     assert "items that requests excluded by candidates" in filtered
+
+
+def test_the_index_is_that_of_the_formula() -> None:
+    old, new = np.array([5000.0, 5000.0]), np.array([6000.0, 4000.0])
+    expected = 0.1 * np.log(0.6 / 0.5) - 0.1 * np.log(0.4 / 0.5)
+    assert stability_index(old, new) == pytest.approx(expected, rel=1e-3)
+    assert stability_index(old, 3 * old) == pytest.approx(0, abs=1e-6)
+
+
+def test_popularity_that_moves_to_rare_items_is_seen() -> None:
+    rng = np.random.default_rng(0)
+    shares = 1 / np.arange(1, 101)
+    old = rng.multinomial(100_000, shares / shares.sum())
+    same = rng.multinomial(5000, shares / shares.sum())
+    assert popularity_index(old, same) < 0.02
+    assert popularity_index(old, same[::-1]) > 0.25
+
+
+def test_rewards_of_two_values_and_of_many_are_compared() -> None:
+    rng = np.random.default_rng(0)
+    clicks = (rng.random((2, 5000)) < 0.1) * 1.0
+    assert reward_index(*clicks) < 0.01
+    assert reward_index(clicks[0], (rng.random(5000) < 0.5) * 1.0) > 0.25
+    prices = rng.lognormal(size=(2, 5000))
+    assert reward_index(*prices) < 0.02
+    assert reward_index(prices[0], 3 * prices[1]) > 0.25
+
+
+def test_drift_is_described_with_and_without_a_reward_model() -> None:
+    found = {"unknown_items": 0.1, "unknown_users": 0.5, "item_popularity": 0.3, "rewards": 0.01}
+    assert "10.0% of the new rows have new items, 50.0% new users" in describe_drift(found)
+    model = {"predicted": 0.2, "observed": 0.3, "calibration_error": 0.1, "slope": 0.9}
+    assert "predicts 0.2, observed 0.3" in describe_drift(found | model)
+
+
+def test_unknown_items_and_users_have_no_number(tmp_path: Path) -> None:
+    trained = trained_run(tmp_path)
+    later_log().to_parquet(tmp_path / "later.parquet")
+    logs, mapping = [tmp_path / "later.parquet"], later_mapping(tmp_path)
+    append_logs(tmp_path / "store", logs, tmp_path / "grown", mapping)
+    newest = EpisodeStore.open(tmp_path / "grown").split("test")
+    known = restrict_to_run(newest, trained)
+    items = newest.step_values("item", *newest.all_steps())
+    expected = np.where(items < ITEMS, items, -1)
+    assert (expected < 0).any()
+    np.testing.assert_array_equal(known.step_values("item", *known.all_steps()), expected)
+    np.testing.assert_array_equal(known.lengths, newest.lengths)
+    assert known.state_size == trained.record.sizes["state"]
+    assert known.episode_values("user").max() < len(trained.user_ids)

@@ -7,7 +7,7 @@ from scipy import sparse
 from sklearn.linear_model import LogisticRegression, Ridge
 from torch import Tensor
 
-from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects, minimum
+from ucfrec.user_model.reward_effects import EFFECTS, Design, fit_effects
 
 
 def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
@@ -96,24 +96,3 @@ def test_effects_are_fitted_jointly_and_a_start_changes_nothing() -> None:
     np.testing.assert_allclose(
         given.predictor(other).numpy(), given.predictor(alone).numpy(), atol=0.05
     )
-
-
-def test_squares_are_those_of_the_inputs() -> None:
-    given = design(200, binary=True)
-    for name in EFFECTS:
-        inputs = matrix(given, name)
-        expected = np.asarray(inputs.multiply(inputs).sum(0)).ravel()
-        actual = given.squares(name).flatten()
-        np.testing.assert_allclose(actual.numpy(), expected, rtol=1e-4)
-
-
-def test_the_minimum_of_a_quadratic_function_is_found() -> None:
-    random = torch.Generator().manual_seed(0)
-    root = torch.eye(30) + 0.1 * torch.randn(30, 30, generator=random)
-    at = torch.randn(30, generator=random)
-
-    def height(z: torch.Tensor) -> torch.Tensor:
-        return 0.5 * (root @ (z - at)).square().sum() + 1.0
-
-    found = minimum(height, torch.zeros(30))
-    assert float(height(found)) == pytest.approx(1.0, abs=1e-4)

@@ -162,7 +162,7 @@ class PolicyActor:
 
         `actions`, (N, A) or (N,), is not used: `act` has recorded them.
         """
-        self._sessions = self._sessions.with_step(self._actions, torch.from_numpy(rewards))
+        self._sessions = self._sessions.add_step(self._actions, torch.from_numpy(rewards))
 
     def _find_excluded(self) -> Tensor | None:
         """(N, n_items) items that the environment lacks or forbids, or that were shown; None for

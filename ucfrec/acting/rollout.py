@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.schema import FORBIDDEN, USER_IDS
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ucfrec.reporting.charts import LIGHT, PLAIN, save, styled
+from ucfrec.reporting.charts import LIGHT, PLAIN, file_style, save
 from ucfrec.reporting.charts import OURS as OURS_COLOR
 from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
 from ucfrec.results.rows import ResultRow
@@ -312,7 +312,7 @@ def _draw_triples(axes: "Axes", rows: Sequence[ResultRow]) -> None:
     axes.legend()
 
 
-@styled
+@file_style()
 def _plot_environments(
     kind: str,
     draw: Callable[["Axes", Sequence[ResultRow]], None],

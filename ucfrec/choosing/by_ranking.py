@@ -3,7 +3,7 @@
 Where the log has no true sessions there is nothing to simulate, but every row shows what a user
 liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
 show, and overlaps with the log enough if it finds liked items better than the ten most liked ones
-do, by a standard error. The choice is repeated on two halves of the users.
+do, by a standard error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
 from ucfrec.user_model.reward_report import draw_steps
 
@@ -42,8 +42,8 @@ _PRIOR = 10.0
 class LoggedScores:
     """Scores of all items at M logged steps by rules of one policy.
 
-    Policy and reward model are computed once for all rules of one target, and where the policy has
-    factors kept for rules that are asked for later: the outputs of others are as many as items.
+    Policy and reward model are computed once for all rules of one target, and kept for later rules
+    where the policy has factors: the outputs of others are as many as items.
     """
 
     def __init__(
@@ -96,10 +96,7 @@ class LoggedEvidence:
     """Validation sessions on which rules of one policy are compared with the log."""
 
     def __init__(self, scorer: Scorer, view: EpisodeStore, most: int, seed: int) -> None:
-        """Args:
-        view: validation episodes.
-        most: about the number of steps of the sessions that are drawn from many, by the seed.
-        """
+        """Draws about `most` steps of whole sessions of a view."""
         order = np.random.default_rng([seed, 7]).permutation(view.n_episodes)
         last = int(np.searchsorted(np.cumsum(view.lengths[order]), most))
         view = view.select(np.sort(order[: last + 1]))
@@ -159,9 +156,8 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
     cannot be distinguished the one with the most hits; without any, those count whose hits cannot
-    be distinguished from the most. If the next larger of the candidates overlaps too little, reward
-    weights between the two are tried. The first candidates are the configured ones; of many
-    validation rows, 4,000 to 20,000 are drawn.
+    be distinguished from the most. If the next larger of the configured candidates overlaps too
+    little, reward weights between the two are tried. Two halves of the users choose again.
     """
     train, validation, scorer = problem.train, problem.validation, problem.scorer
     n_items = len(train.item_states.embeddings)

@@ -32,7 +32,7 @@ from ucfrec.choosing.choice import (
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Windows
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
 from ucfrec.user_model.reward_report import halve_users
@@ -166,12 +166,8 @@ class RuleSearch:
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
     def simulate(self, rules: Sequence[DecisionRule], times: int = 1) -> list[SimulatedRule]:
-        """Roll out each of the rules, side by side, with the same draws, in `times` the sessions of
-        the configuration.
-
-        A rule that is far behind the best one after a part of the sessions is not simulated in the
-        rest; its value is that of the best one less the difference.
-        """
+        """Roll out the rules, side by side with the same draws, in `times` the configured sessions;
+        those far behind the best one after a part of the sessions not in the rest."""
         if not rules:
             return []
         n = times * self._config.sessions
@@ -209,8 +205,7 @@ class RuleSearch:
         return results
 
     def _add_evidence(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The rules with their evidence: of many sessions, where it decides what is allowed and no
-        lookahead makes it slow."""
+        """The rules with evidence: of many sessions where it decides, and no lookahead is slow."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
         fast = [item for item in candidates if item not in slow]
         return [
@@ -230,8 +225,7 @@ class RuleSearch:
         seed: int,
         users: UserModel | None = None,
     ) -> dict[DecisionRule, Outcomes]:
-        """Simulate `n` sessions of each rule that begin as those of a store, none of which excludes
-        seen items; the seed is that of the draws of each rule."""
+        """Simulate `n` sessions of each rule that begin as a store's, with draws of its own."""
         scorers = [self.problem.scorer.under(rule) for rule in rules]
         simulator = UserSimulator(
             users or self.users, store, n, self._longest, seed, times=len(rules)
@@ -293,8 +287,7 @@ class RuleSearch:
     def finalists(
         self, candidates: Sequence[SimulatedRule], best: SimulatedRule
     ) -> list[SimulatedRule]:
-        """The best, the rule that the choice starts from, and those of the highest value among the
-        allowed, in more sessions."""
+        """The best, the start, and allowed ones of the highest value, in more sessions."""
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
         ranked = (best, *self._find_start(candidates), *sorted(allowed, key=_value, reverse=True))
         rules = dict.fromkeys(candidate.rule for candidate in ranked)
@@ -302,11 +295,8 @@ class RuleSearch:
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         """The allowed candidates that cannot be told apart from the best: within the standard error
-        of the difference over pairs of sessions, or the tolerance.
-
-        If the log supports none, the rule that the choice starts from, or the one with the most
-        effective items.
-        """
+        of the difference over pairs of sessions, or the tolerance. If the log supports none, the
+        rule that the choice starts from, or the one with the most effective items."""
         allowed = self._select_allowed(candidates)
         if not allowed:
             most_varied = max(candidates, key=lambda candidate: candidate.items)
@@ -334,12 +324,9 @@ class RuleSearch:
         return min(self.level(candidates), key=_simplicity)
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
-        """Of those that cannot be told apart from the best, the rule that the choice starts from,
-        or the one with the most support in the log: effective users, or without propensities the
-        likelihood; then the most hits, if they differ by a percentage point; then the simplest.
-
-        A handful of effective users is no evidence, nor are fewer hits among few logged steps.
-        """
+        """Of level rules, the one that the choice starts from, or the one with the most support in
+        the log: effective users, or without propensities the likelihood; then the most hits, if
+        they differ by a percentage point; then the simplest. A handful of users is no evidence."""
         level = self.level(candidates)
         level = self._find_start(level) or level
         complete = [candidate for candidate in level if candidate.evidence is not None]
@@ -356,8 +343,7 @@ class RuleSearch:
     def halves_agree(
         self, chosen: SimulatedRule, candidates: Sequence[SimulatedRule]
     ) -> tuple[bool, bool]:
-        """Whether the chosen rule cannot be told apart from the best allowed one in the sessions of
-        either half of the users, as in `level`."""
+        """Whether the chosen rule is level with the best allowed one in either half of users."""
         own_returns = self._sessions[chosen.rule].returns
         n = len(own_returns)
         half = halve_users(self._store)[np.arange(n) % len(self._store)]
@@ -376,11 +362,8 @@ class RuleSearch:
         return agrees(half == 0), agrees(half == 1)
 
     def estimate(self, rule: DecisionRule) -> ValueEstimate:
-        """The return of a session under a rule, in sessions that did not choose it.
-
-        Either half of the users is simulated with the calibration of its own rows. More sessions
-        follow where the standard error of the first ones is large.
-        """
+        """The return of a session under a rule, in sessions that did not choose it: those of either
+        half of the users, with its own calibration; more where their standard error is large."""
         halves = [self._roll_half(rule, number) for number in (0, 1)]
         returns = np.concatenate([half.returns for half in halves])
         if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
@@ -424,11 +407,11 @@ class RuleSearch:
 def choose_by_simulation(problem: Problem) -> RuleChoice:
     """Choose target, minimum target and temperature, then the reward weight.
 
-    Where items have tags, tag window and temperature follow, and the reward weight with the
-    window; where the log shows fatigue, the tag run, and temperature and reward weight with it.
-    Where the log has propensities, rules that stay near it follow. For new users, the rules of the
-    highest value are then simulated in more sessions. Of rules that the model cannot distinguish,
-    the one with the most support in the log is taken.
+    Where items have tags, tag window and temperature follow, and the reward weight with the window;
+    where the log shows fatigue, the tag run, and temperature and reward weight with it. Where the
+    log has propensities, rules that stay near it follow. For new users, the rules of the highest
+    value are then simulated in more sessions. Of rules that the model cannot distinguish, the one
+    with the most support in the log is taken.
 
     With a rule to start from, the candidates are that rule and its neighbours instead, and it stays
     unless one of them is better.
@@ -567,13 +550,10 @@ def find_neighbours(
     rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
 ) -> Iterator[DecisionRule]:
     """The rule, rules with another target, and those with another of its numbers one candidate up
-    or down.
+    or down, among those of the configuration and `more`.
 
     A rule without lookahead also gets one, with the middle weight of the policy, and loses it with
     the middle reward weight.
-
-    Args:
-        more: further candidates of `temperature` and `reward_weight`.
     """
     config, policy = problem.config, problem.scorer.policy
     yield rule

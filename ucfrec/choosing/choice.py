@@ -65,8 +65,7 @@ class RuleConfig:
     propensities, so that its value can be estimated from logs; 0 for any."""
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Share of the best estimate by which that of a rule at a higher temperature, or with less
-    reward weight, may fall short: the standard error of the sessions, which is allowed in any
-    case, does not count what the user model gets wrong."""
+    reward weight, may fall short; the standard error of the sessions is allowed in any case."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +94,8 @@ class Evidence:
     likelihood: float
     """Geometric mean of the probabilities with which the rule shows what was logged."""
     effective_users: float | None = None
-    """Users of equal weight that say as much of the rule as the logged ones, whose sessions are
-    weighted by the rule's over the logged probabilities; of the half of the users with fewer, twice
-    the number. None without propensities."""
+    """Users of equal weight that say as much of the rule as the logged ones, weighted by its over
+    the logged probabilities; of the half with fewer, twice the number; None without any."""
     spread: float = 0.0
     """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
     than the weights how heavy their tail is: few sessions may lack the heavy ones."""

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ucfrec.commands.options import Table
-from ucfrec.processes import block_ctrl_c, pool_of_processes
-from ucfrec.progress import label_progress, progress
+from ucfrec.processes import block_ctrl_c, label_progress, pool_of_processes, progress
 
 if TYPE_CHECKING:
     from ucfrec.results.rows import ResultRow
@@ -83,7 +82,7 @@ class Demo(Table):
 
     def execute(self) -> None:
         """Print the result table and what it shows."""
-        from ucfrec.files.locks import lock_path, remove_leftovers
+        from ucfrec.files.atomic import lock_path, remove_leftovers
         from ucfrec.reporting.tables import evaluation_table
 
         config = FULL if self.full else DemoConfig()
@@ -208,8 +207,7 @@ def _learn(folder: Path, name: str, seed: int, config: DemoConfig) -> "ResultRow
     from ucfrec.evaluation.evaluate import evaluate_policy
     from ucfrec.evaluation.simulator import Environment
     from ucfrec.runs.config import resolve_config
-    from ucfrec.runs.run import train_run
-    from ucfrec.runs.shared_stages import SharedStages
+    from ucfrec.runs.run import SharedStages, train_run
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     torch.set_num_threads(1)

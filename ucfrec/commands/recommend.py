@@ -19,7 +19,7 @@ from ucfrec.commands.shared_options import (
 )
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import origin
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 
 if TYPE_CHECKING:
     from ucfrec.arrays import Array

@@ -88,7 +88,7 @@ class Train(TrainingOptions):
 
     def _describe(self, record: "RunRecord") -> None:
         from ucfrec.files.record import CARD
-        from ucfrec.fitting.metrics_log import read_metrics
+        from ucfrec.fitting.checkpoint import read_metrics
         from ucfrec.runs.record import REFIT, RUN, read_record
 
         print(record.describe(read_metrics(self.out / "policy")))
@@ -196,7 +196,7 @@ class Screen(Table):
 
         from ucfrec.episodes.store import EpisodeStore
         from ucfrec.files.atomic import write_json
-        from ucfrec.provenance import provenance
+        from ucfrec.processes import provenance
         from ucfrec.runs.screened import screen_store
 
         report = screen_store(EpisodeStore.open(self.store), self.seed)

@@ -72,8 +72,8 @@ class Update(LogOptions, RunArgument):
         from ucfrec.runs.promoted import promoted
         from ucfrec.runs.record import RUN
         from ucfrec.runs.trained_policy import TrainedPolicy
-        from ucfrec.updating import drift, verdict
         from ucfrec.updating.update import UpdateOptions, update_run
+        from ucfrec.updating.verdict import describe, describe_drift
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)
@@ -108,7 +108,7 @@ class Update(LogOptions, RunArgument):
         print(record.describe())
         if record.rule is not None and record.rule.rule != old.rule:
             print(f"rule changed  {old.rule} → {record.rule.rule}")
-        print(f"{drift.describe(update.drift)}\n{verdict.describe(update.verdict)}")
+        print(f"{describe_drift(update.drift)}\n{describe(update.verdict)}")
         print(f"\nrun: {self.out}")
         if update.verdict.result == "worse":
             print("next: keep the old run; more new rows, or train from scratch with ucfrec train")

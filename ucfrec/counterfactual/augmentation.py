@@ -29,13 +29,11 @@ from ucfrec.counterfactual.generators import (
 from ucfrec.counterfactual.reward_model import (
     CausalRewardModel,
     CRMConfig,
-    EffectsMean,
-    read_transitions,
-)
-from ucfrec.counterfactual.reward_model_fit import (
     CRMReport,
+    EffectsMean,
     fit_crm,
     fit_warning,
+    read_transitions,
     sample_steps,
     sample_transitions,
 )
@@ -99,13 +97,11 @@ class MoveReport:
     """Moves Δ = (s_c − s) / σ_s of the accepted edits (paper appendix I.2)."""
 
     edits: int
-    """Number of accepted edits."""
     length_quantiles: dict[str, float]
     """Quantiles of ‖Δ‖₂ by level; empty without edits."""
     histogram_edges: tuple[float, ...]
     """Edges of the bins of ‖Δ‖₂, from 0 to ρ_high."""
     histogram_counts: tuple[int, ...]
-    """Number of edits in each bin."""
     mean_move_ratio: Undefinable
     """‖mean Δ‖ / mean ‖Δ‖: 1 if all edits are the same shift, near 0 if they are varied."""
     effective_rank: float
@@ -119,9 +115,8 @@ class ActionReport:
     """Other actions that were proposed, and their counterfactual rewards."""
 
     proposals: int
-    """Number of other actions proposed."""
     reproduced: float
-    """Share of them at steps whose logged reward the reward model reproduces within ε_r."""
+    """Share of the proposals at steps whose logged reward the model reproduces within ε_r."""
     copies: int
     """Number of action copies: those that, at such steps, change the reward by more than δ."""
     mean_change: Undefinable
@@ -137,11 +132,9 @@ class AugmentationReport:
     copies: int
     """Number of augmented episodes."""
     proposals: int
-    """Number of proposed edits."""
     acceptance: float
     """Share of proposals that passed both gates."""
     moves: MoveReport
-    """Statistics of the accepted edits."""
     epsilon_r: float
     """Tolerance of the reward gate, in reward units."""
     delta: float
@@ -151,10 +144,8 @@ class AugmentationReport:
     verdict: str
     """A sentence on whether the bound is informative."""
     warnings: tuple[str, ...]
-    """Warnings of a reward model that predicts nothing, latent collapse, latent leak and edit
-    collapse."""
+    """Of a reward model that predicts nothing, latent collapse, latent leak and edit collapse."""
     reward_model: CRMReport
-    """Quality of the reward model."""
     actions: ActionReport | None = None
     """Action copies; None if no other action was proposed."""
 
@@ -186,17 +177,8 @@ def augment_episodes(
     seed: int,
     device: torch.device = _CPU,
 ) -> tuple[AugmentedEpisodes, AugmentationReport]:
-    """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1).
-
-    Args:
-        train: view to fit both models to and to copy episodes from.
-        validation: view for early stopping and for the quality of the reward model.
-        folder: of the checkpoints, which training resumes from.
-        device: where both models are fitted and edits are made.
-
-    Raises:
-        InputError: all training rewards are equal, or there are no held-out steps.
-    """
+    """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1) of the episodes
+    of `train`; those of `validation` stop the fit early. Training resumes from `folder`."""
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
     item_rewards: ItemRewardModel | None = None
     mean: EffectsMean | None = None
@@ -217,9 +199,9 @@ def augment_episodes(
     episodes, report = edit_states(train, crm, crm_report, generator, config, seed, item_rewards)
     if clusters is None or not config.actions:
         return episodes, report
-    states = crm.normalised_states(training.states.to(device)).cpu()
+    states = crm.normalise_states(training.states.to(device)).cpu()
     labels = clusters.nearest(states).numpy()
-    support = ActionSupport(labels, logged_actions(train, sampled_episodes, sampled_steps))
+    support = ActionSupport(labels, read_actions(train, sampled_episodes, sampled_steps))
     actions = ActionGenerator(
         train, crm, clusters, support, report.epsilon_r, report.delta, item_rewards
     )
@@ -231,12 +213,8 @@ def augment_episodes(
 def find_candidates(
     view: EpisodeStore, config: AugmentConfig, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes.
-
-    Args:
-        view: the training episodes.
-        rng: draws episodes if there are too many steps.
-    """
+    """(episodes, steps), each (M,), that pass the reward filter, in order of episodes, which are
+    drawn if there are too many steps."""
     order = rng.permutation(view.n_episodes)
     count = np.searchsorted(np.cumsum(view.lengths[order]), config.max_steps, side="right")
     sampled = np.sort(order[: max(1, int(count))])
@@ -265,13 +243,8 @@ def edit_states(
     seed: int,
     item_rewards: ItemRewardModel | None = None,
 ) -> tuple[AugmentedEpisodes, AugmentationReport]:
-    """Copy episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`).
-
-    Args:
-        view: the training episodes.
-        config: numbers of copies and edits, and the gate.
-        item_rewards: see `read_transitions`.
-    """
+    """Copy training episodes with other states (Algorithm 5, or appendix H; see `AugmentConfig`);
+    `item_rewards` is that of `read_transitions`."""
     rng, random = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     # The gates are evaluated in float64 on the stored float32 values, so that a later check of the
     # edits confirms every one.
@@ -338,17 +311,12 @@ def accept(
     epsilon_r: float,
     rho_high: float,
 ) -> Tensor:
-    """Which proposals pass both gates of Eq. 4 (Algorithm 4).
+    """Which proposals (M, S) pass both gates of Eq. 4 (Algorithm 4), (M,) bool.
 
     Args:
-        factual: M logged steps.
-        z: (M, latent_dim) disturbances abduced from them.
-        proposals: (M, S) counterfactual states.
+        factual: M logged steps, from which z (M, latent_dim) is abduced.
         epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
         rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
-
-    Returns:
-        (M,) bool.
     """
     change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
     length = crm.moves(factual.states, proposals).norm(dim=1)
@@ -403,11 +371,8 @@ class MoveStatistics:
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0.
-
-        Args:
-            rho_high: upper end of the histogram of lengths.
-        """
+        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0. The
+        histogram of lengths ends at `rho_high`."""
         lengths = torch.cat(self._lengths).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
         levels = _QUANTILES if len(lengths) else ()
@@ -475,11 +440,8 @@ def _report(
 def interventions(
     view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
 ) -> AugmentedEpisodes:
-    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`.
-
-    Values are drawn, jointly, from the steps of the view. Copies 0, 2, … draw once an episode, as
-    an intervention that stays put; copies 1, 3, … at every step.
-    """
+    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`: values are
+    drawn, jointly, from its steps, for copies 0, 2, … once an episode, otherwise at every step."""
     rng = np.random.default_rng(seed)
     episodes, steps = view.all_steps()
     states = view.windows(episodes, steps, 1).states[:, 0].numpy()
@@ -583,25 +545,27 @@ class ActionGenerator:
         z = exact.abduct(s, a, r)
         reproduced = ((exact.predict(s, a, z) - r).abs() <= self.epsilon_r).cpu().numpy()
         rows = np.repeat(np.arange(len(steps)), count)
-        states = self.crm.normalised_states(factual.states).cpu()
+        states = self.crm.normalise_states(factual.states).cpu()
         labels = self.clusters.nearest(states).numpy()
         actions, drawable = self.support.draw(labels[rows], rng)
-        logged = logged_actions(self.view, episodes[rows], steps[rows])
+        logged = read_actions(self.view, episodes[rows], steps[rows])
         differs = drawable & np.atleast_2d((actions != logged).T).any(axis=0)
         rows, actions = rows[differs], actions[differs]
-        other = read_transitions(self.view, episodes[rows], steps[rows], self.item_rewards, actions)
+        changed = read_transitions(
+            self.view, episodes[rows], steps[rows], self.item_rewards, actions
+        )
         at = torch.from_numpy(rows).to(s.device)
         return {
             "episode": episodes[rows],
             "step": steps[rows],
             "action": actions,
-            "reward": exact.predict(s[at], other.actions.to(s), z[at]).cpu().numpy(),
+            "reward": exact.predict(s[at], changed.actions.to(s), z[at]).cpu().numpy(),
             "logged": r.cpu().numpy()[rows],
             "reproduced": reproduced[rows],
         }
 
 
-def logged_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
+def read_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:
     """The logged actions of M steps, (M,) int64 items or (M, A) float32 vectors."""
     if view.has_items:
         return view.step_values(schema.ITEM, episodes, steps).astype(np.int64)

@@ -153,9 +153,8 @@ class TangentGenerator:
 
     A move Δ is drawn from a Gaussian with the covariance Σ of the training states in the cluster
     nearest to s, conditioned on an unchanged reward to first order: ∇f̂_r · Δ = 0. It is scaled to a
-    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r. Only the
-    clusters and their covariances are fitted to data. Not in the paper, whose generator is
-    `CounterfactualStateGenerator`.
+    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r. Not in
+    the paper, whose generator is `CounterfactualStateGenerator`.
     """
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
@@ -169,7 +168,7 @@ class TangentGenerator:
         self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
     ) -> Tensor:
         """See `Generator.propose`."""
-        near = self._clusters.nearest(self._crm.normalised_states(states))
+        near = self._clusters.nearest(self._crm.normalise_states(states))
         noise = torch.randn(states.shape, generator=generator).to(states.device)
         length = _lengths(self.band, states, generator)
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
@@ -192,14 +191,14 @@ class TangentGenerator:
         reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
         steepest = _products(self._clusters.covariances, gradient, rows)
         move = _products(self._roots, noise, rows)
-        move = _scaled(
+        move = _scale(
             move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
         )
         for _ in range(self._config.corrections):
             current, gradient = self._reward(states, actions, z, move)
             steepest = _products(self._clusters.covariances, gradient, rows)
             step = steepest * _ratio(current - reward, gradient, steepest)
-            move = _shortened(move - _shortened(step, length), length)
+            move = _shorten(move - _shorten(step, length), length)
         return move
 
     def _reward(
@@ -251,7 +250,7 @@ class NoiseGenerator:
         noise = torch.randn(states.shape, generator=generator).to(states.device)
         noise = noise * (self._std > 0)
         length = _lengths(self.band, states, generator)
-        return states + self._std * _scaled(noise, length)
+        return states + self._std * _scale(noise, length)
 
 
 def state_clusters(
@@ -259,7 +258,7 @@ def state_clusters(
 ) -> StateClusters:
     """Clusters of the states of the steps that `make_generator` fits to, with the same seed."""
     states = train.states[_high_rewards(train, config, seed)].to(crm.device)
-    return StateClusters.of(crm.normalised_states(states).cpu(), config.clusters, seed)
+    return StateClusters.of(crm.normalise_states(states).cpu(), config.clusters, seed)
 
 
 @random_state_kept()
@@ -274,9 +273,8 @@ def make_generator(
     """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
 
     Args:
-        train: M transitions to fit to, on the CPU.
-        crm: the fitted reward model, whose device the generator shares; its parameters are frozen
-            if the kind is `faithful`.
+        train: M transitions, on the CPU; the generator shares the device of the reward model, whose
+            parameters are frozen if the kind is `faithful`.
         folder: of the checkpoints of `faithful`, which resumes from them.
         clusters: the `state_clusters` of the same arguments, if they are known.
     """
@@ -357,11 +355,11 @@ def _ratio(change: Tensor, gradient: Tensor, steepest: Tensor) -> Tensor:
     return (change / ((gradient * steepest).sum(1) + _TINY)).unsqueeze(1)
 
 
-def _scaled(move: Tensor, length: Tensor) -> Tensor:
+def _scale(move: Tensor, length: Tensor) -> Tensor:
     scaled: Tensor = move * (length / (move.norm(dim=1, keepdim=True) + _TINY))
     return scaled
 
 
-def _shortened(move: Tensor, length: Tensor) -> Tensor:
+def _shorten(move: Tensor, length: Tensor) -> Tensor:
     factor: Tensor = length / (move.norm(dim=1, keepdim=True) + _TINY)
     return move * factor.clamp(max=1.0)

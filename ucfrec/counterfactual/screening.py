@@ -27,34 +27,23 @@ from torch import Tensor
 from ucfrec.arrays import BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
+from ucfrec.processes import progress, random_state_kept
 
 CLIP: Final = 10.0
 """Standardised values beyond this many standard deviations are clipped."""
 MAX_TRANSITIONS: Final = 100_000
 """Largest number of transitions used; of more, that many are drawn."""
+TREES: Final = 150
+"""Largest number of boosted trees that predict a dimension."""
+_LEAVES, _LEARNING_RATE, _PATIENCE = 15, 0.1, 8
+"""Of the trees; fewer grow where rows kept apart are predicted no better."""
+_MIN_EXPLAINED, _LEVEL = 0.003, 0.001
+"""Least share of a dimension's variance that the rest and the reward must each explain, and the
+level of the test that they do."""
+_MOST_ADDED = 0.25
+"""Largest share of what the rest explains that it may add to the reward."""
 _HELD_OUT_EVERY = 5
-_PATIENCE = 8
 _ANSWERS = {True: "yes", False: "no", None: "–"}
-
-
-@dataclass(frozen=True)
-class MeasurementConfig:
-    """Boosted trees that predict a dimension, and how much must be left for a cause."""
-
-    trees: int = 150
-    """Largest number of trees; fewer where rows kept apart are predicted no better."""
-    leaves: int = 15
-    """Largest number of leaves of a tree."""
-    learning_rate: float = 0.1
-    """Share of each tree's prediction that is added."""
-    min_explained: float = 0.003
-    """Least share of a dimension's variance that the rest must explain without the reward."""
-    most_added: float = 0.25
-    """Largest share of that which the rest may add to the reward."""
-    level: float = 0.001
-    """Level of the tests that the rest and the reward explain the dimension at all."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +104,7 @@ class ScreeningReport:
 
 
 @random_state_kept()
-def screen(train: EpisodeStore, config: MeasurementConfig, seed: int) -> ScreeningReport:
+def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
     """Test every logged observation dimension of a log of items: one that measures the reward
     counts as without effect.
 
@@ -135,7 +124,7 @@ def screen(train: EpisodeStore, config: MeasurementConfig, seed: int) -> Screeni
             f"the actions of {train.path} are vectors; screen it with ucfrec-control, which tests "
             "what each dimension predicts"
         )
-    measures = find_measurements(train, config, MAX_TRANSITIONS, seed)
+    measures = find_measurements(train, MAX_TRANSITIONS, seed)
     reports = [
         DimensionReport(dimension, measures_reward=yes, causes=not yes)
         for dimension, yes in measures.items()
@@ -145,19 +134,10 @@ def screen(train: EpisodeStore, config: MeasurementConfig, seed: int) -> Screeni
 
 
 def find_measurements(
-    train: EpisodeStore,
-    config: MeasurementConfig,
-    most: int,
-    seed: int,
-    dimensions: Sequence[int] | None = None,
+    train: EpisodeStore, most: int, seed: int, dimensions: Sequence[int] | None = None
 ) -> dict[int, bool]:
-    """Whether observation dimensions measure the reward, by their errors on held-out episodes.
-
-    Args:
-        train: a view of the training episodes, with observations.
-        most: largest number of transitions to use.
-        seed: of the transitions and of the rows kept apart.
-        dimensions: to test; None for all.
+    """Whether observation dimensions of training episodes measure the reward, by their errors on
+    held-out episodes; None stands for all dimensions. At most `most` transitions are used.
 
     Raises:
         InputError: there are too few episodes with two steps or more to hold some out.
@@ -171,15 +151,14 @@ def find_measurements(
     for part in filter(len, (tested, [d for d in all_dimensions if d not in tested])):
         with progress(len(part), "screening, what measures the reward", "dimensions") as bar:
             for dimension in part:
-                verdicts[dimension] = _measures(data, dimension, (), config, seed)
+                verdicts[dimension] = _measures(data, dimension, (), seed)
                 bar.update()
         if not any(verdicts.values()):
             break
     leaks = {dimension for dimension, measures in verdicts.items() if measures}
     # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return {
-        d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, config, seed))
-        for d in tested
+        d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, seed)) for d in tested
     }
 
 
@@ -191,16 +170,14 @@ class _Steps:
         self.episodes, steps = steps_with_successor(view, most, seed)
         now = view.transitions(self.episodes, steps)
         then = view.transitions(self.episodes, steps + 1)
-        others, observed = now.states.tensor_split([-view.observation_size], dim=1)
+        item_part, observed = now.states.tensor_split([-view.observation_size], dim=1)
         self.columns = standardise(observed).numpy()
-        self.rest = standardise(torch.cat([others, now.actions, then.actions], dim=1)).numpy()
+        self.rest = standardise(torch.cat([item_part, now.actions, then.actions], dim=1)).numpy()
         self.rewards = standardise(torch.stack([now.rewards, then.rewards], dim=1)).numpy()
         self.held_out = held_out_steps(view, self.episodes)
 
 
-def _measures(
-    data: _Steps, dimension: int, without: Collection[int], config: MeasurementConfig, seed: int
-) -> bool:
+def _measures(data: _Steps, dimension: int, without: Collection[int], seed: int) -> bool:
     """Whether a dimension measures the reward; the columns `without` are excluded from the rest."""
     from sklearn.ensemble import HistGradientBoostingRegressor  # takes a second to import
 
@@ -208,34 +185,34 @@ def _measures(
     alone = np.square(values[held_out] - values[~held_out].mean(dtype=np.float64))
     variance = max(float(alone.mean()), 1e-12)
 
-    def explain(inputs: Float32Array) -> Float64Array:
-        """Share (B,) of the variance that the inputs explain of held-out steps."""
+    def explain(columns: Float32Array) -> Float64Array:
+        """Share (B,) of the variance that columns explain of held-out steps."""
         model = HistGradientBoostingRegressor(
-            learning_rate=config.learning_rate,
-            max_iter=config.trees,
-            max_leaf_nodes=config.leaves,
+            learning_rate=_LEARNING_RATE,
+            max_iter=TREES,
+            max_leaf_nodes=_LEAVES,
             early_stopping=True,
             n_iter_no_change=_PATIENCE,
             random_state=seed,
         )
-        model.fit(inputs[~held_out], values[~held_out])
-        errors = np.square(values[held_out] - model.predict(inputs[held_out]))
+        model.fit(columns[~held_out], values[~held_out])
+        errors = np.square(values[held_out] - model.predict(columns[held_out]))
         return np.asarray((alone - errors) / variance)
 
     def is_explained(shares: Float64Array) -> bool:
-        p_value = clustered_p_value(torch.from_numpy(shares), data.episodes[held_out])
-        return bool(shares.mean() >= config.min_explained) and p_value < config.level
+        p_value = compute_p_value(torch.from_numpy(shares), data.episodes[held_out])
+        return bool(shares.mean() >= _MIN_EXPLAINED) and p_value < _LEVEL
 
     # The cheapest first: most dimensions fail one of these.
     by_reward = explain(data.rewards)
     if not is_explained(by_reward):
         return False
-    rest = np.column_stack([np.delete(data.columns, [dimension, *without], axis=1), data.rest])
-    by_rest = explain(rest)
+    inputs = np.column_stack([np.delete(data.columns, [dimension, *without], axis=1), data.rest])
+    by_rest = explain(inputs)
     if not is_explained(by_rest) or by_reward.mean() < by_rest.mean():
         return False
-    by_both = explain(np.column_stack([rest, data.rewards]))
-    return bool(by_both.mean() - by_reward.mean() <= config.most_added * by_rest.mean())
+    by_both = explain(np.column_stack([inputs, data.rewards]))
+    return bool(by_both.mean() - by_reward.mean() <= _MOST_ADDED * by_rest.mean())
 
 
 def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntArray, IntArray]:
@@ -248,11 +225,7 @@ def steps_with_successor(view: EpisodeStore, most: int, seed: int) -> tuple[IntA
 
 
 def held_out_steps(train: EpisodeStore, episodes: IntArray) -> BoolArray:
-    """Which steps are held out: those of every fifth episode.
-
-    Args:
-        train: a view of the training episodes.
-        episodes: (N,) of which episode each step is.
+    """Which steps (N,) are held out, given their episodes (N,): those of every fifth.
 
     Raises:
         InputError: there are too few episodes to hold some out.
@@ -272,13 +245,9 @@ def standardise(values: Tensor) -> Tensor:
     return ((values - mean) / torch.where(std > 1e-6, std, 1.0)).clamp(-CLIP, CLIP)
 
 
-def clustered_p_value(differences: Tensor, episodes: IntArray) -> float:
-    """Of a mean of at most 0, one-sided, where whole episodes (not steps) are independent.
-
-    Args:
-        differences: (B,).
-        episodes: (B,) of which episode each is.
-    """
+def compute_p_value(differences: Tensor, episodes: IntArray) -> float:
+    """Of a mean of at most 0, one-sided, of differences (B,) of steps whose whole episodes (B,) are
+    independent."""
     from scipy import stats  # takes long to import
 
     _, cluster = np.unique(episodes, return_inverse=True)

@@ -38,7 +38,7 @@ class Likeness(nn.Module):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget what was computed from the tags."""
+        """Clear what was computed from the tags."""
         self._matrix: Tensor | None = None
         self._n_tags: int | None = None
         self._sets: tuple[Tensor, Tensor] | None = None
@@ -71,12 +71,8 @@ class Likeness(nn.Module):
         return self._n_tags
 
     def profile(self, items: Tensor, weights: Tensor) -> Tensor:
-        """The weighted sum (M, F) of the tags or directions of items (M, N), −1 for none.
-
-        Args:
-            items: (M, N) int64.
-            weights: (M, N).
-        """
+        """The sum (M, F), weighted by (M, N), of the tags or directions of items (M, N), −1 for
+        none."""
         weights = weights.masked_fill(items < 0, 0.0)
         if not self.tags.shape[1]:
             profile = torch.einsum("mn,mnf->mf", weights, self.directions[items])
@@ -98,12 +94,8 @@ class Likeness(nn.Module):
         return profile @ matrix.T
 
     def added_to(self, values: Tensor, profile: Tensor, items: Tensor | None = None) -> Tensor:
-        """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`.
-
-        Args:
-            profile: see `profile`.
-            items: (L,) int64; None for all items.
-        """
+        """`values` (M, L), which are overwritten, plus the likeness to profiles (M, F) of `items`
+        (L,) int64; None for all items."""
         # Scores are float32, whatever the network computes in.
         with torch.autocast(values.device.type, enabled=False):
             if not self.tags.shape[1]:
@@ -228,12 +220,8 @@ class ExposureTerm(nn.Module):
         return repeated + repeated_liked * liked, alike + alike_liked * liked
 
     def added_to(self, logits: Tensor, exposed: Exposed, items: Tensor | None = None) -> Tensor:
-        """Logits (M, L) of `items` with the term; the given ones are overwritten.
-
-        Args:
-            exposed: what was shown before the M steps.
-            items: (L,) int64, ascending, each once; None for all items.
-        """
+        """Logits (M, L) with the term, which are overwritten, of `items` (L,) int64, ascending,
+        each once; None for all items."""
         repeated, alike = self.weights(exposed)
         profile = self.likeness.profile(exposed.items, alike)
         logits = self.likeness.added_to(logits, profile, items)
@@ -249,12 +237,7 @@ class ExposureTerm(nn.Module):
 
 
 def quantiles(values: Float32Array, levels: Float64Array) -> Float64Array:
-    """`np.quantile` of the values in float64, without a copy of all of them in float64.
-
-    Args:
-        values: (N,), at least one.
-        levels: (L,) 0 to 1.
-    """
+    """`np.quantile` in float64 of one value or more, without a copy of all of them in float64."""
     places = levels * (len(values) - 1)
     below = np.floor(places).astype(np.int64)
     above = np.minimum(below + 1, len(values) - 1)

@@ -1,13 +1,11 @@
 """Items without torch, which preparing a log does not need: numbers, and the file of states."""
 
 import json
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-import xxhash
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
@@ -35,14 +33,8 @@ def write_item_table(
     reward_high: float,
     tags: IntArray | None,
 ) -> None:
-    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically.
-
-    Args:
-        embeddings: (n_items, D).
-        user_features: (n_users, F).
-        reward_low: see `ItemStates`.
-        reward_high: see `ItemStates`.
-        tags: (n_items, T); None for none.
+    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically; arguments
+    are its fields, with None for no tags.
 
     Raises:
         InputError: the disk is full, or the folder is not writable.
@@ -53,31 +45,17 @@ def write_item_table(
     if tags is not None and tags.shape[1]:
         arrays["tags"] = tags
     plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    metadata = json.dumps(numbers)
     with atomic_file(path) as scratch:
         scratch.touch()
         mode = scratch.stat().st_mode
         try:
-            save_file(
-                plain, scratch, metadata={"about": f"{metadata}\n{_checksum(plain, metadata)}"}
-            )
+            save_file(plain, scratch, metadata={"about": json.dumps(numbers)})
             # safetensors restricts its files to their owner; give them the usual permissions.
             scratch.chmod(mode)
         except SafetensorError as error:
             raise InputError(
                 f"{path} cannot be written ({error}); free disk space and run the command again"
             ) from None
-
-
-def _checksum(arrays: Mapping[str, Array], metadata: str) -> str:
-    """The checksum that `ucfrec.fitting.checkpoint.load_tensors` verifies."""
-    digest = xxhash.xxh3_64(metadata.encode())
-    for name in sorted(arrays):
-        array = arrays[name]
-        digest.update(f"\n{name} torch.{array.dtype.name} {list(array.shape)}\n".encode())
-        if array.size:
-            digest.update(array.reshape(-1).view(np.uint8).data)
-    return digest.hexdigest()
 
 
 class IdLookup:

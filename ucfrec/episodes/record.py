@@ -144,7 +144,7 @@ class StoreRecord(Record):
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
-        """See `Record.of`; entries of a newer version are not looked at."""
+        """See `Record.of`."""
         version = value.get("version")
         if type(version) is int and version > schema.STORE_VERSION:
             raise InputError(

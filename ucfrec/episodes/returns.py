@@ -61,35 +61,28 @@ class ReturnToGo:
         return np.asarray(ahead < reach, dtype=np.float64)
 
     def of_logs(self, rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
-        """Returns-to-go of logged episodes.
+        """Returns-to-go (N,) of logged episodes; summed in float64, rounded to float32.
 
         Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5] for `session`.
 
         Args:
             rewards: (N,) rewards of all episodes, concatenated.
             offsets: (E + 1,) index of the first step of each episode, followed by N.
-
-        Returns:
-            (N,) in reward units; summed in float64, rounded to float32.
         """
         if self.definition == "discounted":
-            return _discounted(rewards, offsets, self.discount)
-        before = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
+            return _discount(rewards, offsets, self.discount)
+        sums = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])  # (N + 1,)
         lengths, steps = np.diff(offsets), np.arange(len(rewards))
         ends = np.repeat(offsets[1:], lengths)
         if self.definition == "horizon":
             return np.asarray(
-                before[np.minimum(steps + self.horizon, ends)] - before[:-1], dtype=np.float32
+                sums[np.minimum(steps + self.horizon, ends)] - sums[:-1], dtype=np.float32
             )
-        return _rest(before, offsets)
+        return _rest(sums, offsets)
 
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
-        """Target returns at the next step, (B,) float64, in reward units.
-
-        Args:
-            target: of the session if `per_session`, otherwise of every step.
-            collected: (B,) sum of the rewards earlier in the session.
-        """
+        """Target returns (B,) float64 at the next step, in reward units, of a `target` of the
+        session if `per_session`, otherwise of every step; `collected` (B,) before it."""
         # Checking a log needs this module, but not the seconds that importing torch takes.
         import torch
 
@@ -97,17 +90,11 @@ class ReturnToGo:
         return whole - collected if self.per_session else whole
 
     def before(self, targets: "Tensor", rewards: "Tensor") -> "Tensor":
-        """Returns-to-go of all steps of a window, given the target return at its last step.
+        """Returns-to-go (B, K) float32 of windows with target returns (B,) at their last steps.
 
         Earlier steps count the rewards that followed them, then the target return: the numbers that
-        training would show if the rest of the session returned exactly that.
-
-        Args:
-            targets: (B,) at the last step.
-            rewards: (B, K) of the windows' steps, 0 at padding; the last column is not used.
-
-        Returns:
-            (B, K) float32.
+        training would show if the rest of the session returned exactly that. The last column of the
+        rewards (B, K), 0 at padding, is not used.
         """
         import torch
 
@@ -141,15 +128,15 @@ def returns_in_parts(
     rewards: npt.NDArray[np.floating], offsets: IntArray, steps: int
 ) -> Iterator[Float32Array]:
     """The same numbers as `returns_to_go`, in parts of about `steps` steps, to save memory."""
-    begin, before = 0, 0.0
+    begin, total = 0, 0.0
     while begin < len(offsets) - 1:
         end = int(np.searchsorted(offsets, offsets[begin] + steps))
         end = min(max(end, begin + 1), len(offsets) - 1)
         part = rewards[offsets[begin] : offsets[end]].astype(np.float64)
         # Sums go on where those of the part before ended, so that they round alike.
-        sums = np.cumsum(np.concatenate([[before], part]))
+        sums = np.cumsum(np.concatenate([[total], part]))
         yield _rest(sums, offsets[begin : end + 1] - offsets[begin])
-        begin, before = end, float(sums[-1])
+        begin, total = end, float(sums[-1])
 
 
 def _rest(sums: Float64Array, offsets: IntArray) -> Float32Array:
@@ -160,7 +147,7 @@ def _rest(sums: Float64Array, offsets: IntArray) -> Float32Array:
     return np.asarray(totals - collected, dtype=np.float32)
 
 
-def _discounted(
+def _discount(
     rewards: npt.NDArray[np.floating], offsets: IntArray, discount: float
 ) -> Float32Array:
     """Discounted suffix sums, for all episodes at once, one step from their ends at a time."""

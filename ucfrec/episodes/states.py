@@ -97,18 +97,14 @@ class ItemStates:
     def build(
         self, items: Tensor, rewards: Tensor, steps: Tensor, users: Tensor, observations: Tensor
     ) -> Tensor:
-        """States just before K consecutive steps of each of B sessions.
+        """States (B, K, S) just before K consecutive steps of each of B sessions.
 
         Args:
             items: (B, K + window − 1) int64 items shown before the last of the steps, the latest
-                last; −1 before the session began.
-            rewards: (B, K + window − 1) rewards of those items.
+                last, with their `rewards`; −1 before the session began.
             steps: (B, K) int64 number of each step in its session, from 0.
             users: (B,) int64 rows of `user_features`; −1 for an unknown user.
             observations: (B, K, O) observations logged with the steps; O may be 0.
-
-        Returns:
-            (B, K, S) float32.
         """
         table: Tensor = self._items  # type: ignore[attr-defined]
         batch, length = steps.shape
@@ -175,15 +171,7 @@ def least_liked(low: _Reward, high: _Reward) -> _Reward:
 
 
 def liked_rewards(store: "EpisodeStore", rewards: Array) -> BoolArray:
-    """Whether steps were liked: their reward is at least `least_liked`.
-
-    Args:
-        store: a view of a store of items.
-        rewards: (N,) of some of its steps.
-
-    Returns:
-        (N,) bool.
-    """
+    """Whether steps (N,) of a store of items were liked: their reward is at least `least_liked`."""
     states = store.item_states
     return np.asarray(rewards >= least_liked(states.reward_low, states.reward_high))
 
@@ -206,11 +194,11 @@ class TrainingCounts:
         liked_of: Callable[["EpisodeStore", Array], BoolArray] = liked_rewards,
     ) -> "TrainingCounts":
         """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`."""
-        shown, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
+        impressions, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
         for items, rewards in train.column_batches(schema.ITEM, schema.REWARD):
-            shown += np.bincount(items, minlength=len(shown))
+            impressions += np.bincount(items, minlength=len(impressions))
             liked += np.bincount(items[liked_of(train, rewards)], minlength=len(liked))
-        return cls(torch.from_numpy(shown), torch.from_numpy(liked), train.n_episodes)
+        return cls(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically."""

@@ -242,9 +242,9 @@ class EpisodeStore(EpisodeView):
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
         """A view of the same episodes without some dimensions of the observations, 0 to O − 1."""
-        rest = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        column = self._columns.step_column(schema.OBSERVATION).select_dimensions(rest)
-        columns = self._columns.replace(schema.OBSERVATION, column, (len(rest),), None)
+        remaining = np.setdiff1d(np.arange(self.observation_size), dimensions)
+        column = self._columns.step_column(schema.OBSERVATION).select_dimensions(remaining)
+        columns = self._columns.replace(schema.OBSERVATION, column, (len(remaining),), None)
         return EpisodeStore(columns, self._selected)
 
     @cached_property
@@ -335,7 +335,7 @@ class UserRows:
         items = self.values(schema.ITEM, first[owner] + inside).astype(np.int64)
         return owner[items >= 0], items[items >= 0]
 
-    def continued(self, gap_ms: float | None) -> EpisodeStore:
+    def continue_sessions(self, gap_ms: float | None) -> EpisodeStore:
         """The later log, with the rows before it in the sessions that go on in it.
 
         These rows are known but are not steps of the view: `all_steps` leaves them out.

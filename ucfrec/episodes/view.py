@@ -34,11 +34,7 @@ class StepColumn:
     """A step column, indexed across its shards."""
 
     def __init__(self, parts: list[Array], dimensions: IntArray | None = None) -> None:
-        """
-        Args:
-            parts: one a shard, (M,) or (M, size).
-            dimensions: that values have, of the size; None for all.
-        """
+        """Parts are one a shard, (M,) or (M, size); values have some `dimensions` of it, or all."""
         self.parts, self._dimensions = parts, dimensions
         self._bounds = np.cumsum([0] + [len(part) for part in parts])
 
@@ -100,6 +96,8 @@ class Columns:
         self._arrays, self._given_states = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
+        self.has_items = schema.ITEM in record.columns
+        self.observation_size = int((record.columns.get(schema.OBSERVATION) or [0])[0])
         self.skipped: IntArray | None = None
         """(E,) number of steps at the beginning of each episode that are known but do not count;
         None for none."""
@@ -123,11 +121,7 @@ class Columns:
         episodes: Mapping[str, Array],
         item_states: ItemStates | None,
     ) -> "Columns":
-        """See `EpisodeStore.from_arrays`; `episodes` must include `split`.
-
-        Raises:
-            InputError: columns differ in length.
-        """
+        """See `EpisodeStore.from_arrays`; `episodes` must include `split`."""
         offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         dtypes = schema.STEP_DTYPES | schema.EPISODE_DTYPES
         arrays = {
@@ -181,30 +175,16 @@ class Columns:
     @cached_property
     def lengths(self) -> IntArray:
         """(E,) number of steps of each episode."""
-        lengths = []
-        for offsets in self._parts(schema.OFFSETS):
+        parts, record = self._parts(schema.OFFSETS), self.record
+        for offsets in parts:
             if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
-                raise self._damaged(schema.OFFSETS, "do not ascend from 0")
-            lengths.append(np.diff(offsets))
-        joined = np.concatenate(lengths)
-        counted, expected = joined.sum(), (self.record.n_episodes, self.record.n_steps)
-        if (len(joined), counted) != expected:
-            raise self._damaged(
-                schema.OFFSETS,
-                f"have {len(joined)} episodes of {counted} steps, not {expected[0]} of "
-                f"{expected[1]}",
-            )
-        return joined
-
-    @cached_property
-    def has_items(self) -> bool:
-        """Whether actions are items of a catalogue; otherwise they are vectors."""
-        return schema.ITEM in self.record.columns
-
-    @cached_property
-    def observation_size(self) -> int:
-        """O, size of the logged observation; 0 if none was logged."""
-        return int((self.record.columns.get(schema.OBSERVATION) or [0])[0])
+                raise self._explain_damage(schema.OFFSETS, "do not ascend from 0")
+        lengths = np.concatenate([np.diff(offsets) for offsets in parts])
+        episodes, steps = len(lengths), int(lengths.sum())
+        if (episodes, steps) != (record.n_episodes, record.n_steps):
+            fault = f"have {episodes} episodes of {steps} steps, not {record.n_episodes} of "
+            raise self._explain_damage(schema.OFFSETS, f"{fault}{record.n_steps}")
+        return lengths
 
     @cached_property
     def item_states(self) -> ItemStates:
@@ -246,9 +226,11 @@ class Columns:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
         values = np.concatenate(parts)
         if len(values) != self.record.n_episodes:
-            raise self._damaged(name, f"has {len(values)} of {self.record.n_episodes} episodes")
+            raise self._explain_damage(
+                name, f"has {len(values)} of {self.record.n_episodes} episodes"
+            )
         if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
-            raise self._damaged(name, "has numbers that are not a split")
+            raise self._explain_damage(name, "has numbers that are not a split")
         return values
 
     def step_column(self, name: str) -> StepColumn:
@@ -262,14 +244,16 @@ class Columns:
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
             column = StepColumn(self._parts(name, mmap=True))
             if len(column) != self.record.n_steps:
-                raise self._damaged(name, f"has {len(column)} of {self.record.n_steps} steps")
+                raise self._explain_damage(
+                    name, f"has {len(column)} of {self.record.n_steps} steps"
+                )
             if name == schema.ITEM and name not in self._arrays and self.has_item_states:
                 low = min(part.min() for part in column.parts)
                 high = max(part.max() for part in column.parts)
                 items = len(self.item_states.embeddings)
                 if not -1 <= low <= high < items:
                     fault = f"has items from {low} to {high}, there are {items}"
-                    raise self._damaged(name, fault)
+                    raise self._explain_damage(name, fault)
             self._steps[name] = column
         return self._steps[name]
 
@@ -302,14 +286,9 @@ class Columns:
         return parts
 
     def states(self, episodes: IntArray, steps: IntArray) -> Tensor:
-        """The logged states before the given steps.
+        """The states (B, K, S) before steps (B, K) of episodes with numbers (B,) in the store.
 
-        Args:
-            episodes: (B,) numbers in the store.
-            steps: (B, K) steps of those episodes, consecutive in each row; may be below 0.
-
-        Returns:
-            (B, K, S) float32; undefined at steps below 0.
+        Steps are consecutive in each row; of those below 0, states are undefined.
         """
         index = self.starts[episodes][:, None] + np.maximum(steps, 0)
         observations = torch.zeros(*steps.shape, 0)
@@ -334,7 +313,7 @@ class Columns:
             observations,
         )
 
-    def _damaged(self, name: str, fault: str) -> InputError:
+    def _explain_damage(self, name: str, fault: str) -> InputError:
         return InputError(f"{self.path} is damaged: column {name!r} {fault}; {StoreRecord.REMEDY}")
 
 
@@ -343,10 +322,7 @@ class EpisodeView:
     0 to E − 1."""
 
     def __init__(self, columns: Columns, episode_ids: IntArray | None = None) -> None:
-        """
-        Args:
-            episode_ids: (E,) numbers in the store of the view's episodes; None for all.
-        """
+        """Episodes have the numbers `episode_ids` (E,) in the store; None for all."""
         self._columns, self._selected = columns, episode_ids
         self.path, self.record = columns.path, columns.record
         """The store folder, and the content of its `meta.json`."""
@@ -448,14 +424,8 @@ class EpisodeView:
         return self.step_values(schema.RETURN_TO_GO, episodes, np.zeros_like(episodes))
 
     def step_values(self, name: str, episodes: IntArray, steps: IntArray) -> Array:
-        """Values of a step column at the given steps.
-
-        Args:
-            episodes: positions in the view, of any shape.
-            steps: steps of those episodes, from 0, of a shape that broadcasts with `episodes`.
-
-        Returns:
-            Values of the broadcast shape, followed by the size of a vector.
+        """Values of a step column at steps (from 0) of episodes, two arrays whose shapes broadcast;
+        of this shape, followed by the size of a vector.
 
         Raises:
             InputError: the store has no such column, or its files are damaged.
@@ -464,23 +434,14 @@ class EpisodeView:
         return self._columns.step_column(name).take(index)
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
-        """(B,) sum of the rewards of the session before each step, in reward units.
-
-        Args:
-            episodes: (B,) positions in the view.
-            steps: (B,) steps of those episodes, from 0.
-        """
+        """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""
         owner, earlier_steps = _list_earlier(steps)
         rewards = self.step_values(schema.REWARD, episodes[owner], earlier_steps)
         return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
 
     def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
-        """(rows, items), each (M,): the items that sessions showed before the given steps.
-
-        Args:
-            episodes: (B,) positions in the view.
-            steps: (B,) steps of those episodes, from 0; `rows` are indices into the B.
-        """
+        """(rows, items), each (M,): the items that sessions (B,) showed before steps (B,); rows are
+        indices into the B."""
         owner, earlier_steps = _list_earlier(steps)
         return owner, self.step_values(schema.ITEM, episodes[owner], earlier_steps).astype(np.int64)
 
@@ -582,14 +543,10 @@ class EpisodeView:
         return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps with their next states.
-
-        Args:
-            episodes: (M,) positions in the view.
-            steps: (M,) steps of those episodes, from 0.
+        """Single steps (M,) of episodes (M,), with their next states.
 
         Raises:
-            InputError: an episode or step does not exist, or the arguments have other shapes.
+            InputError: as `windows`.
         """
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1

@@ -140,14 +140,8 @@ class Shown(NamedTuple):
     def before(
         cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, length: int
     ) -> "Shown":
-        """What sessions of a store showed in the `length` steps before the given ones.
-
-        Args:
-            store: of items; an unknown item (−1) counts as the first.
-            episodes: (B,) sessions.
-            steps: (B,) steps of them, from 0.
-            length: N.
-        """
+        """What sessions (B,) of a store of items showed in the N = `length` steps before steps
+        (B,). An unknown item (−1) counts as the first."""
         earlier = steps[:, None] - np.arange(1, length + 1)
         missing, places = earlier < 0, (episodes[:, None], np.maximum(earlier, 0))
         items = store.step_values(schema.ITEM, *places).clip(min=0).astype(np.int64)
@@ -232,13 +226,7 @@ class Sessions:
 
     @classmethod
     def begun(cls, count: int, length: int, vector_size: int = 0) -> "Sessions":
-        """Sessions of unknown users without a step.
-
-        Args:
-            count: B.
-            length: L.
-            vector_size: A; 0 for items.
-        """
+        """B = `count` sessions of unknown users without a step; of items, if A is 0."""
         actions = torch.full((count, length), -1)
         if vector_size:
             actions = torch.zeros(count, length, vector_size)
@@ -287,13 +275,11 @@ class Sessions:
     def from_store(
         cls, store: "EpisodeStore", episodes: IntArray, steps: IntArray, context: int, length: int
     ) -> "Sessions":
-        """What was known before steps of a store of items.
+        """What was known before steps (B,) of sessions (B,) of a store of items.
 
         Args:
             store: the logs, with the training's items. An item −1 is unknown; any known item can
                 replace it, because steps after it have weight 0 in all estimates.
-            episodes: (B,) sessions.
-            steps: (B,) steps of those sessions, from 0.
             context: K, most states that are read.
             length: L, items that are read one by one; as many as the context has in any case.
         """
@@ -322,7 +308,7 @@ class Sessions:
         for values in (self.rewards, self.steps, self.collected):
             values[rows] = 0
 
-    def with_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
+    def add_step(self, actions: Tensor, rewards: Tensor) -> "Sessions":
         """The sessions after one more step: actions (B,) or (B, A), and their rewards (B,)."""
         received = rewards.float()  # rounded like the store's, for bit-identical states
         return replace(
@@ -429,9 +415,9 @@ class AugmentedEpisodes:
             f"{size}, {len(self.action_source):,} action copies)"
         )
 
-    def join(self, other: "AugmentedEpisodes") -> "AugmentedEpisodes":
-        """These episodes, followed by those of `other`."""
-        renumbered = replace(other, edit_copy=other.edit_copy + len(self.copy_source))
+    def join(self, episodes: "AugmentedEpisodes") -> "AugmentedEpisodes":
+        """These episodes, followed by others."""
+        renumbered = replace(episodes, edit_copy=episodes.edit_copy + len(self.copy_source))
         values = {}
         for name in (column.name for column in fields(self)):
             parts = [getattr(self, name), getattr(renumbered, name)]
@@ -459,13 +445,8 @@ class AugmentedEpisodes:
 
     def _require_of(self, store: "EpisodeStore") -> None:
         """Raise ValueError for arrays whose types, shapes and numbers are not of one store."""
-        numbers = {
-            **{"copy_source": self.copy_source, "edit_copy": self.edit_copy},
-            **{"edit_step": self.edit_step, "action_source": self.action_source},
-            "action_step": self.action_step,
-        }
-        for name, values in numbers.items():
-            if values.dtype != np.int64 or values.ndim != 1:
+        for name in ("copy_source", "edit_copy", "edit_step", "action_source", "action_step"):
+            if getattr(self, name).dtype != np.int64 or getattr(self, name).ndim != 1:
                 raise ValueError(f"{name} is no list of int64")
         edits, copies = len(self.edit_copy), len(self.action_source)
         if len(self.edit_step) != edits or self.edit_state.shape != (edits, store.state_size):
@@ -480,6 +461,9 @@ class AugmentedEpisodes:
         lengths = store.whole.lengths
         _require_below(self.edit_step, lengths[self.copy_source[self.edit_copy]], "a step")
         _require_below(self.action_step, lengths[self.action_source], "a step")
+        copy_changes = np.diff(self.edit_copy)
+        if (copy_changes < 0).any() or (np.diff(self.edit_step)[copy_changes == 0] <= 0).any():
+            raise ValueError("its edits are not in order")
         shape = () if store.has_items else tuple(store.record.columns[schema.ACTION])
         kind = np.int64 if store.has_items else np.float32
         if copies and (self.action.dtype != kind or self.action.shape != (copies, *shape)):

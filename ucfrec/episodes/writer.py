@@ -221,7 +221,7 @@ def reward_bit(
     return np.asarray(high ^ flipped, dtype=np.float32)
 
 
-def with_observations(
+def write_observations(
     store: "EpisodeStore",
     out: Path,
     observations: Float32Array,
@@ -257,7 +257,7 @@ def with_observations(
     return type(store).open(out)
 
 
-def logged_observations(store: "EpisodeStore") -> Float32Array:
+def read_observations(store: "EpisodeStore") -> Float32Array:
     """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
     if not store.observation_size:
         return np.zeros((store.n_steps, 0), dtype=np.float32)

@@ -1,7 +1,7 @@
 """Simulate a behavior policy in a simulator and write its sessions as Parquet logs."""
 
 from pathlib import Path
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -12,38 +12,19 @@ from gymnasium.vector import VectorEnv
 from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.evaluation.simulator import Environment, Simulator
+from ucfrec.evaluation.simulator import Catalog, Environment, Simulator, environment_items
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.processes import random_state_kept
-from ucfrec.provenance import versions
+from ucfrec.processes import random_state_kept, versions
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000
 """Start of the first session, 2024-01-01 00:00 UTC, in ms."""
 SESSION_MS: Final = 60_000
-"""Time between the starts of two sessions, in ms."""
+"""Between the starts of two sessions."""
 STEP_MS: Final = 1_000
-"""Time between two steps of a session, in ms."""
+"""Between two steps of a session."""
 ROWS_PER_GROUP: Final = 65_536
 """Rows of a Parquet row group, at least, but for the last."""
-
-
-@runtime_checkable
-class Catalog(Protocol):
-    """A simulated environment with a table of its items."""
-
-    def item_features(self) -> pa.Table:
-        """One row per item in the order of the action indices, with a column `item_id`."""
-
-
-def environment_items(env: VectorEnv[Any, Any, Any]) -> IntArray:
-    """Identifiers (n_items,) of an environment's items in logs: those of its catalogue, or
-    indices."""
-    environment = env.unwrapped
-    if isinstance(environment, Catalog):
-        return np.asarray(environment.item_features()[ITEM_ID], dtype=np.int64)
-    assert isinstance(env.single_action_space, spaces.Discrete)
-    return np.arange(int(env.single_action_space.n))
 
 
 @random_state_kept()

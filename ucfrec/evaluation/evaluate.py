@@ -1,46 +1,48 @@
-"""Evaluate policies in simulated environments."""
+"""Evaluate policies in simulated environments: returns of sessions, and coverage, diversity,
+novelty and dominance of the items recommended (EasyRL4Rec, DORL)."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Actor, Episodes, rollout
-from ucfrec.arrays import IntArray
+from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
+from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.errors import InputError
-from ucfrec.evaluation.collect import environment_items
-from ucfrec.evaluation.diversity import Recommended, variety_columns
-from ucfrec.evaluation.simulator import Environment
-from ucfrec.processes import random_state_kept
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.evaluation.simulator import COLUMNS, Catalog, Environment, environment_items
+from ucfrec.processes import config_hash, provenance, random_state_kept
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "evaluate"
 """Suite of the rows."""
-SIDE_BY_SIDE = 512
+SIDE_BY_SIDE: Final = 512
 """Largest number of episodes simulated in parallel."""
+TAGS: Final = "tags"
+"""Catalogue column with the list of each item's tags."""
+ONE_HOT: Final = "tag_"
+"""Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
+Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
+"""Similarity (M,) of two aligned arrays of items (M,), at most 1; equal items have 1."""
 
 
 @random_state_kept()
 def evaluate_behavior(
     environment: Environment, behavior: str, episodes: int, seed: int
 ) -> ResultRow:
-    """Result row of an environment's built-in policy (`random`, `optimal`, …).
-
-    Args:
-        seed: seed of the environments and of the policy.
-
-    Raises:
-        InputError: the environment has no policy of that name.
-    """
+    """Result row of an environment's built-in policy (`random`, `optimal`, …); InputError if it has
+    none of that name. The seed is that of the environments and of the policy."""
     simulator = environment.simulator()
     if behavior not in simulator.behaviors:
         names = ", ".join(simulator.behaviors)
@@ -71,8 +73,7 @@ def evaluate_policy(
         InputError: the policy's actions or observations do not fit this environment.
     """
     env = environment.simulator().started(min(episodes, SIDE_BY_SIDE), environment.folder)
-    numbers = _item_numbers(environment, env, trained)
-    rule = rule or trained.rule
+    numbers, rule = _item_numbers(environment, env, trained), rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
     record = trained.record
     about = {
@@ -124,8 +125,7 @@ def _row(
 
 
 def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) -> IntArray | None:
-    """The environment's index of each item of the policy, −1 for items it lacks; None for
-    vectors."""
+    """The environment's index of each of the policy's items, −1 for none; None for vectors."""
     space, sizes = env.single_action_space, trained.record.sizes
     provided = int(np.prod(env.single_observation_space.shape))
     expected = trained.logged_observation_size
@@ -134,25 +134,22 @@ def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) ->
             f"the policy observes {expected} numbers, {environment.title} shows {provided}; "
             f"train it on logs of {environment.name}, collected with the same --observe"
         )
-    if not isinstance(space, spaces.Discrete):
-        if sizes["items"] or space.shape != (sizes["action"],):
-            raise _misfit(environment, f"vector actions of size {space.shape}")
-        return None
-    names = environment_items(env)
-    ids = trained.item_ids
-    if ids is None or ids.dtype.kind not in "iu":
-        raise _misfit(environment, f"{len(names)} items with whole numbers as {schema.ITEM_ID}")
-    numbers = IdLookup(names).numbers(ids)
-    if (numbers < 0).all():
-        raise _misfit(environment, f"items {names.min()} to {names.max()} as {schema.ITEM_ID}")
+    numbers, ids = None, trained.item_ids
+    if isinstance(space, spaces.Discrete):
+        names = environment_items(env)
+        takes = f"items {names.min()} to {names.max()} as {schema.ITEM_ID}"
+        if ids is not None and ids.dtype.kind in "iu":
+            numbers = IdLookup(names).numbers(ids)
+        fits = numbers is not None and bool((numbers >= 0).any())
+    else:
+        takes = f"vector actions of size {space.shape}"
+        fits = not sizes["items"] and space.shape == (sizes["action"],)
+    if not fits:
+        raise InputError(
+            f"{environment.name} takes {takes}, which the policy was not trained on; train it on "
+            f"logs of {environment.name}"
+        )
     return numbers
-
-
-def _misfit(environment: Environment, takes: str) -> InputError:
-    return InputError(
-        f"{environment.name} takes {takes}, which the policy was not trained on; train it on "
-        f"logs of {environment.name}"
-    )
 
 
 def session_metrics(played: Episodes) -> dict[str, float]:
@@ -171,3 +168,150 @@ def session_metrics(played: Episodes) -> dict[str, float]:
         "R_avg_episode": float((returns / lengths).mean()),
         "length": float(lengths.mean()),
     }
+
+
+@dataclass
+class Recommended:
+    """The recommended items of all episodes, collected by `rollout(…, on_step=self.record)`."""
+
+    _episodes: list[IntArray] = field(default_factory=list)
+    _items: list[IntArray] = field(default_factory=list)
+
+    def record(self, step: Step) -> None:
+        """Add one step."""
+        self._episodes.append(step.episodes)
+        self._items.append(step.actions)
+
+    def sessions(self) -> tuple[IntArray, IntArray]:
+        """Episode index (M,) and item (M,) of all steps, sorted by episode and then by step."""
+        episodes = np.concatenate(self._episodes)
+        order = np.argsort(episodes, kind="stable")
+        return episodes[order], np.concatenate(self._items)[order]
+
+
+def coverage(items: IntArray, n_items: int) -> float:
+    """CV: share of the `n_items` items of the catalogue that occur in `items` (M,)."""
+    return len(np.unique(items)) / n_items
+
+
+def coverage_per_turn(items: IntArray) -> float:
+    """CV_turn: number of distinct items in `items` (M,), divided by M."""
+    return len(np.unique(items)) / len(items)
+
+
+def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> float:
+    """Mean over episodes of the mean of 1 − similarity over pairs of steps; 1 for a single step.
+
+    `episodes` (M,) are sorted indices, `items` (M,) the items of these steps; M is at least 1.
+    """
+    _, starts, lengths = np.unique(episodes, return_index=True, return_counts=True)
+    # Pairs of all episodes are enumerated at once: each step with all later ones of its episode.
+    last = np.repeat(starts + lengths, lengths)
+    later = last - np.arange(len(items)) - 1
+    first = np.repeat(np.arange(len(items)), later)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
+    distances = 1.0 - similarity(items[first], items[second])
+    owner = np.searchsorted(starts, first, side="right") - 1
+    total = np.bincount(owner, weights=distances, minlength=len(starts))
+    pairs = lengths * (lengths - 1) / 2
+    return float(np.where(lengths > 1, total / np.maximum(pairs, 1), 1.0).mean())
+
+
+def tag_jaccard(incidence: BoolArray) -> Similarity:
+    """Jaccard similarity of two items' tags, from `incidence` (n_items, n_tags); 0 without tags."""
+
+    def similarity(first: IntArray, second: IntArray) -> npt.NDArray[np.floating]:
+        shared = (incidence[first] & incidence[second]).sum(axis=1)
+        either = (incidence[first] | incidence[second]).sum(axis=1)
+        return np.where(first == second, 1.0, shared / np.maximum(either, 1))
+
+    return similarity
+
+
+def novelty(items: IntArray, popularity: npt.NDArray[np.floating]) -> float:
+    """Mean of −ln(popularity) over recommended items (M,), in nats.
+
+    Popularity (n_items,) is interactions divided by users, at least one above 0; an item with 0
+    counts as the least popular item above 0.
+    """
+    lowest = popularity[popularity > 0].min()
+    return float(-np.log(np.maximum(popularity, lowest))[items].mean())
+
+
+def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8) -> BoolArray:
+    """Dominant tags (n_tags,): the most frequent ones that together cover at most `share`.
+
+    The most frequent one is always dominant, if it counts at all.
+
+    Args:
+        incidence: (n_items, n_tags).
+        positives: (n_items,) numbers of positive interactions in the training log; each counts
+            once for every tag of its item.
+    """
+    counts = positives @ incidence.astype(np.int64)
+    order = np.argsort(-counts, kind="stable")
+    covered = np.cumsum(counts[order]) / max(counts.sum(), 1)
+    frequent = covered <= share
+    frequent[:1] = True
+    dominant = np.zeros(len(counts), dtype=np.bool_)
+    dominant[order[frequent]] = True
+    return dominant & (counts > 0)
+
+
+def dominance(items: IntArray, incidence: BoolArray, dominant: BoolArray) -> float:
+    """MCD: share of recommended items (M,) that have a tag of `dominant_tags` (n_tags,), given the
+    incidence (n_items, n_tags)."""
+    return float(incidence[items][:, dominant].any(axis=1).mean())
+
+
+def variety_columns(
+    env: VectorEnv[Any, Any, Any],
+    recommended: Recommended,
+    counts: TrainingCounts | None = None,
+    numbers: IntArray | None = None,
+) -> dict[str, float | None]:
+    """The `COLUMNS`; a metric whose inputs are missing is None.
+
+    Diversity (tag Jaccard) and dominance need a catalogue with tags; novelty and dominance need
+    `counts` and `numbers`, which built-in policies do not have.
+
+    Args:
+        numbers: (items of the log,) the environment's index of each item, −1 for items that it
+            lacks.
+    """
+    episodes, items = recommended.sessions()
+    n_items = len(environment_items(env))
+    row: dict[str, float | None] = dict.fromkeys(COLUMNS)
+    row["coverage"] = coverage(items, n_items)
+    row["coverage_per_turn"] = coverage_per_turn(items)
+    incidence = _read_incidence(env)
+    if incidence is not None:
+        row["diversity"] = diversity(episodes, items, tag_jaccard(incidence))
+    if counts is None or numbers is None:
+        return row
+    shown, liked = (
+        np.bincount(numbers[numbers >= 0], counted.numpy()[numbers >= 0], n_items)
+        for counted in (counts.shown, counts.liked)
+    )
+    if shown.any():
+        row["novelty"] = novelty(items, shown / counts.episodes)
+    if incidence is not None and liked.any():
+        dominant = dominant_tags(incidence, liked.astype(np.int64))
+        row["majority_category_dominance"] = dominance(items, incidence, dominant)
+    return row
+
+
+def _read_incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
+    """Tags (n_items, n_tags) of the environment's catalogue; None if it has no tags."""
+    environment = env.unwrapped
+    table = environment.item_features() if isinstance(environment, Catalog) else pa.table({})
+    hot = [name for name in table.column_names if name.startswith(ONE_HOT)]
+    if hot:
+        return np.stack([np.asarray(table[name]) > 0 for name in hot], axis=1)
+    if TAGS not in table.column_names:
+        return None
+    column = table[TAGS].combine_chunks()
+    known, places = np.unique(np.asarray(column.flatten()), return_inverse=True)
+    incidence = np.zeros((len(column), len(known)), dtype=np.bool_)
+    incidence[np.repeat(np.arange(len(column)), np.diff(np.asarray(column.offsets))), places] = True
+    return incidence

@@ -48,7 +48,6 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     Args:
         env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
-        num_envs: N.
         observe: names of the entries of a dict observation that are observed.
 
     Raises:
@@ -98,15 +97,8 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
 
 class GymnasiumCatalog(GymnasiumEnvironment):
-    """A `GymnasiumEnvironment` of items that have features.
-
-    Args:
-        env_id, num_envs, observe: as for `GymnasiumEnvironment`.
-        items: reads the item table.
-
-    Raises:
-        InputError: as `GymnasiumEnvironment`, or the actions are vectors.
-    """
+    """A `GymnasiumEnvironment` of items that have features, which `items` reads; InputError also
+    where the actions are vectors."""
 
     def __init__(
         self, env_id: str, num_envs: int, items: Items, observe: Sequence[str] = ()
@@ -214,16 +206,13 @@ def _user(info: dict[str, Any]) -> dict[str, IntArray]:
 
 
 def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Table:
-    """The features of an environment's items.
+    """The features of an environment's items: one row per action, with the column `item_id`.
 
     `source` names a file (`.npy`, `.parquet`) or else an attribute of the environment, with dots
     for attributes of attributes. Row i of an array belongs to action i: numbers (n_items,) or
     (n_items, D) become the column `features`, booleans (n_items, D) the column `tags`, the list of
     the columns that are true. A Parquet file has a column `item_id` with the numbers of the
     actions, and its other columns are kept.
-
-    Returns:
-        One row per action in their order, with the column `item_id`: 0, 1, ….
 
     Raises:
         InputError: the file or attribute is missing, is of another kind or shape, or has numbers

@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from pandas.api.types import infer_dtype, is_list_like, is_numeric_dtype
 
-from ucfrec.arguments import require_whole
 from ucfrec.errors import InputError
 from ucfrec.results.statistics import group_auc
 from ucfrec.schema import ITEM_ID, USER_ID
+from ucfrec.settings import require_whole
 
 _RANK: Final = "rank"
 _PAIR: Final = [USER_ID, ITEM_ID]
@@ -106,11 +106,8 @@ def gauc(scored: pd.DataFrame) -> float:
 
 
 def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10) -> float:
-    """Share of the catalogue's items, each counted once, that are among the `k` best of a user.
-
-    Raises:
-        InputError: the catalogue is empty or lacks a recommended item.
-    """
+    """Share of the catalogue's items, each counted once, that are among the `k` best of a user;
+    InputError if it is empty or lacks a recommended item."""
     top = _top(recommended, k)
     return float(top[ITEM_ID].nunique() / _count_items(catalogue, top))
 

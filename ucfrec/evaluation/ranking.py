@@ -65,8 +65,7 @@ class LikedExpression:
         """
         Args:
             expression: a truth value over the column `reward`.
-            reward: the reward's expression in the run; where it is a column's name, that name means
-                the reward, too.
+            reward: the run's; where it is a column's name, that name means the reward, too.
         """
         self._expression = expression
         self._names = {schema.REWARD.casefold(): schema.REWARD}
@@ -155,10 +154,8 @@ class Steps:
     """Rows (M,) and items (M,) that may not be recommended; None to rank all items."""
 
     def windows(self, length: int) -> Windows:
-        """Windows of `length` steps that end with each evaluated step.
-
-        The last column contains the evaluated step's action and reward; rankers must not read them.
-        """
+        """Windows of `length` steps that end with each evaluated step, whose own action and reward,
+        in the last column, rankers must not read."""
         return self.store.windows(self.episodes, self.steps, length)
 
 
@@ -246,10 +243,8 @@ class Period:
 
     @property
     def item_rates(self) -> Float64Array:
-        """Share of each item's impressions in the period that were liked, (n_items,).
-
-        NaN for items that were never shown.
-        """
+        """Share (n_items,) of each item's impressions in the period that were liked; NaN for items
+        that were never shown."""
         shown = np.bincount(self.items, minlength=self.n_items)
         liked = np.bincount(self.items, self.liked, minlength=self.n_items)
         with np.errstate(invalid="ignore"):
@@ -275,16 +270,7 @@ resampled."""
 
 
 def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Float64Array]]:
-    """Every measure as numerators and denominators per user.
-
-    Args:
-        period: the N evaluated steps.
-        ranked: a ranker's results at these steps.
-
-    Returns:
-        By measure, (above, below), (U,) each, with one entry per user; the measure's value is
-        Σ above / Σ below.
-    """
+    """By measure, numerators and denominators (U,) per user; its value is Σ above / Σ below."""
     users, owner = np.unique(period.users, return_inverse=True)
     shown = ranked.top == period.items[:, None]
     hit = shown.any(axis=1)

@@ -1,13 +1,23 @@
-"""The table of `ucfrec rank`: policies of one store and baselines, on the same later steps."""
+"""The table of `ucfrec rank`: policies of one store, and baselines that are fitted on the same
+training rows, on the same later steps."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor
 
+from ucfrec import schema
+from ucfrec.acting.decision import DecisionRule
+from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
 from ucfrec.arrays import Array
-from ucfrec.episodes.states import TrainingCounts
+from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import (
@@ -18,18 +28,23 @@ from ucfrec.evaluation.ranking import (
     LikedByRange,
     Period,
     Ranker,
+    Steps,
     compare,
     name_rankers,
     rank_steps,
 )
-from ucfrec.evaluation.ranking_baselines import (
-    PolicyRanker,
-    RewardRanker,
-    baselines,
-    recent_rankers,
+from ucfrec.policies.baselines import (
+    ItemKNNConfig,
+    ItemKNNPolicy,
+    RecentClicksPolicy,
+    RecentRatePolicy,
+    count_decayed,
+    shrink_rates,
 )
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
+from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
+from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 SUITE: Final = "rank"
@@ -37,14 +52,193 @@ SUITE: Final = "rank"
 METRIC: Final = "hit_rate_liked"
 _OTHERWISE: Final = "hit_rate_shown"
 """Metric of rows on logs in which nothing is liked."""
+_KNN_HISTORY: Final = 20
+"""Latest rows of the user that item-kNN reads."""
+_ALS_FACTORS: Final = 32
+_Factors = Literal["als", "bpr"]
+
+
+class PolicyRanker:
+    """Ranks items as a trained policy does under its decision rule, before anything is drawn."""
+
+    def __init__(self, trained: TrainedPolicy, rule: DecisionRule | None = None) -> None:
+        self.name, self.trained, self._scorer = trained.name, trained, trained.scorer(rule)
+        self.rule = self._scorer.rule
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Log-probabilities at temperature 1 (B, n_items); see `Scorer.scores`."""
+        scores = logged_scores(
+            self._scorer, steps.store, steps.episodes, steps.steps, steps.left_out
+        )
+        return scores.log_softmax(-1).nan_to_num(nan=-torch.inf, neginf=-torch.inf)
+
+
+@dataclass(frozen=True)
+class RewardRanker:
+    """Ranks items by the run's reward model alone."""
+
+    scorer: Scorer
+    name: str = "reward model"
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Predicted rewards (B, n_items), in the model's units, up to a constant per step."""
+        sessions = sessions_before(self.scorer, steps.store, steps.episodes, steps.steps)
+        return self.scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
+
+
+@dataclass(frozen=True)
+class SameForAll:
+    """Ranks items by fixed scores, the same for all users."""
+
+    name: str
+    items: Tensor
+    """(n_items,) score of each item."""
+
+    def scores(self, steps: Steps) -> Tensor:
+        """The fixed scores (1, n_items)."""
+        return self.items.unsqueeze(0)
+
+
+class Random:
+    """Ranks items by uniform random scores."""
+
+    name = "random"
+
+    def __init__(self, n_items: int, seed: int) -> None:
+        self._n_items, self._generator = n_items, torch.Generator().manual_seed(seed)
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Scores (B, n_items), uniform in [0, 1)."""
+        return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
+
+
+class ItemNeighbours:
+    """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
+
+    See `ItemKNNPolicy`; the items are those of all the user's sessions, also before the log.
+    """
+
+    name = "item-knn"
+
+    def __init__(self, train: EpisodeStore, popularity: Tensor) -> None:
+        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
+        self._knn.start_from(train)
+        self._tie_break = 1e-6 * popularity / popularity.max()
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Scores (B, n_items)."""
+        items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
+        return self._knn.similarity(items, rewards) + self._tie_break
+
+
+class BoostedClicks:
+    """Ranks items by gradient-boosted clicks; see `BoostedPolicy`."""
+
+    name = "boosted clicks"
+
+    def __init__(self, train: EpisodeStore, seed: int) -> None:
+        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
+        self._policy = BoostedPolicy(config, policy_sizes(train))
+        self._policy.start_from(train)
+        self._policy.make_solver(train, None, Path(), seed)()
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Log-odds of a like (B, n_items)."""
+        return self._policy.act(steps.windows(_KNN_HISTORY + 1))
+
+
+class MatrixFactorisation:
+    """Factors of users and items from the users' liked items: ALS (Hu et al., 2008) or BPR (Rendle
+    et al., 2009); needs the package `implicit`."""
+
+    def __init__(
+        self,
+        name: _Factors,
+        train: EpisodeStore,
+        popularity: Tensor,
+        seed: int,
+        liked_of: Liked = liked_rewards,
+    ) -> None:
+        from implicit.als import AlternatingLeastSquares
+        from implicit.bpr import BayesianPersonalizedRanking
+        from threadpoolctl import threadpool_limits
+
+        self.name = name
+
+        users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
+        items = train.column(schema.ITEM)
+        liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
+        shape = (int(users.max()) + 1, len(popularity))
+        matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
+        matrix.eliminate_zeros()
+        kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
+        model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
+        with threadpool_limits(1, "blas"):
+            model.fit(matrix, show_progress=False)
+        # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
+        of_users = np.asarray(model.user_factors)
+        factors = np.vstack([of_users, np.zeros(of_users.shape[1])])
+        factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
+        self._users = torch.from_numpy(factors.astype(np.float32))
+        self._items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
+        self._tie_break = 1e-6 * popularity / popularity.max()
+
+    def scores(self, steps: Steps) -> Tensor:
+        """Scores (B, n_items)."""
+        known = np.where(steps.users < len(self._users) - 1, steps.users, -1)
+        return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
+
+
+def recent_rankers(
+    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_rewards
+) -> list[Ranker]:
+    """Clicks and click rate with half-lives, which the validation split of the store chooses."""
+    first, validation = store.split("train"), store.split("validation")
+    if not validation.n_episodes:
+        return []
+    rankers: list[Ranker] = []
+    for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
+        hours = kind.best_half_life(first, validation, liked_of)
+        scores = kind.scores_of(count_decayed(train, hours, liked_of))
+        rankers.append(SameForAll(f"recent {name}", scores.double()))
+    return rankers
+
+
+def baselines(
+    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_rewards
+) -> list[Ranker]:
+    """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
+    clicks, ALS and BPR.
+
+    ALS and BPR are included if the package `implicit` is installed (extra `rank`).
+
+    Args:
+        train: the training episodes; None if their store is unavailable, which excludes all that
+            learn from single rows.
+        seed: of the random scores, boosted clicks, ALS and BPR.
+        liked_of: says which training steps were liked, for ALS and BPR; `counts` has its own, and
+            boosted clicks those of the run.
+    """
+    shown, liked = counts.shown.double(), counts.liked.double()
+    rankers: list[Ranker] = [
+        Random(len(shown), seed),
+        SameForAll("most shown", shown),
+        SameForAll("most clicked", liked),
+        SameForAll("item click rate", shrink_rates(counts)),
+    ]
+    if train is not None:
+        rankers.append(ItemNeighbours(train, shown.float()))
+        rankers.append(BoostedClicks(train, seed))
+        if find_spec("implicit") is not None:
+            rankers += [
+                MatrixFactorisation(name, train, shown.float(), seed, liked_of)
+                for name in get_args(_Factors)
+            ]
+    return rankers
 
 
 def require_one_catalogue(trained: Sequence[TrainedPolicy]) -> None:
-    """Refuse runs that cannot be ranked side by side.
-
-    Raises:
-        InputError: the actions of a policy are vectors, or two were trained on different stores.
-    """
+    """Refuse runs that cannot be ranked side by side: policies of vectors, or of two stores."""
     for policy in trained:
         if policy.item_states is None or policy.counts is None:
             raise InputError(f"{policy.folder}: this policy has no items to rank")

@@ -4,15 +4,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
+import numpy as np
+
+from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
 from ucfrec.plugins import load_plugin
+from ucfrec.schema import ITEM_ID
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from gymnasium.vector import VectorEnv
 
     from ucfrec.acting.rollout import Actor
+
+COLUMNS = (
+    "coverage", "coverage_per_turn", "diversity", "novelty", "majority_category_dominance",
+)  # fmt: skip
+"""Metrics of the items that were recommended, where they can be measured."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +64,23 @@ class Simulator:
 
 GYMNASIUM: Final = "gymnasium:"
 """Start of the names of environments that are Gymnasium environments."""
+
+
+@runtime_checkable
+class Catalog(Protocol):
+    """A simulated environment with a table of its items."""
+
+    def item_features(self) -> "pa.Table":
+        """One row per item in the order of the action indices, with a column `item_id`."""
+
+
+def environment_items(env: "VectorEnv[Any, Any, Any]") -> IntArray:
+    """Identifiers (n_items,) of an environment's items in logs: of its catalogue, or indices."""
+    environment = env.unwrapped
+    if isinstance(environment, Catalog):
+        return np.asarray(environment.item_features()[ITEM_ID], dtype=np.int64)
+    space: Any = env.single_action_space
+    return np.arange(int(space.n))
 
 
 @dataclass(frozen=True)

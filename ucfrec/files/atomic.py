@@ -1,31 +1,50 @@
-"""Atomic files and folders, and JSON."""
+"""Atomic files and folders, claims on what only one process at a time may write, and JSON.
+
+A process that writes PATH holds a lock of the operating system (by `filelock`) on the file
+`.NAME.ucfrec-lock` beside it and writes to the scratch `.NAME.ucfrec-partial`. The system releases
+the lock when the process ends, also when it is killed; whoever gets the lock next knows that the
+scratch is dead, and removes it.
+"""
 
 import json
 import math
 import os
+import secrets
 import shutil
+import socket
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import xxhash
+from filelock import BaseFileLock, FileLock, Timeout
 
 from ucfrec.errors import InputError
-from ucfrec.files.locks import claim, lock_path, remove, remove_leftovers, scratch_of
 
-CHECKSUM: Final = "checksum"
-"""Entry of a JSON object with the checksum of its other entries; see `content_checksum`."""
+LOCK: Final = ".ucfrec-lock"
+SCRATCH: Final = ".ucfrec-partial"
+_CHECKSUM: Final = "checksum"
+"""Entry of a JSON object with the checksum of its other entries."""
+_PATIENCE: Final = 0.5
+"""Seconds before a claim is given up: another process may just be checking whether its owner is
+dead."""
+_FOREVER: Final = -1.0
+_COMMAND_LENGTH: Final = 160
 _LARGEST_JSON: Final = 2**30
 _LARGEST_TOML: Final = 2**24
+
+_held: set[tuple[int, Path]] = set()
+"""(process, path) of the claims that are held; a fork holds none of its parent's."""
 
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a scratch folder next to `path` that is renamed to `path` when the block succeeds.
 
-    If the block raises, the scratch folder is removed and `path` is not created. Scratch that
-    killed processes left next to `path` is removed.
+    If the block raises, the scratch folder is removed and `path` is not created.
 
     Raises:
         InputError: `path` exists already, or another process is writing it.
@@ -33,20 +52,65 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     _require_absent(path)
     with lock_path(path):
         _require_absent(path)
-        remove_leftovers(path.parent)
-        scratch = scratch_of(path)
-        remove(scratch)
-        scratch.mkdir()
-        try:
+        with _scratch_moved(path) as scratch:
+            scratch.mkdir()
             yield scratch
-            scratch.rename(path)
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _require_absent(path: Path) -> None:
     if os.path.lexists(path):
         raise InputError(f"{path} exists already; remove it or name another output folder")
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
+
+    If the block raises, the scratch file is removed and `path` keeps its old content. Of two
+    processes that write one file, the second waits for the first.
+
+    Raises:
+        InputError: `path` is a folder.
+    """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, a file is needed; name a file")
+    with claim(path, wait=True), _scratch_moved(path) as scratch:
+        yield scratch
+
+
+@contextmanager
+def _scratch_moved(path: Path) -> Iterator[Path]:
+    """The scratch of a claimed path, which becomes the path at the end."""
+    remove_leftovers(path.parent)
+    scratch = scratch_of(path)
+    _remove(scratch)
+    try:
+        yield scratch
+        scratch.replace(path)
+    finally:
+        _remove(scratch)
+
+
+@contextmanager
+def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Yield a new folder for scratch in `parent` that no other user can read; removed at the end.
+
+    If this process is killed, the next one that calls this or `remove_leftovers` removes it.
+    """
+    path = parent / f"{name}-{secrets.token_hex(8)}"
+    with lock_path(path):
+        remove_leftovers(parent)
+        scratch = scratch_of(path)
+        scratch.mkdir(mode=0o700)
+        try:
+            yield scratch
+        finally:
+            _remove(scratch)
+
+
+def scratch_of(path: Path) -> Path:
+    """Where the content of `path` is written before it is renamed; owned by whoever claims it."""
+    return path.with_name(f".{path.name}{SCRATCH}")
 
 
 def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None:
@@ -63,27 +127,121 @@ def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
+def claim(path: Path, wait: bool = False) -> Iterator[bool]:
+    """Try to hold the claim on `path`; a process that holds it already holds it again.
 
-    If the block raises, the scratch file is removed and `path` keeps its old content. Of two
-    processes that write one file, the second waits for the first. Scratch that killed processes
-    left next to `path` is removed.
+    Args:
+        path: need not exist; its folder is made if missing.
+        wait: wait until the claim is free, instead of giving up.
+
+    Yields:
+        Whether the claim is held; always true if `wait` is.
+    """
+    key = (os.getpid(), path.parent.resolve() / path.name)
+    if key in _held:
+        yield True
+        return
+    new_folders = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = _acquire(_lock_of(path), _FOREVER if wait else _PATIENCE)
+    if lock is None:
+        yield False
+        return
+    _held.add(key)
+    try:
+        yield True
+    finally:
+        _held.discard(key)
+        _release(lock)
+        with suppress(OSError):  # those that are empty go; the inner ones come first
+            for folder in new_folders:
+                folder.rmdir()
+
+
+@contextmanager
+def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
+    """Hold the claim on `path`, or say who does.
+
+    Args:
+        path: see `claim`.
+        use: what the holder of the claim does with the path, for the message.
+        part: claim this use of the path only; the path itself can be claimed by others.
 
     Raises:
-        InputError: `path` is a folder.
+        InputError: another process holds it; the message names that process.
     """
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, a file is needed; name a file")
-    with claim(path, wait=True):
-        remove_leftovers(path.parent)
-        scratch = scratch_of(path)
-        remove(scratch)
-        try:
-            yield scratch
-            scratch.replace(path)
-        finally:
-            remove(scratch)
+    part_path = path.with_name(f"{path.name}.{part}") if part else path
+    with claim(part_path) as held:
+        if held:
+            yield
+            return
+        words = b""
+        with suppress(OSError), _lock_of(part_path).open("rb") as content:
+            content.seek(1)
+            words = content.read(1024)
+        stated = words.startswith(b"process ")
+        holder = words.decode(errors="replace") if stated else "another process"
+        raise InputError(
+            f"{path} is being {use} by {holder}; wait for it to end, or name another path"
+        )
+
+
+def remove_leftovers(folder: Path, within: bool = False) -> None:
+    """Remove the scratch and locks of processes that were killed while they wrote in `folder`.
+
+    Args:
+        within: and in every folder inside.
+    """
+    for file in [*folder.glob(f"{'**/' * within}.?*{LOCK}")]:
+        path = file.with_name(file.name[1 : -len(LOCK)])
+        if (os.getpid(), path.parent.resolve() / path.name) in _held:
+            continue
+        with suppress(OSError):  # of another user
+            if (lock := _acquire(file, 0.0)) is not None:
+                _remove(scratch_of(path))
+                _release(lock)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder with all it holds, if it exists and can be removed."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}{LOCK}")
+
+
+def _acquire(file: Path, seconds: float) -> BaseFileLock | None:
+    """The held lock; None if another process holds it for longer than `seconds`."""
+    # A generator that holds a claim may be closed by another thread.
+    lock = FileLock(file, thread_local=False, poll_interval=0.01)
+    try:
+        lock.acquire(timeout=seconds)
+        command = " ".join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])[:_COMMAND_LENGTH]
+        since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
+        # On Windows no one else can read the first byte, which is what is locked.
+        with file.open("r+b") as content:
+            content.write(b" " + holder.encode())
+            content.truncate()
+    except Timeout:
+        return None
+    except BaseException:
+        _release(lock)
+        raise
+    return lock
+
+
+def _release(lock: BaseFileLock) -> None:
+    # Whoever waits finds out that the file is gone. Windows removes it after the release.
+    if lock.is_locked:
+        with suppress(OSError):
+            Path(lock.lock_file).unlink()
+    lock.release()
 
 
 def json_text(value: Any, **layout: Any) -> str:
@@ -102,30 +260,31 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
-    """Write `value` as indented JSON, atomically; see `json_text`."""
+def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = False) -> None:
+    """Write `value` as indented JSON, atomically; see `json_text`.
+
+    Args:
+        seal: add the checksum of an object as its entry `checksum`.
+    """
+    if seal and isinstance(value, Mapping):
+        value = {**value, _CHECKSUM: _content_checksum(value)}
     with atomic_file(path) as scratch:
         scratch.write_text(json_text(value, indent=2) + "\n", encoding="utf-8")
 
 
-def write_sealed_json(path: Path, value: Mapping[str, Any]) -> None:
-    """`write_json` of an object, with its checksum as the entry `checksum`."""
-    write_json(path, {**value, CHECKSUM: content_checksum(value)})
-
-
 def read_json(path: Path) -> Any:
-    """Read a JSON file; the entry `checksum` of `write_sealed_json` is verified and excluded.
+    """Read a JSON file; the entry `checksum` of a sealed object is verified and excluded.
 
     Raises:
         InputError: the file is missing, is not JSON, or was changed after it was sealed.
     """
     value = _parse(path, _LARGEST_JSON, "JSON", json.loads)
-    if isinstance(value, dict) and isinstance(value.get(CHECKSUM), str):
-        stated = value.pop(CHECKSUM)
-        if stated != content_checksum(value):
+    if isinstance(value, dict) and isinstance(value.get(_CHECKSUM), str):
+        stated = value.pop(_CHECKSUM)
+        if stated != _content_checksum(value):
             raise InputError(
                 f"{path} was changed after ucfrec wrote it: its checksum differs; restore the "
-                f"file, or remove its entry {CHECKSUM!r} if you changed it on purpose"
+                f"file, or remove its entry {_CHECKSUM!r} if you changed it on purpose"
             )
     return value
 
@@ -143,11 +302,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
-    """Read a text file; reading a pipe or a device might never end, so it must be a regular one.
-
-    Args:
-        largest: size in bytes beyond which the file is refused.
-    """
+    """Read a text file of at most so many bytes; a pipe or a device might never end."""
     if not path.is_file():
         what = "is not a regular file" if path.exists() else "does not exist"
         raise InputError(f"{path} {what}; check the path")
@@ -161,7 +316,7 @@ def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> 
         raise InputError(f"{path} is not {kind}: {error}") from None
 
 
-def content_checksum(value: Mapping[str, Any]) -> str:
+def _content_checksum(value: Mapping[str, Any]) -> str:
     """XXH3 (64 bits, hexadecimal) of a JSON object, in whatever order and layout it is written."""
     text = json_text(value, sort_keys=True, separators=(",", ":"))
     return xxhash.xxh3_64_hexdigest(text.encode())

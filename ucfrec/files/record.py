@@ -28,8 +28,7 @@ from pydantic import (
 )
 
 from ucfrec.errors import InputError, explain_os_error
-from ucfrec.files.atomic import read_json, write_sealed_json
-from ucfrec.files.locks import is_lock_or_scratch
+from ucfrec.files.atomic import LOCK, SCRATCH, read_json, write_json
 
 CARD, MEASURED = "MODEL_CARD.md", "measured.json"
 """Files of a run that later measurements change; they are never listed."""
@@ -75,7 +74,7 @@ class Sealed:
             InputError: the first file that is missing, or has another size.
         """
         for name in self.files:
-            self._refuse(name, self._size_fault(name))
+            self._refuse(name, self._find_fault(name, content=False))
 
     def require(self, name: str) -> None:
         """Read a file and check its size and checksum; a file that is not listed passes.
@@ -84,7 +83,7 @@ class Sealed:
             InputError: the file is missing or has another content.
         """
         if name in self.files:
-            self._refuse(name, self._fault(name))
+            self._refuse(name, self._find_fault(name))
 
     def require_small(self) -> None:
         """Check the sizes of all files, and the content of small ones.
@@ -105,32 +104,25 @@ class Sealed:
         from concurrent.futures import ThreadPoolExecutor  # only to verify everything
 
         with ThreadPoolExecutor(_THREADS) as threads:
-            for name, fault in zip(self.files, threads.map(self._fault, self.files), strict=True):
-                if fault:
-                    yield name, fault
+            faults = zip(self.files, threads.map(self._find_fault, self.files), strict=True)
+            yield from ((name, fault) for name, fault in faults if fault)
 
     def strangers(self) -> list[str]:
         """Files of the folder that are not listed, without locks and scratch."""
         return sorted(set(_names(self.folder)) - self.files.keys())
 
-    def _fault(self, name: str) -> str:
+    def _find_fault(self, name: str, content: bool = True) -> str:
+        path, (stated, checksum) = self.folder / name, self.files[name]
         try:
-            return self._size_fault(name) or (
-                ""
-                if file_checksum(self.folder / name) == self.files[name][1]
-                else "has another content than was written"
-            )
+            if not path.is_file():
+                return "is not a regular file" if path.exists() else "is missing"
+            if (size := path.stat().st_size) != stated:
+                kind = "truncated" if size < stated else "grown"
+                return f"is {kind}: {size:,} of {stated:,} bytes"
+            same = not content or file_checksum(path) == checksum
+            return "" if same else "has another content than was written"
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
-
-    def _size_fault(self, name: str) -> str:
-        path, stated = self.folder / name, self.files[name][0]
-        if not path.is_file():
-            return "is not a regular file" if path.exists() else "is missing"
-        size = path.stat().st_size
-        if size == stated:
-            return ""
-        return f"is {'truncated' if size < stated else 'grown'}: {size:,} of {stated:,} bytes"
 
     def _refuse(self, name: str, fault: str) -> None:
         if fault:
@@ -142,7 +134,7 @@ def _names(folder: Path) -> Iterator[str]:
         # A folder with a record of its own has checksums of its own.
         folders[:] = [name for name in folders if not (Path(where) / name / RUN_RECORD).is_file()]
         for name in files:
-            if not is_lock_or_scratch(name) and name not in (CARD, MEASURED):
+            if not name.endswith((LOCK, SCRATCH)) and name not in (CARD, MEASURED):
                 yield (Path(where) / name).relative_to(folder).as_posix()
 
 
@@ -244,7 +236,7 @@ class Record(Entry):
 
     def write(self, folder: Path) -> Self:
         """Write the record as it is; returns it."""
-        write_sealed_json(folder / self.FILE, self.model_dump())
+        write_json(folder / self.FILE, self.model_dump(), seal=True)
         return self
 
     def checksums(self, folder: Path) -> Sealed:

@@ -19,7 +19,7 @@ from tempfile import gettempdir
 from typing import Any, Final
 
 from ucfrec.errors import InputError, one_line
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 
 _URI: Final = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://.+")
 _BLOCK: Final = 2**22

@@ -1,59 +1,56 @@
-"""Checkpoints: one safetensors file each, with metadata as JSON in the file's header."""
+"""Files of a training: tensors with metadata (safetensors), and the scalars of `metrics.jsonl`."""
 
 import json
+import math
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import torch
-import xxhash
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file
-from ucfrec.fitting.average import PREFIX, WeightAverage, averages
+from ucfrec.files.atomic import atomic_file, json_text
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
-_OPTIMIZER = "optimizer."
+METRICS: Final = "metrics.jsonl"
+_STEP: Final = "step"
+_LARGEST_STEP: Final = 2**53
+"""The largest range of integers that floats represent exactly."""
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
-def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write named tensors and metadata that JSON can represent, atomically.
 
     Raises:
         InputError: the disk is full, or the folder is not writable.
     """
-    plain = _apart(tensors)
+    plain: dict[str, Tensor] = {}
+    places = set()
+    for name, tensor in tensors.items():
+        plain[name] = tensor.detach().contiguous().cpu()
+        place = plain[name].untyped_storage().data_ptr()
+        if place in places:  # safetensors refuses tensors that share memory
+            plain[name] = plain[name].clone()
+        places.add(place)
     with atomic_file(path) as scratch:
         scratch.touch()
         mode = scratch.stat().st_mode
         try:
-            about = json.dumps(metadata)
             # One entry: safetensors writes several in any order, and files of equal content are to
             # be equal.
-            save_file(plain, scratch, metadata={"about": f"{about}\n{_checksum(plain, about)}"})
-            # safetensors restricts its files to their owner; give them the usual permissions.
-            scratch.chmod(mode)
+            save_file(plain, scratch, metadata={"about": json.dumps(metadata)})
         except SafetensorError as error:
             raise InputError(
                 f"{path} cannot be written ({error}); free disk space and run the command again"
             ) from None
-
-
-def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors on the CPU; safetensors refuses those that share memory, so these are copies."""
-    plain: dict[str, Tensor] = {}
-    taken = set()
-    for name, tensor in tensors.items():
-        plain_tensor = tensor.detach().contiguous().cpu()
-        place = plain_tensor.untyped_storage().data_ptr()
-        plain[name] = plain_tensor.clone() if place in taken else plain_tensor
-        taken.add(place)
-    return plain
+        # safetensors restricts its files to their owner; give them the usual permissions.
+        scratch.chmod(mode)
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -62,93 +59,16 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: the file is missing or damaged.
     """
+    # safetensors may call whatever it cannot read a missing file.
+    if not path.is_file():
+        raise InputError(f"{path} does not exist")
     try:
-        # safetensors may call whatever it cannot read a missing file.
-        if not path.is_file():
-            raise InputError(f"{path} does not exist")
         with safe_open(path, framework="pt") as file:
-            stated = file.metadata() or {}
+            about = json.loads((file.metadata() or {}).get("about", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+        return tensors, dict(about)
+    except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} is damaged ({error}); {REMEDY}") from None
-    about, _, checksum = stated.get("about", "{}").partition("\n")
-    if checksum != _checksum(tensors, about):
-        raise InputError(f"{path} is damaged (its checksum differs); restore it or train again")
-    with damage_explained(path, REMEDY):
-        return tensors, dict(json.loads(about))
-
-
-def _checksum(tensors: Mapping[str, Tensor], about: str) -> str:
-    """XXH3 (64 bits, hexadecimal) of names, types, shapes and values of tensors, and of a text."""
-    digest = xxhash.xxh3_64(about.encode())
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        digest.update(f"\n{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
-        if tensor.numel():
-            digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()
-
-
-def save_training(
-    path: Path,
-    module: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    counters: dict[str, Any],
-    average: WeightAverage | None = None,
-) -> None:
-    """Write everything that resuming a training needs: weights, optimizer state and counters.
-
-    Raises:
-        InputError: the disk is full, or the folder is not writable.
-    """
-    tensors = dict(module.state_dict())
-    for index, moments in optimizer.state_dict()["state"].items():
-        for key, value in moments.items():
-            tensors[f"{_OPTIMIZER}{index}.{key}"] = value
-    if average is not None:
-        means, steps = average.state()
-        tensors, counters = tensors | means, counters | steps
-    save_tensors(path, tensors, counters)
-
-
-def load_training(
-    path: Path,
-    module: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    average: WeightAverage | None = None,
-) -> dict[str, Any]:
-    """Restore `module`, `optimizer` and `average`, in place, from what `save_training` wrote.
-
-    Raises:
-        InputError: the file is missing or damaged, or holds weights of another architecture.
-    """
-    tensors, counters = load_tensors(path)
-    state: dict[int, dict[str, Tensor]] = {}
-    with damage_explained(path, REMEDY):
-        for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
-            index, key = name.removeprefix(_OPTIMIZER).split(".")
-            state.setdefault(int(index), {})[key] = tensors.pop(name)
-    means = {name: tensors.pop(name) for name in [*tensors] if name.startswith(PREFIX)}
-    load_weights(path, module, tensors)
-    with damage_explained(path, REMEDY):
-        groups = optimizer.state_dict()["param_groups"]
-        optimizer.load_state_dict({"state": state, "param_groups": groups})
-        if average is not None:
-            average.restore(means, counters)
-    return counters
-
-
-def load_trained(path: Path) -> dict[str, Tensor]:
-    """The trained weights in a file of `save_tensors` or `save_training`: averages where it has
-    them, without what only resuming needs.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
-    tensors, counters = load_tensors(path)
-    weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, PREFIX))}
-    with damage_explained(path, REMEDY):
-        return weights | averages(tensors, weights, counters)
 
 
 def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Tensor]) -> _Module:
@@ -177,7 +97,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 
 
 def load_weights(
-    path: Path, module: nn.Module, tensors: dict[str, Tensor], assign: bool = False
+    path: Path, module: nn.Module, tensors: Mapping[str, Tensor], assign: bool = False
 ) -> None:
     """Load `tensors` into `module`; `path`, where they were read from, is for the message.
 
@@ -195,3 +115,97 @@ def load_weights(
             f"{path} holds weights of another architecture ({first}); use the settings that it was "
             "trained with, or another folder"
         ) from None
+
+
+class MetricsLog:
+    """Writes scalars to `metrics.jsonl`, which is read back, and to an event file of TensorBoard.
+
+    Both are on disk before `add` returns, so a killed training loses nothing that it logged;
+    `tensorboardX.SummaryWriter` would write in a thread. A line is `{"step": 500, "loss": 1.25}`; a
+    value that is not finite becomes null.
+
+    Args:
+        folder: of both files; must exist.
+        start: the step that training resumes from; 0 for a new training.
+    """
+
+    def __init__(self, folder: Path, start: int) -> None:
+        # Not above: it imports boto3 if that is installed, and most commands only read metrics.
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        self._path, self._event = folder / METRICS, Event
+        if self._path.exists():
+            with self._path.open("r+b") as file:  # without the part of a line of a killed process
+                file.truncate(file.read().rfind(b"\n") + 1)
+        # tensorboardX names files by the second; the suffix keeps a quick resumption from reusing
+        # the name.
+        self._events = EventsWriter(str(folder / "events"), f".{start:09d}")
+        if start:  # makes TensorBoard discard events that were logged after the checkpoint
+            log = SessionLog(status=SessionLog.START)
+            self._events.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
+
+    def add(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Log named scalars; the name `step` is reserved."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json_text({_STEP: step, **scalars}) + "\n")
+        event = self._event(wall_time=time.time(), step=step)
+        for name, value in scalars.items():
+            event.summary.value.add(tag=name, simple_value=value)
+        self._events.write_event(event)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Close the event file."""
+        self._events.close()
+
+
+def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
+    """Read `metrics.jsonl` in `folder`, also while the training is running.
+
+    If a resumed training logged a step again, the later line is used. An incomplete last line is
+    ignored.
+
+    Returns:
+        {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
+        if the file does not exist.
+
+    Raises:
+        InputError: a line is not an object of a step and numbers.
+    """
+    path = folder / METRICS
+    if not path.exists():
+        return {}
+    *lines, _incomplete = path.read_bytes().split(b"\n")
+    scalars: dict[str, dict[int, float]] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            step, values = _parse_line(line)
+        except ValueError as error:
+            raise InputError(
+                f"{path}, line {number}, {error}; delete the line, or restore the file"
+            ) from None
+        for name, value in values.items():
+            scalars.setdefault(name, {})[step] = value
+    return {name: dict(sorted(curve.items())) for name, curve in scalars.items()}
+
+
+def _parse_line(line: bytes) -> tuple[int, dict[str, float]]:
+    """Step and scalars of a line; a ValueError says what is wrong with it."""
+    try:
+        values = json.loads(line)
+    except (ValueError, RecursionError):
+        raise ValueError("is not JSON") from None
+    if not isinstance(values, dict):
+        raise ValueError("is not a JSON object")
+    step = values.pop(_STEP, None)
+    if type(step) is not int or not 0 <= step <= _LARGEST_STEP:
+        raise ValueError(f"has no whole number of 0 or more as {_STEP!r}")
+    for name, value in values.items():
+        if value is not None and type(value) not in (int, float):
+            raise ValueError(f"has no number as {name!r}")
+        try:
+            values[name] = math.nan if value is None else float(value)
+        except OverflowError:
+            raise ValueError(f"has too large a number as {name!r}") from None
+    return step, values

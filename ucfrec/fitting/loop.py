@@ -13,26 +13,19 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from ucfrec.errors import InputError
+from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting import distributed
-from ucfrec.fitting.average import WeightAverage
-from ucfrec.fitting.checkpoint import (
-    load_tensors,
-    load_trained,
-    load_training,
-    load_weights,
-    save_tensors,
-    save_training,
-)
-from ucfrec.fitting.metrics_log import MetricsLog
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import Progress, no_progress, progress
+from ucfrec.fitting.checkpoint import REMEDY, MetricsLog, load_tensors, load_weights, save_tensors
+from ucfrec.processes import progress, random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
 Batch = TypeVar("Batch")
-INITIAL: Final = "initial.safetensors"
-"""File of the weights that a training begins with, in its folder, if it is there."""
+_OPTIMIZER: Final = "optimizer."
+_AVERAGE: Final = "average."
+"""Start of the names of averages in a checkpoint."""
+_WHEN: Final = ".when"
+"""End of the name of when each row of a table was last averaged."""
 
 
 @settings_table("train")
@@ -103,38 +96,8 @@ class Callbacks:
     """Called after every validation, with the step and all that is logged: `validation_loss`,
     `loss`, `gradient_norm`, …"""
 
-    def step(self, step: int, loss: Tensor) -> None:
-        """Tell of an update."""
-        if self.on_step is not None and distributed.leads():
-            self.on_step(step, {"loss": loss.item()})
-
-    def validation(self, step: int, logged: Mapping[str, float]) -> None:
-        """Tell of a validation."""
-        if self.on_validation is not None and distributed.leads():
-            self.on_validation(step, logged)
-
 
 SILENT: Final = Callbacks()
-
-
-def step_generator(seed: int, step: int) -> np.random.Generator:
-    """The generator for all random draws of one training step.
-
-    It depends on nothing but `seed` and `step`, so a resumed training draws the same batches as an
-    uninterrupted one.
-    """
-    return np.random.default_rng([seed, step])
-
-
-def _seed_setter() -> Callable[[int], object]:
-    """What seeds torch at every step.
-
-    `torch.manual_seed` keeps a traceback of each call for every kind of accelerator that is not in
-    use: without any, half a millisecond a step and memory for all of them.
-    """
-    if torch.accelerator.is_available():
-        return torch.manual_seed
-    return torch.default_generator.manual_seed
 
 
 @random_state_kept()
@@ -169,33 +132,53 @@ def fit(
         InputError: a loss or gradient is not finite, or a checkpoint is damaged or does not fit.
     """
     training = _Training(module, config, folder, describe)
-    step = int(training.counters["step"])
-    clock, log = _Clock(step, training.counters["seconds"]), _log(folder, step)
-    set_seed = _seed_setter()
+    counters, step = training.counters, int(training.counters["step"])
+    started = time.perf_counter() - counters["seconds"]
+    log = MetricsLog(folder, step) if distributed.leads() else None
+    # `torch.manual_seed` keeps a traceback of each call for every kind of accelerator that is not
+    # in use: without any, half a millisecond a step and memory for all of them.
+    accelerated = torch.accelerator.is_available()
+    set_seed = torch.manual_seed if accelerated else torch.default_generator.manual_seed
     joint, rank = rows if distributed.processes() > 1 else None, distributed.rank()
     module.train()
-    for step, bar in _steps(training.counters, config, describe):
-        generator = step_generator(seed, step)
-        with clock.waiting():
+    # Of the interval since the last validation: its start, its first step, seconds without a batch.
+    since, since_step, waited = time.perf_counter(), step, 0.0
+    with progress(config.steps, describe, "steps", step, shown=log is not None) as bar:
+        while step < config.steps and not 0 < config.patience <= counters["stale"]:
+            step += 1
+            # A function of seed and step, so that a resumed training draws the same batches.
+            generator = np.random.default_rng([seed, step])
+            asked_at = time.perf_counter()
             batch = draw(generator)
-        set_seed(int(generator.integers(2**62)) + rank)
-        if not module.training:  # a validation or a callback has ended it
-            module.train()
-        value, scalars = loss(batch)
-        count = None if joint is None else joint(batch)
-        norm = training.descend(value, step, count)
-        callbacks.step(step, value)
-        if step % config.validate_every and step != config.steps:
-            continue
-        logged = _means({"loss": value, **scalars}, count) | {"gradient_norm": norm.item()}
-        logged |= clock.rates(step, config)
-        logged |= training.validated(step, logged, validate, clock)
-        if log is not None:
-            log.add(step, logged)
-            bar.update(0, loss=logged["loss"])
-            training.save()
-        callbacks.validation(step, logged)
-        clock.restart(step)
+            waited += time.perf_counter() - asked_at
+            set_seed(int(generator.integers(2**62)) + rank)
+            if not module.training:  # a validation or a callback has ended it
+                module.train()
+            value, scalars = loss(batch)
+            count = None if joint is None else joint(batch)
+            norm = training.descend(value, step, count)
+            if callbacks.on_step is not None and log is not None:
+                callbacks.on_step(step, {"loss": value.item()})
+            if step % config.validate_every == 0 or step == config.steps:
+                means = {name: scalar.item() for name, scalar in {"loss": value, **scalars}.items()}
+                if count is not None:
+                    means = distributed.joint_means(means, count)
+                elapsed = time.perf_counter() - since
+                logged = means | {
+                    "gradient_norm": norm.item(),
+                    "samples_per_second": (step - since_step) * config.batch_size / elapsed,
+                    "waiting_for_data": waited / elapsed,
+                }
+                logged |= training.validate(step, logged, validate)
+                counters |= {"step": step, "seconds": time.perf_counter() - started}
+                if log is not None:
+                    log.add(step, logged)
+                    bar.set_postfix(loss=logged["loss"], refresh=False)
+                    training.save()
+                    if callbacks.on_validation is not None:
+                        callbacks.on_validation(step, logged)
+                since, since_step, waited = time.perf_counter(), step, 0.0
+            bar.update()
     if log is not None:
         log.close()
     if joint is not None:
@@ -210,14 +193,11 @@ class _Training:
         folder.mkdir(parents=True, exist_ok=True)
         self._last, self._best = folder / "last.safetensors", folder / "best.safetensors"
         self._module, self._config, self._describe = module, config, describe
-        self._optimizer = RowAdamW(
-            module.parameters(),
-            lr=config.learning_rate,
-            weight_decay=config.weight_decay,
-            fused=True,
-        )
-        average, start = config.average, config.warmup_steps
-        self._average = WeightAverage(module, average, start) if average else None
+        rate, decay = config.learning_rate, config.weight_decay
+        self._optimizer = RowAdamW(module.parameters(), lr=rate, weight_decay=decay, fused=True)
+        self._average = None
+        if config.average:
+            self._average = WeightAverage(module, config.average, config.warmup_steps)
         self.counters: dict[str, float] = {
             "step": 0,
             "best_step": 0,
@@ -226,63 +206,84 @@ class _Training:
             "seconds": 0.0,
         }
         if self._last.exists():
-            self.counters.update(load_training(self._last, module, self._optimizer, self._average))
-        elif (initial := folder / INITIAL).exists():
-            load_weights(initial, module, load_trained(initial))
+            self._resume()
+
+    def _resume(self) -> None:
+        """Read what `save` wrote."""
+        tensors, counters = load_tensors(self._last)
+        state: dict[int, dict[str, Tensor]] = {}
+        means = {name: tensors.pop(name) for name in [*tensors] if name.startswith(_AVERAGE)}
+        with damage_explained(self._last, REMEDY):
+            for name in [name for name in tensors if name.startswith(_OPTIMIZER)]:
+                index, key = name.removeprefix(_OPTIMIZER).split(".")
+                state.setdefault(int(index), {})[key] = tensors.pop(name)
+            load_weights(self._last, self._module, tensors)
+            groups = self._optimizer.state_dict()["param_groups"]
+            self._optimizer.load_state_dict({"state": state, "param_groups": groups})
+            if self._average is not None:
+                self._average.restore(means, counters)
+            self.counters |= {name: counters[name] for name in self.counters}
+
+    def save(self) -> None:
+        """Write what a resumption needs: weights, their averages, optimizer state and counters."""
+        tensors, counters = dict(self._module.state_dict()), dict(self.counters)
+        for index, moments in self._optimizer.state_dict()["state"].items():
+            for key, value in moments.items():
+                tensors[f"{_OPTIMIZER}{index}.{key}"] = value
+        if self._average is not None:
+            means, steps = self._average.state()
+            tensors, counters = tensors | means, counters | steps
+        save_tensors(self._last, tensors, counters)
 
     def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
         """One optimizer step on the loss `value`; returns the gradient norm before clipping.
 
         With `count`, the number of rows of `value`, on its mean over all processes.
         """
+        config = self._config
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         if count is not None:
             distributed.average_gradients(self._module.parameters(), count)
-        norm = clip_gradients(self._module.parameters(), self._config.clip_norm)
+        norm = clip_gradients(self._module.parameters(), config.clip_norm)
+        rate = config.learning_rate * min(1.0, step / max(1, config.warmup_steps))
+        if config.cosine and step >= config.warmup_steps:
+            done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+            rate = rate * (1 + math.cos(math.pi * done)) / 2
         for group in self._optimizer.param_groups:
-            group["lr"] = _learning_rate(self._config, step)
+            group["lr"] = rate
         moved = None if self._average is None else self._average.before_step()
         self._optimizer.step()
         if self._average is not None and moved is not None:
             self._average.after_step(moved)
         return norm
 
-    def validated(
-        self,
-        step: int,
-        logged: Mapping[str, float],
-        validate: Callable[[], float] | None,
-        clock: "_Clock",
+    def validate(
+        self, step: int, logged: Mapping[str, float], validate: Callable[[], float] | None
     ) -> dict[str, float]:
-        """Check and count what was logged of a step, and keep its weights if they are the best.
+        """Save the weights if their validation loss is the lowest so far, or without validation.
 
         Returns:
             The validation loss, for the log; empty without validation.
         """
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
-        validation = self._keep_best(validate, step)
-        self.counters |= {"step": step, "seconds": clock.total()}
-        return validation
-
-    def _keep_best(self, validate: Callable[[], float] | None, step: int) -> dict[str, float]:
-        """Save the weights if their validation loss is the lowest so far, or without validation."""
         with nullcontext() if self._average is None else self._average.applied():
-            if validate is None:
-                self.counters["best_step"] = step
-                self._save_best({"step": step})
-                return {}
-            self._module.eval()
-            with torch.no_grad():
-                loss = validate()
-            self._require_finite("validation loss", loss, step)
-            if loss < self.counters["best_validation"]:
-                self.counters |= {"best_validation": loss, "best_step": step, "stale": 0}
-                self._save_best({"step": step, "validation_loss": loss})
-            else:
-                self.counters["stale"] += 1
-            return {"validation_loss": loss}
+            about: dict[str, float] = {"step": step}
+            if validate is not None:
+                self._module.eval()
+                with torch.no_grad():
+                    loss = validate()
+                self._require_finite("validation loss", loss, step)
+                if loss >= self.counters["best_validation"]:
+                    self.counters["stale"] += 1
+                    return {"validation_loss": loss}
+                self.counters |= {"best_validation": loss, "stale": 0}
+                about["validation_loss"] = loss
+            self.counters["best_step"] = step
+            if distributed.leads():
+                save_tensors(self._best, self._module.state_dict(), about)
+        return {} if validate is None else {"validation_loss": loss}
 
     def _require_finite(self, quantity: str, value: float, step: int) -> None:
         if not math.isfinite(value):
@@ -291,10 +292,6 @@ class _Training:
                 "rate or look for extreme values in the store (`ucfrec prepare --validate`)"
             )
 
-    def save(self) -> None:
-        """Write what a resumption needs."""
-        save_training(self._last, self._module, self._optimizer, self.counters, self._average)
-
     def end(self, step: int, validated: bool) -> Fit:
         """Load the best weights; returns the outcome, with the last `step`."""
         load_weights(self._best, self._module, load_tensors(self._best)[0])
@@ -302,71 +299,18 @@ class _Training:
         lowest = self.counters["best_validation"] if validated else math.nan
         return Fit(step, int(self.counters["best_step"]), lowest, self.counters["seconds"])
 
-    def _save_best(self, about: dict[str, float]) -> None:
-        if distributed.leads():
-            save_tensors(self._best, self._module.state_dict(), about)
 
+def load_trained(path: Path) -> dict[str, Tensor]:
+    """The trained weights in a file that `fit` wrote: averages where it has them, without what only
+    resuming needs.
 
-def _means(scalars: Mapping[str, Tensor], count: float | None) -> dict[str, float]:
-    """Scalars of a batch; with `count`, its rows here, their means over all processes."""
-    values = {name: scalar.item() for name, scalar in scalars.items()}
-    return values if count is None else distributed.joint_means(values, count)
-
-
-def _log(folder: Path, step: int) -> MetricsLog | None:
-    """The log of the training; none for a process that is not the leader."""
-    return MetricsLog(folder, step) if distributed.leads() else None
-
-
-def _steps(
-    counters: Mapping[str, float], config: LoopConfig, describe: str
-) -> Iterator[tuple[int, Progress]]:
-    """Yield the remaining steps, until the last or an early stop, with their progress display."""
-    step = int(counters["step"])
-    display = progress if distributed.leads() else no_progress
-    with display(config.steps, describe, "steps", step) as bar:
-        while step < config.steps and not 0 < config.patience <= counters["stale"]:
-            step += 1
-            yield step, bar
-            bar.update()
-
-
-class _Clock:
-    """Measures training time and the share of it spent waiting for data."""
-
-    def __init__(self, step: int, seconds: float) -> None:
-        self._start = time.perf_counter() - seconds
-        self.restart(step)
-
-    @contextmanager
-    def waiting(self) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self._waited += time.perf_counter() - start
-
-    def rates(self, step: int, config: LoopConfig) -> dict[str, float]:
-        """Samples per second and share of time spent waiting for data, since the last restart."""
-        elapsed = time.perf_counter() - self._interval_start
-        return {
-            "samples_per_second": (step - self._step) * config.batch_size / elapsed,
-            "waiting_for_data": self._waited / elapsed,
-        }
-
-    def restart(self, step: int) -> None:
-        """Start a new interval for `rates`, which thus excludes validations and checkpoints."""
-        self._interval_start, self._step, self._waited = time.perf_counter(), step, 0.0
-
-    def total(self) -> float:
-        """Seconds since the training began, including earlier processes."""
-        return time.perf_counter() - self._start
-
-
-def _learning_rate(config: LoopConfig, step: int) -> float:
-    warmup = min(1.0, step / max(1, config.warmup_steps))
-    if not config.cosine or step < config.warmup_steps:
-        return config.learning_rate * warmup
-    done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
-    return config.learning_rate * warmup * (1 + math.cos(math.pi * done)) / 2
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    tensors, counters = load_tensors(path)
+    weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, _AVERAGE))}
+    with damage_explained(path, REMEDY):
+        return weights | _averages(tensors, weights, counters)
 
 
 class RowAdamW(torch.optim.AdamW):
@@ -424,3 +368,128 @@ def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor
     if largest:
         torch._foreach_mul_(gradients, torch.clamp(largest / (norm + 1e-6), max=1.0))
     return norm
+
+
+class WeightAverage:
+    """The mean θ̄ of a module's weights θ over its steps: θ̄ₜ = dₜ θ̄ₜ₋₁ + (1 − dₜ) θₜ.
+
+    dₜ = min(decay, t / (9 + t)), with t counted from the end of the learning rate's warm-up, and 0
+    before, so that a short training is not held back by its first weights. Buffers are not
+    averaged.
+
+    Of a table with sparse gradients, a step averages the rows that it moves. While a row rests, its
+    average approaches it by the product of the steps' d, which is applied when the row moves again
+    or is read. What is stored depends only on the steps, not on when averages were read, so a
+    resumed training ends with the bits of an uninterrupted one.
+    """
+
+    def __init__(self, module: nn.Module, decay: float, start: int = 0) -> None:
+        """
+        Args:
+            module: averaged from its present weights on, which then change in place.
+            decay: the largest d, above 0 and below 1.
+            start: steps whose weights are not averaged.
+        """
+        self._decay, self._start, self._step = decay, start, 0
+        self._log = 0.0  # Σ log d of the steps so far
+        # A checkpoint has shared weights once for each name, so their averages are, too.
+        self._gradients = dict(module.named_parameters(remove_duplicate=False))
+        self._weights = {name: each.detach() for name, each in self._gradients.items()}
+        self._means = {name: weights.clone() for name, weights in self._weights.items()}
+        self._when: dict[str, Tensor] = {}  # `_log` at the last average of each row of a table
+
+    def before_step(self) -> dict[str, Tensor]:
+        """Bring the averages of rows that the next step moves up to date; returns them by table.
+
+        To be called once gradients are known, and before weights move.
+        """
+        moved = {}
+        for name, parameter in self._gradients.items():
+            gradient = parameter.grad
+            if gradient is not None and gradient.is_sparse:
+                rows = moved[name] = gradient.coalesce().indices()[0]
+                if name not in self._when:
+                    whole = torch.full((len(parameter),), self._log, dtype=torch.float64)
+                    self._when[name] = whole.to(rows.device)
+                self._means[name][rows] = _rested(
+                    self._means[name][rows],
+                    self._weights[name][rows],
+                    self._log - self._when[name][rows],
+                )
+        return moved
+
+    def after_step(self, moved: Mapping[str, Tensor]) -> None:
+        """Average the weights after a step; `moved` is what `before_step` returned."""
+        self._step += 1
+        t = max(0, self._step - self._start)
+        decay = min(self._decay, t / (9 + t))
+        if decay:  # otherwise the averages are the weights, also of rows that rest
+            self._log += math.log(decay)
+        for name, rows in moved.items():
+            self._means[name][rows] = self._means[name][rows].lerp_(
+                self._weights[name][rows], 1 - decay
+            )
+            self._when[name][rows] = self._log
+        dense = [name for name in self._means if name not in self._when]
+        torch._foreach_lerp_(
+            [self._means[name] for name in dense],
+            [self._weights[name] for name in dense],
+            1 - decay,
+        )
+
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """Inside, the module's weights are the averages."""
+        kept = {name: weights.clone() for name, weights in self._weights.items()}
+        tensors, counters = self.state()
+        self._put(_averages(tensors, kept, counters))
+        try:
+            yield
+        finally:
+            self._put(kept)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Named tensors and counters, for `restore`."""
+        when = {f"{name}{_WHEN}": table for name, table in self._when.items()}
+        tensors = {f"{_AVERAGE}{name}": table for name, table in {**self._means, **when}.items()}
+        return tensors, {"averaged_steps": self._step, "average_log": self._log}
+
+    def restore(self, tensors: Mapping[str, Tensor], counters: Mapping[str, float]) -> None:
+        """Go on from what `state` returned.
+
+        Raises:
+            KeyError, RuntimeError: an average is missing, or has another shape.
+        """
+        self._step, self._log = int(counters["averaged_steps"]), float(counters["average_log"])
+        for name, mean in self._means.items():
+            mean.copy_(tensors[f"{_AVERAGE}{name}"])
+            if (when := tensors.get(f"{_AVERAGE}{name}{_WHEN}")) is not None:
+                self._when[name] = when.to(mean.device)
+
+    def _put(self, values: Mapping[str, Tensor]) -> None:
+        for name, weights in self._weights.items():
+            weights.copy_(values[name])
+
+
+def _averages(
+    tensors: Mapping[str, Tensor], weights: Mapping[str, Tensor], counters: Mapping[str, float]
+) -> dict[str, Tensor]:
+    """Averages by the names of their weights, every row of a table brought up to date.
+
+    Args:
+        tensors: of `WeightAverage.state`; others are ignored.
+        counters: of `WeightAverage.state`.
+    """
+    means = {}
+    for name, table in weights.items():
+        if (mean := tensors.get(f"{_AVERAGE}{name}")) is not None:
+            when = tensors.get(f"{_AVERAGE}{name}{_WHEN}")
+            rest = None if when is None else counters["average_log"] - when
+            means[name] = mean if rest is None else _rested(mean, table, rest)
+    return means
+
+
+def _rested(means: Tensor, weights: Tensor, log_shares: Tensor) -> Tensor:
+    """Averages of rows (M, …) that rested for steps with Σ log d = `log_shares` (M,)."""
+    share = log_shares.exp().to(means.dtype).view(-1, *[1] * (means.dim() - 1))
+    return torch.where(share < 1, torch.lerp(weights, means, share), means)

@@ -7,7 +7,6 @@ follow. All old rows become training rows, and the newest of the new rows valida
 import hashlib
 import os
 import shutil
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -21,7 +20,7 @@ import pyarrow.parquet as pq
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.record import Source, StoreRecord
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.record import file_checksum
 from ucfrec.logs.expressions import Expression
@@ -31,7 +30,7 @@ from ucfrec.logs.prepare import PreparedLog, PrepareOptions, feature_tables, rea
 from ucfrec.logs.sessions import ID_TABLES, write_ids, write_steps
 from ucfrec.logs.summary import note_unknown
 from ucfrec.logs.typed import TypedLog
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 
 SPLIT: Final = (0.6, 0.2, 0.2)
 """Shares of the new rows, in order of time, that train, validate and test."""
@@ -181,11 +180,9 @@ def _survey_ids(
         rows = f"(SELECT {name} FROM {used} WHERE {is_new})"
         note_lacking(typed.connection, tables, log.features[name], name, rows, f"new {whose}s")
         if new and not tables and name in old.source.features:
-            warnings.warn(
+            warn_user(
                 f"{store} was prepared with {whose} features and none are given now: all {new:,} "
-                f"new {whose}s begin at the mean; give a current table with --mapping",
-                InputNote,
-                stacklevel=3,
+                f"new {whose}s begin at the mean; give a current table with --mapping"
             )
         counts[f"new_{table}"] = typed.one(f"SELECT count(*) FROM {table}")[0] - old_count
         counts[f"new_{table.removesuffix('s')}_steps"] = steps

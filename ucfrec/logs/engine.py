@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.errors import InputError
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.expressions import NotScalarError, cast_truth_values, columns_of, refusal
 from ucfrec.logs.mapping import KEY_COLUMNS, LogMapping
 from ucfrec.logs.tables import Table, fault_of_line, first_line, glob_pattern, quote, quote_name

@@ -1,7 +1,6 @@
 """Features of items and users: tables that are read with a log, then sparse matrices."""
 
 import hashlib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.item_table import DISTINCT_TAGS, TAGS_PER_ITEM
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, wrong_type
 from ucfrec.logs.mapping import FeatureTable, LogMapping, is_table, log_files
 from ucfrec.logs.sessions import ID_TABLES
@@ -246,11 +245,9 @@ def note_lacking(
     for table, name in zip(tables, names, strict=True):
         without_row = _count(connection, f"{rows} ANTI JOIN {name} ON id = {kind}")
         if without_row > share * count:
-            warnings.warn(
+            warn_user(
                 f"{', '.join(map(str, table.files))}: {without_row:,} of {count:,} {which} have "
-                "no row; their features count as missing",
-                InputNote,
-                stacklevel=3,
+                "no row; their features count as missing"
             )
 
 
@@ -261,11 +258,9 @@ def note_unread_features(files: Sequence[Path], mapping: LogMapping) -> None:
         beside = (file for folder in folders for file in sorted(folder.glob(f"{name}.*")))
         table = next((file for file in beside if is_table(file) and file not in files), None)
         if table is not None and not tables:
-            warnings.warn(
+            warn_user(
                 f"{table} lies beside the log and is not read; if it holds features of {name}, "
-                f"name the folder {table.parent}, or the file too",
-                InputNote,
-                stacklevel=2,
+                f"name the folder {table.parent}, or the file too"
             )
 
 

@@ -1,6 +1,5 @@
 """The item history of each user of a log, from files or from a data frame."""
 
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +13,8 @@ import pyarrow as pa
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.errors import InputError, InputNote
-from ucfrec.files.locks import scratch_folder
+from ucfrec.errors import InputError, warn_user
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors, settle_mapping, to_arrow
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
@@ -133,9 +132,7 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
         except _UnusableError as error:
             if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
                 raise InputError(f"{name}: {column} {error}") from None
-            warnings.warn(
-                f"{name}: column {column} is left out: it {error}", InputNote, stacklevel=4
-            )
+            warn_user(f"{name}: column {column} is left out: it {error}")
     return pa.table(columns)
 
 

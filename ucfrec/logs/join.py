@@ -1,6 +1,5 @@
 """Exposures and feedback as one log: what was shown, with what probability, and what came of it."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +10,8 @@ import duckdb
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.errors import InputError, InputNote
-from ucfrec.files.atomic import atomic_file, require_other_files
-from ucfrec.files.locks import scratch_folder
+from ucfrec.errors import InputError, warn_user
+from ucfrec.files.atomic import atomic_file, require_other_files, scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.summary import note_undefined
@@ -137,7 +135,7 @@ def join_feedback(
             _write(connection, columns, further, out)
             joined = _count(connection, columns)
             if not joined.matched:
-                warnings.warn(_why_unmatched(connection, joined), InputNote, stacklevel=2)
+                warn_user(_why_unmatched(connection, joined))
             return joined
 
 
@@ -308,11 +306,9 @@ def _feedback_columns(
     if left_out:
         files = first_and_more([file for table in tables for file in table.files])
         names = ", ".join(f"{name} ({why})" for name, why in left_out.items())
-        warnings.warn(
+        warn_user(
             f"{files}: columns are left out: {names}; where one is feedback, {_WRITE_NUMBERS}, in "
-            "a column of its own name",
-            InputNote,
-            stacklevel=4,
+            "a column of its own name"
         )
     return tuple(name for name, _ in columns.values())
 

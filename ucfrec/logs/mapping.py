@@ -3,7 +3,6 @@
 import glob
 import hashlib
 import tarfile
-import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -14,7 +13,7 @@ from typing import Final, get_args
 
 from ucfrec import schema
 from ucfrec.episodes.record import Source
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder, read_toml
 from ucfrec.files.remote import RECORDS
 from ucfrec.logs.expressions import Expression
@@ -317,7 +316,7 @@ def _tables(path: Path, parents: tuple[Path, ...] = ()) -> list[Path]:
     folders that it lies in, without links, for a link may lead back to one of them."""
     if not path.is_dir():
         if path.name.lower().endswith(_OTHER_TABLES):
-            warnings.warn(f"{path} is not read; {_CONVERT}", InputNote, stacklevel=4)
+            warn_user(f"{path} is not read; {_CONVERT}")
         return [path] if is_table(path) else []
     real = path.resolve()
     if real in parents or (parents and any((path / name).is_file() for name in RECORDS)):

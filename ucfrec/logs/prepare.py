@@ -19,8 +19,7 @@ from pydantic import Field, InstanceOf
 from ucfrec import schema
 from ucfrec.episodes.item_table import ITEM_STATES
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import atomic_folder, scratch_folder
 from ucfrec.logs import sessions, summary
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.features import (
@@ -33,7 +32,7 @@ from ucfrec.logs.features import (
 from ucfrec.logs.mapping import FeatureTable, LogMapping, log_files
 from ucfrec.logs.rows import SortedRows, sort_rows
 from ucfrec.logs.typed import open_log, open_log_tables
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.settings import Count, Width, require, settings_table
 
 

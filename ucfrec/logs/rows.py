@@ -450,8 +450,8 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     """Keys for `numpy.lexsort` by which, of rows of one user, time and choice, the one that counts
     is the first.
 
-    Columns besides `reward` and `row` decide between rows that are equal to the rule, so that the
-    order of rows and files does not matter.
+    Other columns decide between rows that are equal to the rule, so that the order of rows and
+    files does not matter; of rows that are equal throughout, it is the first in the files.
     """
     rewards = rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT
@@ -460,7 +460,7 @@ def order_duplicates(rows: Mapping[str, Array], duplicates: str) -> list[Array]:
     for name in (schema.OBSERVATION, schema.PROPENSITY, "session", schema.IS_RANDOM):
         if name in rows:
             keys += list(rows[name].T) if rows[name].ndim == 2 else [rows[name]]
-    return keys[::-1]
+    return [rows["row"], *keys[::-1]]
 
 
 def hash_ids(ids: Sequence[object]) -> IntArray:

@@ -23,7 +23,7 @@ from ucfrec.logs.engine import BATCH_ROWS, to_arrow, to_numpy
 from ucfrec.logs.rows import CODES, ITEM, SESSION, USER, SortedRows
 from ucfrec.logs.tables import glob_pattern, quote
 from ucfrec.logs.typed import TypedLog
-from ucfrec.progress import Progress
+from ucfrec.processes import Progress
 
 FEW_VALUES: Final = 20
 """Rewards with at most this many distinct values are counted by value, others in as many bins."""

@@ -28,7 +28,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, InputNote, one_line
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS, engine, explain_errors
 from ucfrec.logs.mapping import KEY_COLUMNS, OPTIONAL_COLUMNS, LogMapping, log_files
 from ucfrec.logs.rows import (

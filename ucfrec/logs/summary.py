@@ -1,7 +1,6 @@
 """Report on what was read of a log, dropped and kept, and warnings that its owner would want."""
 
 import re
-import warnings
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.store import LONG
-from ucfrec.errors import InputError, InputNote, one_line
+from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
@@ -204,29 +203,23 @@ def format_report(report: Mapping[str, Any]) -> str:
     for reason, rows in report["dropped"].items():
         if rows:
             lines.append((f"  dropped: {reason}", f"{rows:,}  {REASONS.get(reason, '')}"))
-    if report["conflicting_duplicates"]:
-        rule = DUPLICATES[report.get("duplicates", "highest")]
-        conflicts = f"{report['conflicting_duplicates']:,}  {CONFLICT}, which {rule}"
-        lines.append(("  conflicting duplicates", conflicts))
-    if report["equal_times"]:
-        tied = f"{report['equal_times']:,} (in no order that could be learned)"
-        lines.append(("  at equal times", tied))
-    lines += [
-        ("  out of order", f"{report['unsorted_rows']:,} (sorted, none dropped)"),
-        ("steps kept", f"{report['steps']:,}"),
-        ("users", f"{report['users']:,}"),
-    ]
-    if "items" in report:
-        lines.append(("items", f"{report['items']:,}"))
-    if report.get("unknown_propensities"):
-        unknown = f"{report['unknown_propensities']:,}  missing, NaN or infinite"
-        lines.append(("  unknown propensity", unknown))
-    lines.append(("sessions", f"{report['sessions']:,} by {report['session_by']}"))
-    if report["sessions_cut"]:
-        lines.append(("  cut at a split", f"{report['sessions_cut']:,}"))
-    if report.get("sessions_censored"):
-        censored = f"{report['sessions_censored']:,}  may have gone on after the log ended"
-        lines.append(("  censored", censored))
+
+    def add(label: str, n: int | None, text: str = "", always: bool = False) -> None:
+        if n or always:
+            lines.append((label, f"{n:,}{text}"))
+
+    rule = DUPLICATES[report.get("duplicates", "highest")]
+    add("  conflicting duplicates", report["conflicting_duplicates"], f"  {CONFLICT}, which {rule}")
+    add("  at equal times", report["equal_times"], " (in no order that could be learned)")
+    add("  out of order", report["unsorted_rows"], " (sorted, none dropped)", always=True)
+    add("steps kept", report["steps"], always=True)
+    add("users", report["users"], always=True)
+    add("items", report.get("items"))
+    add("  unknown propensity", report.get("unknown_propensities"), "  missing, NaN or infinite")
+    add("sessions", report["sessions"], f" by {report['session_by']}", always=True)
+    add("  cut at a split", report["sessions_cut"])
+    censored = "  may have gone on after the log ended"
+    add("  censored", report.get("sessions_censored"), censored)
     lines += [
         (f"  {name}", f"{count['episodes']:,} episodes, {count['steps']:,} steps")
         for name, count in report["splits"].items()
@@ -309,7 +302,7 @@ def note_dropped(
     reasons = "; ".join(f"{n:,}: {REASONS.get(reason, reason)}" for reason, n in counts.items())
     hint = f"; {_CLOCK_HINT}" if "clock_out_of_range" in counts else ""
     total = f"{sum(counts.values()):,} of {n_read:,} rows were excluded ({reasons}{hint})"
-    warnings.warn(f"{name}: {total}" if name else total, InputNote, stacklevel=3)
+    warn_user(f"{name}: {total}" if name else total)
 
 
 def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: str) -> None:
@@ -318,11 +311,9 @@ def note_unknown(name: str, column: str, unknown: int, total: int, known_ids: st
     if total < FEW_IDS or unknown < MOST_UNKNOWN * total:
         return
     ids = column.removesuffix("_id") + "s"
-    warnings.warn(
+    warn_user(
         f"{name}: {unknown:,} of {total:,} {ids} are not among those {known_ids}; if they "
-        f"should be, compare how {column} is written",
-        InputNote,
-        stacklevel=3,
+        f"should be, compare how {column} is written"
     )
 
 
@@ -377,13 +368,11 @@ def note_undefined(
         ((some, every),) = connection.sql(f"SELECT {aggregates} FROM {source}").fetchall()
         undefined, rows = undefined + some, rows + every
     if undefined:
-        warnings.warn(
+        warn_user(
             f"{first_and_more([file for table in tables for file in table.files])}: the condition "
             f"{where} is neither true nor false in {undefined:,} of {rows:,} rows, as a column is "
             "missing there, and these are excluded; to keep them, write IS DISTINCT FROM for <>, "
-            "or coalesce(…, true) around the condition",
-            InputNote,
-            stacklevel=3,
+            "or coalesce(…, true) around the condition"
         )
 
 
@@ -436,4 +425,4 @@ def note_empty_splits(rows: SortedRows, report: Mapping[str, Any]) -> None:
 
 
 def _note(rows: SortedRows, message: str) -> None:
-    warnings.warn(f"{rows.log.name}: {message}", InputNote, stacklevel=3)
+    warn_user(f"{rows.log.name}: {message}")

@@ -1,7 +1,6 @@
 """A log as one relation of typed rows: its columns, its vectors, its times, its reward."""
 
 import re
-import warnings
 from calendar import month_name
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
@@ -12,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import duckdb
 
 from ucfrec import schema
-from ucfrec.errors import InputError, InputNote
+from ucfrec.errors import InputError, warn_user
 from ucfrec.logs.engine import BATCH_ROWS, Bound, bind, explain_errors, settle_mapping, wrong_type
 from ucfrec.logs.expressions import NotScalarError, columns_of
 from ucfrec.logs.mapping import OPTIONAL_COLUMNS, LogMapping
@@ -263,11 +262,9 @@ def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
         having = [t for t in tables if name in {column.casefold() for column in t.columns}]
         files = [file for table in having for file in table.files]
         if files:
-            warnings.warn(
+            warn_user(
                 f"{name} is excluded: only {len(files)} of {count} files have it ({files[0]}); add "
-                f"it to the others, or drop it with --column {name}=",
-                InputNote,
-                stacklevel=4,
+                f"it to the others, or drop it with --column {name}="
             )
 
 
@@ -418,11 +415,9 @@ def _unify_ids(
         whole &= kind == NOTHING or all_integers
     whole &= not as_text
     if not whole and some_whole and with_decimals is not None:
-        warnings.warn(
+        warn_user(
             f"{name} is written as whole numbers and, in {with_decimals.files[0]}, with decimals: "
-            f"7 and 7.0 are two ids; to make them one, say --column {name}='COLUMN::BIGINT'",
-            InputNote,
-            stacklevel=5,
+            f"7 and 7.0 are two ids; to make them one, say --column {name}='COLUMN::BIGINT'"
         )
     for _, values in selects:
         sql, _ = values[name]

@@ -13,7 +13,7 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.arrays import Array, Float64Array
 from ucfrec.errors import InputError, InputNote
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.engine import engine, explain_errors
 from ucfrec.logs.join import FEEDBACK
 from ucfrec.logs.mapping import log_files

@@ -44,7 +44,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -257,14 +257,12 @@ class StepSums:
         return cls(len(steps.first), steps.step_totals(), rewarded)
 
     def __add__(self, other: "StepSums") -> "StepSums":
-        longest = max(len(self.totals), len(other.totals))
-
-        def pad(values: Float64Array, mode: Any) -> Float64Array:
-            return np.pad(values, (0, longest - len(values)), mode)
-
-        # Sessions that have ended keep the weight of their last step, and have no reward.
-        totals = pad(self.totals, "edge") + pad(other.totals, "edge")
-        rewarded = pad(self.rewarded, "constant") + pad(other.rewarded, "constant")
+        totals, rewarded = np.zeros((2, max(len(self.totals), len(other.totals))))
+        for sums in (self, other):
+            # Sessions that have ended keep the weight of their last step, and have no reward.
+            lacking = 0, len(totals) - len(sums.totals)
+            totals += np.pad(sums.totals, lacking, "edge")
+            rewarded += np.pad(sums.rewarded, lacking)
         return StepSums(self.sessions + other.sessions, totals, rewarded)
 
 
@@ -374,7 +372,6 @@ class Resamples:
     """(B, K) its own standard error."""
     spreads: BoolArray
     """(K,) whether clusters differ at all."""
-
     usable: BoolArray
     """(B, K) whether the resample has a spread of its own."""
 
@@ -401,16 +398,13 @@ def resample(
     unit = scale / size
     correction = np.sqrt(clusters / max(clusters - 1, 1))
     error = correction * np.sqrt((e**2).sum(axis=0)) / b.sum(axis=0)
-    moments = np.stack([e, b, e * e, e * b, b * b])
-    flat, at_once = (
-        np.moveaxis(moments, 1, 0).reshape(clusters, -1),
-        max(1, _COUNTS_AT_ONCE // clusters),
-    )
-    counts, shifts, spreads = _draw_counts(clusters, seed), [], []
+    moments = np.concatenate([e, b, e * e, e * b, b * b], axis=1)
+    counts, at_once = _draw_counts(clusters, seed), max(1, _COUNTS_AT_ONCE // clusters)
+    shifts, spreads = [], []
     for begin in range(0, RESAMPLES, at_once):
         # How often each cluster is drawn stands for the resampled rows.
         times = counts[begin : begin + at_once].astype(np.float64)
-        e, b, ee, eb, bb = (times @ flat).reshape(-1, 5, len(value)).swapaxes(0, 1)
+        e, b, ee, eb, bb = (times @ moments).reshape(-1, 5, len(value)).swapaxes(0, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             shift = np.where(b > 0, e / b, np.nan)
             spread = np.maximum(ee - 2 * shift * eb + shift**2 * bb, 0.0)

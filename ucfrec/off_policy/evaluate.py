@@ -42,7 +42,7 @@ from ucfrec.off_policy.verdict import (
     diagnose,
     list_cautions,
 )
-from ucfrec.provenance import config_hash, provenance, shorten_paths
+from ucfrec.processes import config_hash, provenance, shorten_paths
 from ucfrec.results.rows import ResultRow, ResultTable, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table
@@ -278,15 +278,9 @@ def make_report(
     steps, per_step = evidence.steps, evidence.per_step
     estimates = estimate(steps, seed)
     diagnosis = diagnose(steps, options.reward_range, evidence.segment)
-    verdict = conclude(
-        steps,
-        seed,
-        diagnosis,
-        options.wanted_lift,
-        evidence.forbidden,
-        evidence.declared,
-        options.filter_seen,
-    )
+    forbidden, declared, filter_seen = evidence.forbidden, evidence.declared, options.filter_seen
+    lift = options.wanted_lift
+    verdict = conclude(steps, seed, diagnosis, lift, forbidden, declared, filter_seen)
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
     record, choice = trained.record, "softmax" if rule.draws else "greedy"
     conditions: dict[str, Scalar] = {
@@ -294,22 +288,13 @@ def make_report(
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
-        "filter_seen": options.filter_seen,
+        "filter_seen": filter_seen,
         "sessions": len(steps.first),
         "steps": evidence.rows,
     }
-    judged = {
-        **evidence.columns,
-        "warnings": warnings,
-        **{
-            name: value
-            for name, value in asdict(verdict).items()
-            if name not in ("estimator", "reasons")
-        },
-        "verdict": str(verdict),
-        "verdict_of": verdict.estimator,
-        **diagnosis.as_columns(),
-    }
+    judged = evidence.columns | asdict(verdict) | diagnosis.as_columns()
+    judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
+    del judged["estimator"], judged["reasons"]
 
     def make_row(name: str, result: Estimate, metric: str, units: str, table: str) -> ResultRow:
         row = ResultRow(

@@ -14,8 +14,7 @@ from torch import Tensor
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.off_policy.logged_steps import Modelled
 from ucfrec.off_policy.score import ScoredSteps
-from ucfrec.processes import require_blas_memory
-from ucfrec.progress import progress
+from ucfrec.processes import progress, require_blas_memory
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 _PRODUCTS = 256

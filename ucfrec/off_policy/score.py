@@ -21,15 +21,14 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.windows import seen_before
 from ucfrec.errors import InputError
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.logs.rows import mix_bits
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.logs.summary import note_unknown
-from ucfrec.progress import progress
-from ucfrec.runs.later_logs import columns_used, reward_of
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.processes import progress
+from ucfrec.runs.trained_policy import TrainedPolicy, columns_used, reward_of
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 UNKNOWN_ITEMS = "unknown_item_rows"
@@ -176,7 +175,7 @@ def _add_history(
     rows = UserRows.of(store, users, earlier)
     if trained.record.session_by == schema.SESSION_ID:
         return store, rows
-    return rows.continued(trained.record.session_gap_ms), rows
+    return rows.continue_sessions(trained.record.session_gap_ms), rows
 
 
 def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Array
 from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.parquet import part_name, require_regular, write_frames
@@ -41,8 +41,7 @@ from ucfrec.off_policy.score import (
     training_options,
 )
 from ucfrec.off_policy.verdict import MOST_LEFT_OUT
-from ucfrec.runs.on_workers import RunOnWorkers
-from ucfrec.runs.trained_policy import ITEMS, TrainedPolicy
+from ucfrec.runs.trained_policy import ITEMS, RunOnWorkers, TrainedPolicy
 
 _BATCH_ROWS: Final = 2**18
 _TESTED_ROWS: Final = 2**20
@@ -89,8 +88,8 @@ def evaluate_scored(
     for file in files:
         for batch in _read_batches(file, _KEYS):
             users, items, times = (batch[name][::every] for name in _KEYS)
-            known = trained.users.numbers(users), trained.items.numbers(items)
-            keys.append(hash_rows(*known, times))
+            users, items = trained.users.numbers(users), trained.items.numbers(items)
+            keys.append(hash_rows(users, items, times))
     seen = share_of_rows_seen(trained, np.concatenate(keys))
     evidence = Evidence(sessions, rows, {"seen_in_training": seen})
     evidence.remarks = ["from scored rows: without models of the reward there is no DR"]
@@ -161,10 +160,9 @@ def _read_whole_sessions(files: Sequence[Path]) -> Iterator[tuple[Path, dict[str
         yield files[-1], held
 
 
-def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[LoggedSteps, IntArray]]:
-    """The sessions of all files, in order, some at once; with the number (S,) of each session's
-    user, over all of them."""
-    session, user, users = -1, None, 0
+def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[LoggedSteps, Array]]:
+    """The sessions of all files, in order, some at once; with each session's user (S,)."""
+    session = -1
     for file, rows in _read_whole_sessions(files):
         rises = np.diff(rows[SESSION], prepend=session)
         if rises[0] != 1 or not np.isin(rises, (0, 1)).all():
@@ -172,9 +170,6 @@ def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[Logged
                 f"{file}: sessions are not numbered in order; give all files of ucfrec score as it "
                 "wrote them, none twice"
             )
-        owners = rows[schema.USER_ID][rises == 1]
-        new = np.append(owners[0] != user, owners[1:] != owners[:-1])
-        numbers = users - 1 + np.cumsum(new)
         try:
             steps = LoggedSteps(
                 rows[SESSION] - rows[SESSION][0],
@@ -185,8 +180,8 @@ def _read_steps(files: Sequence[Path], discount: float) -> Iterator[tuple[Logged
             )
         except InputError as error:
             raise InputError(f"{file}: {error}; name what ucfrec score wrote, unchanged") from None
-        yield steps, numbers
-        session, user, users = rows[SESSION][-1], owners[-1], int(numbers[-1]) + 1
+        yield steps, rows[schema.USER_ID][rises == 1]
+        session = rows[SESSION][-1]
 
 
 def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedSteps:
@@ -236,7 +231,8 @@ def score_with_spark(
     filter_seen: bool = False,
     memory_limit: str = "2GB",
 ) -> int:
-    """Write the probability of every choice of logs, as `score` finds it.
+    """Write the probability of every choice of logs, as `score` finds it; returns how many sessions
+    there are.
 
     Args:
         files: logs, which every worker sees, as the run folder and `out`.
@@ -245,9 +241,6 @@ def score_with_spark(
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
-
-    Returns:
-        The number of sessions.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, or Spark is missing

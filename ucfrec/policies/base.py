@@ -72,15 +72,6 @@ class PolicyConfig:
     sampled_items: Annotated[int, Field(ge=1, le=10**7)] = 2048
     """Items that are sampled for a training batch of a large catalogue."""
 
-    def samples_of(self, n_items: int) -> int:
-        """Items that a training batch samples from `n_items`; 0 for all."""
-        return self.sampled_items if n_items > self.sampled_above else 0
-
-    @property
-    def exposure_lags(self) -> int:
-        """Earlier steps that the exposure term reads; 0 for no such term."""
-        return min(self.exposure_window, self.context - 1) if self.exposure else 0
-
     def returns(self, session_by: str | None) -> ReturnToGo:
         """What returns-to-go count in a log whose sessions are made `session_by`."""
         definition = self.return_to_go
@@ -123,9 +114,9 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        self.head = head_from(
-            sizes, config.dim, config.exposure_lags, config.samples_of(sizes["items"])
-        )
+        lags = min(config.exposure_window, config.context - 1) if config.exposure else 0
+        samples = config.sampled_items if sizes["items"] > config.sampled_above else 0
+        self.head = head_from(sizes, config.dim, lags, samples)
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 
@@ -341,7 +332,7 @@ def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
     padding = (~mask).sum(1, keepdim=True)
     places = torch.arange(length, device=mask.device)
 
-    def rolled(x: Tensor, by: Tensor) -> Tensor:
+    def roll(x: Tensor, by: Tensor) -> Tensor:
         return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
 
-    return rolled(network(rolled(inputs, padding))[0], -padding)
+    return roll(network(roll(inputs, padding))[0], -padding)

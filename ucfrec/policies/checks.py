@@ -57,8 +57,17 @@ def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str
     policy.eval()
     try:
         _check_answer(policy, train)
-        _check_padding(policy, train)
-        windows = _sample(train, policy.config.context)
+        windows, most = _sample(train, policy.config.context), max(policy.config.context // 2, 1)
+        padded = _sample(train, policy.config.context, most)
+        rows = [_outputs(policy, part) for part in (padded, padded.last(most))]
+        (features, acts), (short_features, short_acts) = rows
+        alike = _alike(short_features[:, -1], features[:, -1], _ROUNDING)
+        if not (alike and _alike(short_acts, acts, _ROUNDING)):
+            _refuse(
+                policy,
+                "depends on how much padding is before a session; leave steps out where "
+                "windows.mask is false (for a recurrent network: ucfrec.policies.base.recurrent)",
+            )
         if policy.make_solver(train, None, Path(), 0) is None:
             with torch.enable_grad():
                 pair = policy.loss(windows.at(slice(0, 2)))
@@ -95,22 +104,6 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
         "reads what it is to predict: its output at a step depends on the action or reward of that "
         "step, or on a later step; shift the actions and rewards by one step, or mask later ones",
     )
-
-
-def _check_padding(policy: SequencePolicy, train: EpisodeStore) -> None:
-    most = max(policy.config.context // 2, 1)
-    padded = _sample(train, policy.config.context, most)
-    features, acts = _outputs(policy, padded)
-    short_features, short_acts = _outputs(policy, padded.last(most))
-    if not (
-        _alike(short_features[:, -1], features[:, -1], _ROUNDING)
-        and _alike(short_acts, acts, _ROUNDING)
-    ):
-        _refuse(
-            policy,
-            "depends on how much padding is before a session; leave steps out where windows.mask "
-            "is false (for a recurrent network: ucfrec.policies.base.recurrent)",
-        )
 
 
 def _sample(train: EpisodeStore, length: int, most: int | None = None) -> Windows:

@@ -73,14 +73,14 @@ class CRMGreedyPolicy(SequencePolicy):
         if not isinstance(model, ItemRewardModel):
             return None
         if validation is None:
-            held_out = np.arange(train.n_episodes) % 10 == 1
-            validation = train.select(np.flatnonzero(held_out))
-            train = train.select(np.flatnonzero(~held_out))
+            tenth = np.arange(train.n_episodes) % 10 == 1
+            validation = train.select(np.flatnonzero(tenth))
+            train = train.select(np.flatnonzero(~tenth))
 
-        views = train, validation
+        held_out = validation
 
         def solve() -> None:
-            fitted, _ = fit_item_reward_model(*views, folder, seed)
+            fitted, _ = fit_item_reward_model(train, held_out, folder, seed)
             model.load_state_dict(fitted.state_dict())
 
         return solve
@@ -116,17 +116,14 @@ class CRMGreedyPolicy(SequencePolicy):
         users that are not known, or the best action vectors (B, A)."""
         if isinstance(self.model, ItemRewardModel):
             return self.model.scores(windows.states[:, -1], Shown.before_last(windows))
-        values = self._values(self.model, self.normalize(windows).states[:, -1])
-        return self.candidates[values.argmax(1)]
-
-    def _values(self, model: nn.Sequential, states: Tensor) -> Tensor:
-        """Predicted standardised rewards (B, n_candidates) in states (B, S)."""
-        first, *layers = model
+        states = self.normalize(windows).states[:, -1]
+        first, remaining = self.model[0], self.model[1:]
         assert isinstance(first, nn.Linear)
         # The first layer is linear: its state part is computed once per state and its action part
         # once per candidate, instead of both once per pair.
         size = states.shape[1]
         of_actions = F.linear(self.candidates, first.weight[:, size:], first.bias)
-        of_states, remaining = F.linear(states, first.weight[:, :size]), nn.Sequential(*layers)
+        of_states = F.linear(states, first.weight[:, :size])
         chunks = torch.split(of_states, max(1, _PAIRS // len(of_actions)))
-        return torch.cat([remaining(rows.unsqueeze(1) + of_actions).squeeze(-1) for rows in chunks])
+        values = [remaining(rows.unsqueeze(1) + of_actions).squeeze(-1) for rows in chunks]
+        return self.candidates[torch.cat(values).argmax(1)]

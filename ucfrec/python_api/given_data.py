@@ -14,11 +14,10 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arguments import require_ids, shown
 from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 from ucfrec.logs.histories import log_table
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
@@ -26,8 +25,8 @@ from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import Histories, histories_of_frame, select_users
-from ucfrec.runs.later_logs import later_logs
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, later_logs
+from ucfrec.settings import require_ids, shown
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]
 """A frame with one row per interaction; or files, folders and globs."""

@@ -14,29 +14,20 @@ from typing import Any, Final, Self
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arguments import (
-    check_arguments,
-    require_kind,
-    require_list,
-    require_number,
-    require_seed,
-    require_whole,
-)
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, InputNote
 from ucfrec.evaluation.ranking_table import require_one_catalogue
 from ucfrec.evaluation.simulator import Environment
-from ucfrec.files.atomic import atomic_folder
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import atomic_folder, scratch_folder
+from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.fitting.loop import Callbacks, Watcher
-from ucfrec.fitting.metrics_log import read_metrics
 from ucfrec.logs.append import AppendOptions
 from ucfrec.logs.mapping import LogFiles
 from ucfrec.logs.rows import DAY_MS
 from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
-from ucfrec.provenance import shorten_paths
+from ucfrec.processes import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,
@@ -57,6 +48,14 @@ from ucfrec.reporting.page import write_report
 from ucfrec.results.rows import Evaluation, Ranking, ResultTable
 from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.settings import (
+    check_arguments,
+    require_kind,
+    require_list,
+    require_number,
+    require_seed,
+    require_whole,
+)
 from ucfrec.updating.update import UpdateOptions, update_run
 
 _OWN = ("policy", "settings", "seed")

@@ -42,6 +42,29 @@ _COMPARED: Final = 16
 """Random sessions on which a graph is compared with torch."""
 _MOST_EXCLUDED: Final = 0.5
 """Largest share of the items that these exclude, where the graph answers single requests."""
+_MEANINGS: Final = {
+    "items": "index of each item shown in the session, the latest last; -1 before the session "
+    "began",
+    "rewards": "reward of each; 0 before the session began",
+    "steps": "number of items that the session has shown",
+    "collected": "sum of the rewards of the session",
+    "users": "index of the user in user_ids; -1 for others",
+    _EXCLUDED: "items that may not be shown, e.g. those already seen; padded with -1, at least one "
+    "column",
+    _OBSERVATIONS: "of the last steps, the one to decide included; `ucfrec recommend` repeats the "
+    "last",
+    "scores": "policy_weight times the policy's log-probability plus reward_weight times what the "
+    "reward model says, with a lookahead also of what follows, up to a constant; -inf for items "
+    "that `excluded`, tag_window or tag_run leave out",
+    "top_items": "index of the best items; -1 if fewer are left",
+    "top_scores": "their log-probabilities at temperature 1, nats",
+}
+_NOTES: Final = (
+    "the graph applies target, minimum_target, policy_weight, reward_weight, lookahead, tag_window "
+    "and tag_run; with exclude_seen, put the session's items into `excluded`; with a temperature, "
+    "draw from `scores` divided by it, with top_k among so many best; with explore, draw that "
+    "share of the requests uniformly, with explore_top among so many best"
+)
 _SERVE: Final = "use `ucfrec serve` or `recommend --stream`"
 _TORCH: Final = "use --engine torch"
 
@@ -99,7 +122,22 @@ def export(
     return Exported(sum(sizes.values()), difference)
 
 
-class RuleGraph(nn.Module):
+class _Network(nn.Module):
+    """A scorer as a module, with its weights."""
+
+    def __init__(self, scorer: Scorer) -> None:
+        super().__init__()
+        models = (scorer.policy, scorer.reward_model)
+        self.scorer = scorer
+        self._models = nn.ModuleList(model for model in models if model is not None)
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
+        *session, excluded = inputs
+        return self.scorer.scores(Sessions(*session), excluded=excluded, empty=True)
+
+
+class RuleGraph(_Network):
     """Scores of all items for B sessions, see `Scorer.scores`, and the `k` best."""
 
     def __init__(self, scorer: Scorer, kind: str, k: int | None) -> None:
@@ -107,7 +145,6 @@ class RuleGraph(nn.Module):
         Raises:
             InputError: the policy has vector actions, or scores items in a way of its own.
         """
-        super().__init__()
         if scorer.states is None:
             raise InputError(
                 "this policy's actions are vectors; only policies of items can be exported"
@@ -124,10 +161,10 @@ class RuleGraph(nn.Module):
             raise InputError(
                 f"--k is {k}; the run has {items:,} items: give a whole number from 1 to {most:,}"
             )
-        self.scorer, self.k, self._items = scorer, k, items
-        self._parts = _list_modules(scorer)
+        super().__init__(scorer)
+        self.k, self._items = k, items
 
-    def forward(
+    def forward(  # type: ignore[override]
         self,
         items: Tensor,
         rewards: Tensor,
@@ -172,17 +209,14 @@ def find_best(scores: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 class ScoreGraph:
-    """`Scorer.scores` of one session, by onnxruntime and one thread."""
+    """`Scorer.scores` of one session, by onnxruntime and one thread.
+
+    Raises:
+        InputError: the extra `export` is not installed, the policy scores items in a way of its own
+            or cannot be exported, or what the graph gives differs from torch's.
+    """
 
     def __init__(self, scorer: Scorer, kind: str) -> None:
-        """
-        Args:
-            scorer: of a policy; its weights must not change afterwards.
-
-        Raises:
-            InputError: the extra `export` is not installed, the policy scores items in a way of its
-                own or cannot be exported, or what the graph gives differs from torch's.
-        """
         _require_installed()
         if not scorer.has_factors:
             raise InputError(
@@ -216,24 +250,6 @@ class ScoreGraph:
         shown."""
         inputs = {**_name_inputs(session), _EXCLUDED: excluded}
         return torch.from_numpy(_run_graph(self._runner, inputs)[0])
-
-
-class _Network(nn.Module):
-    """The scores of one session as a module."""
-
-    def __init__(self, scorer: Scorer) -> None:
-        super().__init__()
-        self._scorer, self._parts = scorer, _list_modules(scorer)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Scores; the inputs are the fields of `Sessions`, and last what may not be shown."""
-        *session, excluded = inputs
-        return self._scorer.scores(Sessions(*session), excluded=excluded, empty=True)
-
-
-def _list_modules(scorer: Scorer) -> nn.ModuleList:
-    models = (scorer.policy, scorer.reward_model)
-    return nn.ModuleList(model for model in models if model is not None)
 
 
 def _draw_sessions(scorer: Scorer, sessions: int, seed: int) -> Sessions:
@@ -307,14 +323,8 @@ def measure_magnitude(scorer: Scorer) -> float:
 
 
 def require_close(pairs: Iterable[tuple[Array, Tensor]], remedy: str, size: float) -> float:
-    """The largest difference of a graph's numbers to torch's, relative to max(size, |number|).
-
-    Args:
-        size: see `measure_magnitude`.
-
-    Raises:
-        InputError: it is beyond the tolerance.
-    """
+    """The largest difference of a graph's numbers to torch's, relative to max(size, |number|), with
+    the size of `measure_magnitude`; InputError beyond the tolerance."""
     largest = 0.0
     for theirs, tensor in pairs:
         ours = tensor.numpy()
@@ -350,19 +360,14 @@ def _write_graph(
     remedy: str,
     shapes: dict[str, Any] | None = None,
 ) -> None:
-    """Write a module as an ONNX graph with its weights.
+    """Write a module in evaluation mode as an ONNX graph with its weights.
 
     Weights of more than 1.5 GB lie beside it, in a file with `.data` appended to its name: the file
     of a graph ends at 2 GB.
 
     Args:
-        module: in evaluation mode.
         names: of the inputs and of the outputs.
-        remedy: what to do where it cannot be exported.
         shapes: sizes that may vary; None for those of the example alone.
-
-    Raises:
-        InputError: torch cannot export it.
     """
     try:
         with _quiet(), torch.no_grad():
@@ -405,62 +410,39 @@ def _quiet() -> Any:
 
 def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
-    rule, record, length = graph.scorer.rule, trained.record, graph.scorer.length
-    items, k, b = len(trained.items), graph.k, "batch"
-    context = graph.scorer.policy.config.context
-    inputs: list[tuple[str, str, list[int | str], str]] = [
-        (
-            "items",
-            "int64",
-            [b, length],
-            "index of each item shown in the session, the latest last; -1 before the session began",
-        ),
-        ("rewards", "float32", [b, length], "reward of each; 0 before the session began"),
-        ("steps", "int64", [b], "number of items that the session has shown"),
-        ("collected", "float64", [b], "sum of the rewards of the session"),
-        ("users", "int64", [b], "index of the user in user_ids; -1 for others"),
-        (
-            _EXCLUDED,
-            "int64",
-            [b, "excluded_items"],
-            "items that may not be shown, e.g. those already seen; padded with -1, at least one "
-            "column",
-        ),
-        (
-            _OBSERVATIONS,
-            "float32",
-            [b, context, record.observation_size],
-            "of the last steps, the one to decide included; `ucfrec recommend` repeats the last",
-        ),
-    ]
-    outputs: list[tuple[str, str, list[int | str], str]] = [
-        (
-            "scores",
-            "float32",
-            [b, items],
-            "policy_weight times the policy's log-probability plus reward_weight times what the "
-            "reward model says, with a lookahead also of what follows, up to a constant; -inf for "
-            "items that `excluded`, tag_window or tag_run leave out",
-        ),
-        ("top_items", "int64", [b, k], "index of the best items; -1 if fewer are left"),
-        ("top_scores", "float32", [b, k], "their log-probabilities at temperature 1, nats"),
-    ]
-    if not record.observation_size:
-        del inputs[-1]
-    names = ("name", "dtype", "shape", "meaning")
+    rule, record, b = graph.scorer.rule, trained.record, "batch"
+    length, context = graph.scorer.length, graph.scorer.policy.config.context
+    inputs: dict[str, tuple[str, list[str | int]]] = {
+        "items": ("int64", [b, length]),
+        "rewards": ("float32", [b, length]),
+        "steps": ("int64", [b]),
+        "collected": ("float64", [b]),
+        "users": ("int64", [b]),
+        _EXCLUDED: ("int64", [b, "excluded_items"]),
+    }
+    if record.observation_size:
+        inputs[_OBSERVATIONS] = ("float32", [b, context, record.observation_size])
+    outputs: dict[str, tuple[str, list[str | int]]] = {
+        "scores": ("float32", [b, len(trained.items)]),
+        "top_items": ("int64", [b, graph.k]),
+        "top_scores": ("float32", [b, graph.k]),
+    }
+    described_inputs, described_outputs = (
+        [
+            {"name": name, "dtype": dtype, "shape": shape, "meaning": _MEANINGS[name]}
+            for name, (dtype, shape) in tensors.items()
+        ]
+        for tensors in (inputs, outputs)
+    )
     return {
         "format": 1,
         "ucfrec": __version__,
         "graph": GRAPH,
-        "inputs": [dict(zip(names, tensor, strict=True)) for tensor in inputs],
-        "outputs": [dict(zip(names, tensor, strict=True)) for tensor in outputs],
+        "inputs": described_inputs,
+        "outputs": described_outputs,
         "rule": rule.as_dict(),
         "rule_hash": rule.hash,
-        "rule_notes": "the graph applies target, minimum_target, policy_weight, reward_weight, "
-        "lookahead, tag_window and tag_run; with exclude_seen, put the session's items into "
-        "`excluded`; with a temperature, draw from `scores` divided by it, with top_k among so "
-        "many best; with explore, draw that share of the requests uniformly, with explore_top "
-        "among so many best",
+        "rule_notes": _NOTES,
         "policy": trained.name,
         "reward": record.reward,
         "session_by": record.session_by,

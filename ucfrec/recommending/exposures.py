@@ -51,11 +51,7 @@ def exposure_schema(trained: TrainedPolicy) -> pa.Schema:
 def exposures_written(
     path: Path, trained: TrainedPolicy, rule: str, frames: Iterable[pd.DataFrame]
 ) -> Iterator[Iterator[pd.DataFrame]]:
-    """Yield the same frames, which are also written to a file, whole once the block ends.
-
-    Args:
-        frames: of `recommend`.
-    """
+    """Yield the same frames of `recommend`, also written to a file, whole once the block ends."""
     columns, now = exposure_schema(trained), int(time.time() * 1000)
     constants: dict[str, str | int] = {
         schema.RUN: trained.fingerprint, schema.RULE: rule, schema.TIMESTAMP: now, schema.ARM: ""
@@ -155,25 +151,23 @@ class ExposureLog:
             time.sleep(min(1.0, self._seconds))
 
     def _table(self, waiting: "list[tuple[str, int, Answer]]") -> pa.Table:
-        rows = [
-            (
-                user_id,
-                item,
-                now,
-                answer.request_id,
-                position,
-                propensity,
-                answer.run,
-                answer.rule,
-                answer.arm,
-            )
-            for user_id, now, answer in waiting
-            for position, (item, propensity) in enumerate(
-                zip(answer.items, answer.propensities, strict=True), start=1
-            )
-        ]
-        columns = zip(self._schema.names, zip(*rows, strict=True), strict=True)
-        return pa.table(dict(columns), self._schema)
+        columns: dict[str, list[object]] = {name: [] for name in self._schema.names}
+        for user_id, now, answer in waiting:
+            size = len(answer.items)
+            values: dict[str, Iterable[object]] = {
+                schema.USER_ID: [user_id] * size,
+                schema.ITEM_ID: answer.items,
+                schema.TIMESTAMP: [now] * size,
+                schema.REQUEST_ID: [answer.request_id] * size,
+                schema.POSITION: range(1, size + 1),
+                schema.PROPENSITY: answer.propensities,
+                schema.RUN: [answer.run] * size,
+                schema.RULE: [answer.rule] * size,
+                schema.ARM: [answer.arm] * size,
+            }
+            for name, column in columns.items():
+                column += values[name]
+        return pa.table(columns, self._schema)
 
 
 def _warn(message: str) -> None:

@@ -20,8 +20,7 @@ from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.logs.rows import choose_rows
-from ucfrec.runs.later_logs import columns_used, reward_of
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, columns_used, reward_of
 
 _MOST_PLAIN_ROWS = 1_000_000
 """Rows up to which a frame is read at once, not in batches of users."""
@@ -57,7 +56,7 @@ class Histories:
         seen_owner, seen_ids = _flatten(batch.column("seen"))
         session_ids = observations = None
         if "session_ids" in batch.schema.names:
-            session_ids = _flatten(batch.column("session_ids"))[1]
+            session_ids = np.asarray(batch.column("session_ids").flatten())
         if schema.OBSERVATION in batch.schema.names:
             column = batch.column(schema.OBSERVATION)
             observations = np.asarray(column.flatten(), np.float32).reshape(len(column), -1)
@@ -65,8 +64,8 @@ class Histories:
             users=np.asarray(batch.column(schema.USER_ID)),
             owner=owner,
             item_ids=item_ids,
-            rewards=_flatten(batch.column("rewards"))[1].astype(np.float32),
-            timestamps=_flatten(batch.column("timestamps"))[1].astype(np.int64),
+            rewards=np.asarray(batch.column("rewards").flatten(), np.float32),
+            timestamps=np.asarray(batch.column("timestamps").flatten(), np.int64),
             session_ids=session_ids,
             seen_owner=seen_owner,
             seen_ids=seen_ids,
@@ -146,10 +145,7 @@ class Histories:
 
         With `session_ids`, these are the rows with the session id of the user's last row. Without,
         the session begins after the last pause of more than `gap_ms` milliseconds, or with the
-        user's first row if `gap_ms` is None.
-
-        Args:
-            new: (U,) users who begin a new session, which has no rows yet; None for no one.
+        user's first row if `gap_ms` is None. That of users who begin a `new` one (U,) has no rows.
         """
         if new is not None and new.any():
             return self.with_rows(~new[self.owner]).latest_session(gap_ms)
@@ -197,11 +193,10 @@ def histories_of_files(
     mapping: LogMapping,
     memory_limit: str = "2GB",
 ) -> Iterator[Histories]:
-    """Read histories from log files in batches of users, users in sorted order.
+    """Read histories from log files, folders and globs in batches of users, in sorted order.
 
     Args:
         trained: policy whose reward expression, session rule and observations apply.
-        files: log files, folders and globs.
         mapping: names of the columns; what it leaves open is as in the training log.
         memory_limit: of the process, such as "2GB"; rows spill to disk.
 
@@ -223,19 +218,13 @@ def histories_of_files(
 def histories_of_frame(
     trained: TrainedPolicy, frame: pd.DataFrame, mapping: LogMapping, stored: bool = False
 ) -> Iterator[Histories]:
-    """Read histories from a frame in batches of users, users in sorted order.
+    """`histories_of_files` of a frame with one row per interaction.
 
     Rewards are the frame's column `reward`, unless the run's reward expression computes with a
     column of that name; otherwise that expression over the frame's columns.
 
     Args:
-        trained: policy whose reward expression, session rule and observations apply.
-        frame: one row per interaction.
-        mapping: names of the columns; what it leaves open is as in the training log.
         stored: whether the frame is of a store, whose column `reward` is what was computed.
-
-    Raises:
-        InputError: a column is missing, or has values that cannot be used.
     """
     record, columns = trained.record, {str(name) for name in getattr(frame, "columns", ())}
     computed = not stored and computes_with_reward(record.reward)
@@ -262,11 +251,8 @@ def histories_of_frame(
 
 
 def select_users(batches: Iterable[Histories], users: Array) -> Iterator[Histories]:
-    """The histories of the named users only, in the order of `batches`.
-
-    Raises:
-        InputError: one of them has no rows; once all are read.
-    """
+    """The histories of the named users only, in the order of `batches`; InputError if one of them
+    has no rows, once all are read."""
     lookup = IdLookup(pd.unique(users))
     has_rows = np.zeros(len(lookup), dtype=bool)
     for batch in batches:

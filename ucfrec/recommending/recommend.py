@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
-from ucfrec.arguments import require_ids, require_whole
 from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.windows import Sessions
@@ -21,6 +20,7 @@ from ucfrec.errors import InputError
 from ucfrec.logs.rows import mix_bits
 from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.settings import require_ids, require_whole
 
 RANK: Final = "rank"
 SCORE: Final = "score"
@@ -212,14 +212,8 @@ class Chooser:
 
 
 def candidate_numbers(index: IdLookup, ids: Array, skip_unknown: bool) -> IntArray:
-    """Numbers (N,) of the items that may be recommended.
-
-    Args:
-        skip_unknown: leave out those that the policy does not know.
-
-    Raises:
-        InputError: the policy does not know some of them, or with `skip_unknown`, any.
-    """
+    """Numbers (N,) of the items that may be recommended; InputError if the policy does not know
+    some of them, or any with `skip_unknown`, which leaves those out."""
     numbers = index.numbers(ids)
     in_catalogue = numbers >= 0
     if not (in_catalogue.any() if skip_unknown else in_catalogue.all()):
@@ -305,13 +299,8 @@ class ItemIndex:
     """
 
     def __init__(self, scorer: Scorer, kind: str) -> None:
-        """
-        Args:
-            scorer: of a policy of items; its weights must not change afterwards.
-
-        Raises:
-            InputError: faiss is not installed, or the rule or the policy need scores of all items.
-        """
+        """Index the items of a policy, whose weights must not change afterwards; InputError if
+        faiss is not installed, or the rule or the policy need scores of all items."""
         try:
             import faiss
         except ModuleNotFoundError:

@@ -38,8 +38,7 @@ from ucfrec.logs.histories import FrameTable
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.logs.tables import is_number
 from ucfrec.recommending.histories import Histories
-from ucfrec.runs.later_logs import reward_of
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import TrainedPolicy, reward_of
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]
@@ -62,11 +61,7 @@ _MEMORY: Final = "256MB"
 
 
 def _parse_time(value: float | str) -> float:
-    """A time of a request in milliseconds since 1970.
-
-    Raises:
-        ValueError: it is text, but not of ISO 8601.
-    """
+    """A time of a request in milliseconds since 1970; ValueError for text that is not ISO 8601."""
     if not isinstance(value, str):
         return value
     try:
@@ -119,44 +114,21 @@ class Request(BaseModel):
     Lists are read up to their first fault: a message about every element would take seconds.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config = ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True)
 
     user_id: Id
     """Identifier in the training logs, or any other."""
-    history: Annotated[
-        list[Row],
-        Field(
-            description="The user's interactions, in any order; empty for a new user.",
-            fail_fast=True,
-        ),
-    ] = []
-    k: Annotated[int, Field(ge=1, description="Number of items.")] | None = None
-    candidates: (
-        Annotated[
-            list[Id],
-            Field(min_length=1, description="The only items to recommend.", fail_fast=True),
-        ]
-        | None
-    ) = None
-    new_session: Annotated[
-        bool,
-        Field(
-            description="Whether the user begins a new session. Otherwise the latest one of the "
-            "history goes on."
-        ),
-    ] = False
-    request_id: (
-        Annotated[
-            str,
-            Field(
-                min_length=1,
-                max_length=200,
-                description="Identifies the request: a repetition gets the same items. Without "
-                "one, the server makes one.",
-            ),
-        ]
-        | None
-    ) = None
+    history: Annotated[list[Row], Field(fail_fast=True)] = []
+    """The user's interactions, in any order; empty for a new user."""
+    k: Annotated[int, Field(ge=1)] | None = None
+    """Number of items."""
+    candidates: Annotated[list[Id], Field(min_length=1, fail_fast=True)] | None = None
+    """The only items to recommend."""
+    new_session: bool = False
+    """Whether the user begins a new session. Otherwise the latest one of the history goes on."""
+    request_id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    """Identifies the request: a repetition gets the same items. Without one, the server makes one.
+    """
 
 
 class StreamRequest(Request):
@@ -168,11 +140,7 @@ class StreamRequest(Request):
 
 
 def parse(kind: type[Request], text: bytes, limits: Limits) -> Any:
-    """Read a request of a kind, `Request` or a subclass.
-
-    Raises:
-        InputError: it is not such a request, or too large.
-    """
+    """Read a request of a kind, `Request` or a subclass; InputError for another or a larger one."""
     if len(text) > limits.bytes:
         raise InputError(f"the request has more than {limits.bytes:,} bytes; send fewer rows")
     try:
@@ -246,11 +214,7 @@ class RowRewards:
         self._stack.close()
 
     def of_rows(self, rows: Sequence[Mapping[str, Any]]) -> list[float]:
-        """Rewards (N,) of rows.
-
-        Raises:
-            InputError: a reward or feedback is missing, not finite or too large.
-        """
+        """Rewards (N,) of rows; InputError for one that is missing, not finite or too large."""
         if not rows:
             return []
         rewards = [row.get(schema.REWARD) for row in rows]
@@ -351,11 +315,8 @@ class HistoryReader:
         )
 
     def read(self, rows: Sequence[Row], user_id: int | str) -> Histories:
-        """The history of the rows of one user.
-
-        Raises:
-            InputError: a row lacks something, or has a time or reward that cannot be used.
-        """
+        """The history of the rows of one user; InputError for a row that lacks something, or has a
+        time or reward that cannot be used."""
         if self.observation_size and not rows:
             raise InputError("the policy needs the last observation; give a row of history with it")
         items = id_array([row["item_id"] for row in rows])
@@ -414,16 +375,14 @@ class HistoryReader:
 
 def _read_times(rows: Sequence[Row]) -> list[int]:
     latest = time.time() * 1000 + DAY_MS
-    times = []
-    for n, row in enumerate(rows):
-        # DuckDB rounds halves away from zero.
-        when = math.floor(float(row["timestamp"]) + 0.5)
+    # DuckDB rounds halves away from zero.
+    times = [math.floor(float(row["timestamp"]) + 0.5) for row in rows]
+    for n, when in enumerate(times):
         if not _EARLIEST_MS <= when <= latest:
             raise InputError(
-                f"history.{n}: timestamp {row['timestamp']} is before 1971 or more than a day "
+                f"history.{n}: timestamp {rows[n]['timestamp']} is before 1971 or more than a day "
                 "ahead of now; give milliseconds since 1970, or ISO 8601 text"
             )
-        times.append(when)
     return times
 
 

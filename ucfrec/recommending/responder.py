@@ -87,15 +87,13 @@ def exact_id(value: int | str) -> int | str:
 
 
 class _Question(NamedTuple):
-    """A request that can be answered."""
+    """A request that can be answered, with its history and candidates as numbers of items."""
 
     request: Request
     request_id: str
     k: int
     history: Histories
-    """Of its user, with the policy's numbers of items."""
     candidates: IntArray | None
-    """(c,) index of the only items to recommend; None for all."""
 
 
 class Responder:
@@ -116,11 +114,11 @@ class Responder:
         seed: int = 0,
         engine: str = TORCH,
     ) -> None:
-        """
+        """As `recommend`; draws depend on user and request_id.
+
         Args:
             k: items for requests that do not say how many.
-            engine: what computes the scores of a request that comes alone, one of `ENGINES`. The
-                others are as of `recommend`; draws depend on user and request_id.
+            engine: what computes the scores of a request that comes alone, one of `ENGINES`.
 
         Raises:
             InputError: the policy's actions are vectors, the rule does not fit the policy, `k` is
@@ -149,10 +147,8 @@ class Responder:
         update = self.trained.record.update
         drift = (update and update.drift) or {}
         means = {f"update_{name}": Mean(float(value), 1.0) for name, value in drift.items()}
-        return means | {
-            "unknown_items": self._unknown_items,
-            "unknown_users": self._unknown_users,
-        }
+        unknown = {"unknown_items": self._unknown_items, "unknown_users": self._unknown_users}
+        return means | unknown
 
     def described(self) -> dict[str, Any]:
         """What answers, for the health page."""
@@ -168,11 +164,8 @@ class Responder:
         self._reader.rewards.close()
 
     def answers(self, requests: Sequence[Request]) -> list[Answer | InputError]:
-        """Answer requests with as few forward passes as memory allows.
-
-        Returns:
-            In the order of the requests: the answer, or what is wrong with the request.
-        """
+        """Answer requests with as few forward passes as memory allows: to each, in their order, the
+        answer, or what is wrong with it."""
         with self._busy:
             outcomes = [self._read_or_refuse(request) for request in requests]
             questions = [question for question in outcomes if isinstance(question, _Question)]
@@ -243,11 +236,8 @@ class _Arm(NamedTuple):
 
 
 def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
-    """Index of a user's arm: users are divided by a hash of their identifier, the same for ever.
-
-    Args:
-        shares: of the arms, which add up to 1.
-    """
+    """Index of a user's arm of those with the shares, which add up to 1: users are divided by a
+    hash of their identifier, the same for ever."""
     place = xxhash.xxh3_64_intdigest(f"arm {user_id}".encode()) % _UNITS / _UNITS
     for number, share in enumerate(shares):
         place -= share
@@ -257,11 +247,7 @@ def arm_of(user_id: int | str, shares: Sequence[float]) -> int:
 
 
 def parse_split(text: str) -> dict[str, float]:
-    """Read `A=0.9,B=0.1`: names of runs and their shares of the users.
-
-    Raises:
-        InputError: it is written otherwise, or the shares do not add up to 1.
-    """
+    """Read `A=0.9,B=0.1`: names of runs and their shares of the users; or raise InputError."""
     shares: dict[str, float] = {}
     for part in text.split(","):
         name, _, share = part.partition("=")
@@ -342,15 +328,12 @@ class Served:
         return page
 
     def drift(self) -> dict[str, Mean]:
-        """See `Responder.drift`; of the first arm."""
+        """`Responder.drift` of the first arm."""
         return self._arms[0].responder.drift()
 
     def check(self) -> None:
-        """Answer with the current run from now on, if it is another one and passes a trial.
-
-        Raises:
-            InputError: no run is current.
-        """
+        """Answer with the current run from now on, if it is another one and passes a trial;
+        InputError if none is current."""
         current = self._current()
         if current == self._known:
             return

@@ -51,11 +51,7 @@ def server_config(application: Any, **more: Any) -> uvicorn.Config:
 
 @contextmanager
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket bound to an address.
-
-    Raises:
-        InputError: nothing can be bound there.
-    """
+    """A socket bound to an address; InputError if nothing can be bound there."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port is {port}; give a number from 0 to 65,535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -79,13 +75,9 @@ def ready_line(what: str, listening: socket.socket, page: str = "/docs") -> str:
 
 
 class Server(uvicorn.Server):
-    """A server that reports when it is ready."""
+    """A server that reports when it is ready, with the socket on which it answers from then on."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[socket.socket], None]) -> None:
-        """
-        Args:
-            ready: is called with the socket on which requests are answered from now on.
-        """
         super().__init__(config)
         self._ready = ready
 
@@ -134,15 +126,13 @@ class Parent:
 
     def ready(self, what: str) -> None:
         """Report that the worker answers, and with what."""
-        self._report("ready", what)
+        with suppress(OSError):  # the parent has ended
+            self._connection.send(("ready", what))
 
     def failed(self, why: str) -> None:
         """Report why the worker cannot start."""
-        self._report("failed", why)
-
-    def _report(self, news: str, text: str) -> None:
-        with suppress(OSError):  # the parent has ended
-            self._connection.send((news, text))
+        with suppress(OSError):
+            self._connection.send(("failed", why))
 
     def close(self) -> None:
         """End the thread that listens to the parent: Python ends in order only without it."""
@@ -194,13 +184,9 @@ class _Worker:
 
 
 class Workers:
-    """Processes that answer on one socket; whichever ends is replaced."""
+    """Processes that answer on one bound socket, closed at the end; whichever ends is replaced."""
 
     def __init__(self, work: Work, listening: socket.socket) -> None:
-        """
-        Args:
-            listening: a socket that is bound; closed at the end.
-        """
         self._work, self._listening = work, listening
         self._workers: list[_Worker] = []
         self._first = True
@@ -216,11 +202,8 @@ class Workers:
         self._folder.cleanup()
 
     def start(self, count: int) -> str:
-        """Start so many workers, and wait until all answer; returns what they answer with.
-
-        Raises:
-            InputError: one cannot start; the reason of the first.
-        """
+        """Start so many workers, and wait until all answer; returns what they answer with, or
+        raises an InputError with the reason of the first that cannot start."""
         for _ in range(count):
             self._start()
         while not all(worker.ready for worker in self._workers):
@@ -230,20 +213,14 @@ class Workers:
         return self._workers[0].what
 
     def keep(self) -> None:
-        """Replace workers that end, for ever.
-
-        Raises:
-            InputError: none is left, and none can start.
-        """
+        """Replace workers that end, for ever; InputError once none is left and none can start."""
         while True:
             again = min(self._missing, default=None)
             for worker in self._wait_for_news(again):
                 if worker.receive() == "ended":
                     self._lose(worker)
-            now = time.monotonic()
-            due = sum(at <= now for at in self._missing)
-            self._missing = [at for at in self._missing if at > now]
-            for _ in range(due):
+            for at in [at for at in self._missing if at <= time.monotonic()]:
+                self._missing.remove(at)
                 self._start()
 
     def end(self) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pandas as pd
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arguments import require_whole
 from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
@@ -19,9 +18,8 @@ from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import Histories, session_by
 from ucfrec.recommending.recommend import recommend
-from ucfrec.runs.later_logs import columns_used, reward_of
-from ucfrec.runs.on_workers import RunOnWorkers
-from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy, columns_used, reward_of
+from ucfrec.settings import require_whole
 
 
 def recommend_with_spark(
@@ -41,19 +39,17 @@ def recommend_with_spark(
     seed: int = 0,
     memory_limit: str = "2GB",
 ) -> int:
-    """Write the `k` best next items of every user of logs, as `recommend` finds them.
+    """Write the `k` best next items of every user of logs, as `recommend` finds them; returns their
+    number.
 
     Args:
         files: logs, which every worker sees, as the run folder and `out`.
         mapping: of the logs' columns; what it leaves open is as in the training logs.
         out: folder for the recommendations, Parquet parts with users in sorted order.
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
-        exposures: folder for what was shown, see `ucfrec.recommending.exposures`; None for none.
+        exposures: folder for what was shown; None for none.
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.
-
-    Returns:
-        The number of recommended items.
 
     Raises:
         InputError: an argument or the logs cannot be used, or Spark is missing or fails.
@@ -87,11 +83,8 @@ class _RecommendPart:
 
     run: RunOnWorkers
     out: Path
-    """Folder for the parts of the recommendations, as of `recommend`."""
     exposures: Path | None
-    """Folder for the parts of the exposures; None for none."""
     memory_limit: str
-    """Of a worker while it reads its rows."""
     rule: str
     """Hash of the decision rule."""
     recommend: Callable[[TrainedPolicy, Iterable[Histories]], Iterator[pd.DataFrame]]

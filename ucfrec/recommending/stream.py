@@ -32,6 +32,12 @@ class Counts:
     errors: int = 0
 
 
+_Line = tuple[int, bytes | None]
+"""Number of a line, from 1, and what it holds; None if it is too long."""
+_Read = tuple[int, StreamRequest | InputError]
+"""Number of a line, and the request, or what is wrong with it."""
+
+
 def answer_stream(
     responder: Responder,
     source: Readable,
@@ -60,46 +66,43 @@ def answer_stream(
     return counts
 
 
-Line = tuple[int, bytes | None]
-"""Number of a line, from 1, and what it holds; None if it is too long."""
-
-
 def _answer(
     responder: Responder,
     remembered: "_Remembered",
-    lines: Sequence[Line],
+    lines: Sequence[_Line],
     exposures: ExposureLog | None,
 ) -> Iterator[dict[str, Any]]:
     """The answers to lines."""
-    waiting: list[tuple[int, StreamRequest | InputError]] = []
+    waiting: list[_Read] = []
+    users: set[str] = set()
     for number, line in lines:
-        try:
-            request: StreamRequest | InputError = _parse_line(line, responder.limits)
-        except InputError as error:
-            request = error
-        users = {str(one.user_id) for _, one in waiting if isinstance(one, StreamRequest)}
+        request = _parse_line(line, responder.limits)
+        user = None if isinstance(request, InputError) else str(request.user_id)
         # Whether rows are remembered is known once they have been answered.
-        again = isinstance(request, StreamRequest) and str(request.user_id) in users
-        if again or len(waiting) == _AT_ONCE:
+        if user in users or len(waiting) == _AT_ONCE:
             yield from _answer_together(responder, remembered, waiting, exposures)
-            waiting = []
+            waiting, users = [], set()
         waiting.append((number, request))
+        users |= set() if user is None else {user}
     yield from _answer_together(responder, remembered, waiting, exposures)
 
 
-def _parse_line(line: bytes | None, limits: Limits) -> StreamRequest:
+def _parse_line(line: bytes | None, limits: Limits) -> StreamRequest | InputError:
     if line is None:
-        raise InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
+        return InputError(f"the line has more than {limits.bytes:,} bytes; send fewer rows")
     if not line.strip():
-        raise InputError("the line is blank; send a request on each line")
-    request: StreamRequest = parse(StreamRequest, line, limits)
+        return InputError("the line is blank; send a request on each line")
+    try:
+        request: StreamRequest = parse(StreamRequest, line, limits)
+    except InputError as error:
+        return error
     return request
 
 
 def _answer_together(
     responder: Responder,
     remembered: "_Remembered",
-    waiting: Sequence[tuple[int, StreamRequest | InputError]],
+    waiting: Sequence[_Read],
     exposures: ExposureLog | None,
 ) -> Iterator[dict[str, Any]]:
     """The answers to requests of different users, with one forward pass."""
@@ -151,25 +154,21 @@ class _Remembered:
             self._count -= len(self._rows.popitem(last=False)[1])
 
 
-def _read_lines(source: Readable, most: int) -> Iterator[list[Line]]:
+def _read_lines(source: Readable, most: int) -> Iterator[list[_Line]]:
     """Lines that arrive together; None for one of over `most` bytes."""
     number, buffer, too_long = 0, bytearray(), False
     while block := source.read(_BLOCK):
         first, *following_parts = block.split(b"\n")
         buffer += first
-        lines: list[Line] = []
+        lines: list[_Line] = []
         for following in following_parts:
             number += 1
-            if too_long or len(buffer) > most:
-                lines.append((number, None))
-            else:
-                lines.append((number, bytes(buffer)))
+            whole = not (too_long or len(buffer) > most)
+            lines.append((number, bytes(buffer) if whole else None))
             buffer, too_long = bytearray(following), False
         if len(buffer) > most:
             buffer, too_long = bytearray(), True
         if lines:
             yield lines
-    if too_long or len(buffer) > most:
-        yield [(number + 1, None)]
-    elif buffer:
-        yield [(number + 1, bytes(buffer))]
+    if buffer or too_long:
+        yield [(number + 1, None if too_long else bytes(buffer))]

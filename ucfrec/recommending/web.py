@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mappin
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from ipaddress import IPv6Address
-from typing import Annotated, Any, Final, NamedTuple, NotRequired
+from typing import Annotated, Any, Final, NotRequired
 
 from fastapi import FastAPI, Response
 from fastapi import Request as HTTPRequest
@@ -111,10 +111,8 @@ class _Metrics:
     def __init__(self, drift: Callable[[], Mapping[str, Mean]], shared: bool) -> None:
         """
         Args:
-            drift: returns what is different in requests, or in the logs of the last update, by
-                name.
-            shared: the text has the totals of all processes that share the folder
-                PROMETHEUS_MULTIPROC_DIR.
+            drift: returns what is different in requests, or in the logs of the last update.
+            shared: count for all processes that share the folder PROMETHEUS_MULTIPROC_DIR.
         """
         registry = CollectorRegistry()
         self._measure_drift, self._shared = drift, shared
@@ -193,9 +191,8 @@ class _Metrics:
             self._cpu.inc(self._used - seconds)
 
 
-class _Waiting(NamedTuple):
-    request: Request
-    outcome: "asyncio.Future[Answer | InputError]"
+_Outcome = Answer | InputError
+_Waiting = tuple[Request, "asyncio.Future[_Outcome]"]
 
 
 class _Batcher:
@@ -207,7 +204,7 @@ class _Batcher:
 
     def __init__(
         self,
-        answers: Callable[[Sequence[Request]], list[Answer | InputError]],
+        answers: Callable[[Sequence[Request]], list[_Outcome]],
         metrics: _Metrics,
         limits: ServerLimits,
     ) -> None:
@@ -216,16 +213,12 @@ class _Batcher:
         self._thread = ThreadPoolExecutor(1, "forward")
         self._running: asyncio.Task[None] | None = None
 
-    async def answer(self, request: Request) -> Answer | InputError:
-        """The answer to a request, or what is wrong with it; a cancelled one has no one waiting.
-
-        Raises:
-            HTTPException: too many requests wait.
-        """
+    async def answer(self, request: Request) -> _Outcome:
+        """The answer to a request, or what is wrong with it; HTTPException if too many wait."""
         if len(self._queue) >= self._limits.queue:
             raise HTTPException(503, "too many requests wait; try again later")
-        outcome: asyncio.Future[Answer | InputError] = asyncio.get_running_loop().create_future()
-        self._queue.append(_Waiting(request, outcome))
+        outcome: asyncio.Future[_Outcome] = asyncio.get_running_loop().create_future()
+        self._queue.append((request, outcome))
         self._metrics.waiting.set(len(self._queue))
         if self._running is None or self._running.done():
             self._running = asyncio.create_task(self._run())
@@ -239,7 +232,7 @@ class _Batcher:
 
     async def _run(self) -> None:
         while batch := self._take_batch():
-            began, requests = time.perf_counter(), [waiting.request for waiting in batch]
+            began, requests = time.perf_counter(), [request for request, _ in batch]
             outcomes: Sequence[Answer | Exception]
             try:
                 outcomes = await asyncio.get_running_loop().run_in_executor(
@@ -248,20 +241,20 @@ class _Batcher:
             except Exception as error:  # a bug, or out of memory; every caller receives it
                 outcomes = [error] * len(batch)
             self._metrics.count_batch(len(batch), time.perf_counter() - began)
-            for waiting, outcome in zip(batch, outcomes, strict=True):
-                if waiting.outcome.done():
+            for (_, waiting), outcome in zip(batch, outcomes, strict=True):
+                if waiting.done():
                     continue
                 if isinstance(outcome, (Answer, InputError)):
-                    waiting.outcome.set_result(outcome)
+                    waiting.set_result(outcome)
                 else:
-                    waiting.outcome.set_exception(outcome)
+                    waiting.set_exception(outcome)
 
     def _take_batch(self) -> list[_Waiting]:
         batch: list[_Waiting] = []
         while self._queue and len(batch) < self._limits.batch:
-            waiting = self._queue.popleft()
-            if not waiting.outcome.done():
-                batch.append(waiting)
+            request, outcome = self._queue.popleft()
+            if not outcome.done():
+                batch.append((request, outcome))
         self._metrics.waiting.set(len(self._queue))
         return batch
 
@@ -297,12 +290,9 @@ def application(
 
     Args:
         allowed_hosts: values of the header `Host`, without a port, that are answered: names,
-            addresses, *.example.org for all names below, or * for any.
+            addresses, *.example.org for all names below, or * for any; InputError otherwise.
         exposures: gets every answer; None for none.
         shared_metrics: `/metrics` has the totals of several processes.
-
-    Raises:
-        InputError: a host is written otherwise.
     """
     hosts = [_read_host(host) for host in allowed_hosts]
     metrics = _Metrics(responder.drift, shared_metrics)
@@ -326,7 +316,12 @@ def application(
         status: {"description": text, "model": _Error} for status, text in _FAULTS.items()
     }
 
-    @app.post(_PATH, openapi_extra=_DESCRIBED, responses=faults, response_model=_Recommendations)
+    @app.post(
+        _PATH,
+        openapi_extra=_describe_requests(),
+        responses=faults,
+        response_model=_Recommendations,
+    )
     async def recommendations(http: HTTPRequest) -> Response:
         """The next items for one user."""
         began = time.perf_counter()
@@ -415,8 +410,9 @@ def _respond(status: int, body: Any, headers: Any = None) -> Response:
     return Response(json_text(body), status, headers, media_type=_JSON)
 
 
-def _inline(schema: dict[str, Any]) -> Any:
-    """A JSON schema without references, which lie elsewhere in OpenAPI."""
+def _describe_requests() -> dict[str, Any]:
+    """The body of requests, for OpenAPI: a JSON schema without references, which lie elsewhere."""
+    schema = Request.model_json_schema()
     definitions = schema.pop("$defs", {})
 
     def inline(value: Any) -> Any:
@@ -426,12 +422,5 @@ def _inline(schema: dict[str, Any]) -> Any:
             return {name: inline(entry) for name, entry in value.items()}
         return [inline(entry) for entry in value] if isinstance(value, list) else value
 
-    return inline(schema)
-
-
-_DESCRIBED: Final = {
-    "requestBody": {
-        "required": True,
-        "content": {_JSON: {"schema": _inline(Request.model_json_schema())}},
-    }
-}
+    body = {"required": True, "content": {_JSON: {"schema": inline(schema)}}}
+    return {"requestBody": body}

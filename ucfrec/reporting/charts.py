@@ -10,13 +10,12 @@ import io
 import re
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -28,9 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-P = ParamSpec("P")
-Drawn = TypeVar("Drawn")
-
 WIDTH, HEIGHT = 360, 220
 """Size of line charts and histograms in SVG units, which are points in matplotlib; charts of
 intervals have the same width. A phone is about as wide, so that text is not scaled there."""
@@ -39,25 +35,29 @@ _VARIABLES: Final = ("ink", "soft", "rule", "paper", *(f"c{series}" for series i
 _COLORS: Final = {f"#01{number:02x}fe": name for number, name in enumerate(_VARIABLES)}
 INK, SOFT, RULE, PAPER, *SERIES = _COLORS
 _DASHES: Final = ("solid", "dashed", "dotted")
+_SHARED_STYLE: Final[Any] = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "figure.constrained_layout.use": True,
+    # Text stays text in SVG, and equal figures give identical files.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "ucfrec",
+}
 _STYLE: Final[Any] = {
+    **_SHARED_STYLE,
     "font.size": 11,
     "text.color": INK,
     "text.parse_math": False,
     "axes.edgecolor": INK,
     "axes.labelcolor": SOFT,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
     "axes.formatter.useoffset": False,
     "xtick.color": SOFT,
     "ytick.color": SOFT,
     "grid.color": RULE,
     "figure.facecolor": "none",
-    "figure.constrained_layout.use": True,
     "axes.facecolor": "none",
     "lines.linewidth": 2,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "ucfrec",
 }
 _NAME, _BAR, _BOTTOM = 16, 28, 26
 """Heights of a line of a name, of the bar below it with a gap, and of the axis below all."""
@@ -265,39 +265,29 @@ PLAIN, OURS, LIGHT = "#8C8C8C", "#D55E00", "#56B4E9"
 _NOT_IN_NAMES: Final = re.compile(r"[^\w,.= -]+")
 
 _FILE_STYLE: Final[Any] = {
+    **_SHARED_STYLE,
     "figure.dpi": 200,
-    "figure.constrained_layout.use": True,
     "font.size": 8,
     "axes.titlesize": 8,
     "legend.fontsize": 7,
     "legend.frameon": False,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
     "grid.color": "#DDDDDD",
     "lines.linewidth": 1.3,
     "lines.markersize": 3.5,
     "image.cmap": "cividis",
-    # Text stays text in SVG, and equal figures give identical files.
-    "svg.fonttype": "none",
-    "svg.hashsalt": "ucfrec",
 }
 
 
-def styled(draw: Callable[P, Drawn]) -> Callable[P, Drawn]:
-    """Decorator for functions that draw or save a figure: applies the style."""
+@contextmanager
+def file_style() -> Iterator[None]:
+    """The style of a figure that is a file, for the block or function that draws or saves it."""
+    from matplotlib import rc_context
 
-    @wraps(draw)
-    def drawn(*args: P.args, **kwargs: P.kwargs) -> Drawn:
-        from matplotlib import rc_context
-
-        with rc_context(_FILE_STYLE):
-            return draw(*args, **kwargs)
-
-    return drawn
+    with rc_context(_FILE_STYLE):
+        yield
 
 
-@styled
+@file_style()
 def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
     """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths.
 

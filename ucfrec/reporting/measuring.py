@@ -8,14 +8,13 @@ from pathlib import Path
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.ranking import Later, LikedExpression
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.evaluation.ranking_table import ranking_rows
+from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.logs.expressions import Expression
 from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy
 from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen
 from ucfrec.off_policy.scored import evaluate_scored
-from ucfrec.provenance import shorten_paths
+from ucfrec.processes import shorten_paths
 from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking
 from ucfrec.results.rows import Evaluation, Ranking
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ucfrec.errors import InputError
-from ucfrec.evaluation.diversity import COLUMNS
+from ucfrec.evaluation.simulator import COLUMNS
 from ucfrec.off_policy.estimators import LOGGED, SUITE
 from ucfrec.reporting.charts import Chart, Interval, interval_chart, line_chart
 from ucfrec.reporting.tables import Table, evaluation_line, format_value

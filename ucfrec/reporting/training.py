@@ -20,11 +20,11 @@ from ucfrec.files.parquet import require_regular
 from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
-from ucfrec.runs.samples import SAMPLES
+from ucfrec.runs.run import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
 Curves = Mapping[str, Mapping[int, float]]
-"""{name: {step: value}}, as from `ucfrec.fitting.metrics_log.read_metrics`."""
+"""{name: {step: value}}, as from `ucfrec.fitting.checkpoint.read_metrics`."""
 POINTS: Final = 200
 """Most points of a drawn curve."""
 REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}

@@ -25,9 +25,15 @@ from pydantic import (
 )
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_file, read_json, write_json
-from ucfrec.files.locks import claim, lock_path, remove_leftovers
-from ucfrec.provenance import config_hash
+from ucfrec.files.atomic import (
+    atomic_file,
+    claim,
+    lock_path,
+    read_json,
+    remove_leftovers,
+    write_json,
+)
+from ucfrec.processes import config_hash
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ucfrec.arguments import LARGEST_SEED, require_list, require_seed, shown
 from ucfrec.choosing.choice import RuleConfig
 from ucfrec.counterfactual.augmentation import AugmentConfig
 from ucfrec.counterfactual.generators import CSGConfig
@@ -19,7 +18,15 @@ from ucfrec.files.atomic import read_toml
 from ucfrec.fitting.loop import LoopConfig
 from ucfrec.policies.base import PolicyConfig
 from ucfrec.policies.registry import policy_class
-from ucfrec.settings import SettingError, nearest, settings_table
+from ucfrec.settings import (
+    LARGEST_SEED,
+    SettingError,
+    nearest,
+    require_list,
+    require_seed,
+    settings_table,
+    shown,
+)
 
 TABLES: Final = ("policy", "train", "crm", "csg", "augment", "rule")
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from pydantic import Field
 
 from ucfrec.errors import InputError
-from ucfrec.files.locks import claim
+from ucfrec.files.atomic import claim
 from ucfrec.files.record import Record, Text
 from ucfrec.runs.record import RunRecord, read_record, verified
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -198,7 +198,7 @@ class Update(Entry):
     appended: dict[str, Any]
     """Other counts of the new logs; see `ucfrec.logs.append.append_logs`."""
     drift: dict[str, Any] | None = None
-    """See `ucfrec.updating.drift`."""
+    """See `ucfrec.updating.verdict`."""
     verdict: UpdateVerdict | None = None
 
 

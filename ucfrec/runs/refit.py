@@ -8,11 +8,11 @@ from typing import Any, Final
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
-from ucfrec.provenance import config_hash
+from ucfrec.processes import config_hash
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
 from ucfrec.user_model.model import SESSIONS
 from ucfrec.user_model.reward_fit import refit_item_reward_model
@@ -52,7 +52,7 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     }
     if out == first / REFIT:
         about |= place_of(store.path, first)
-    store = without_columns(store, trained.dropped)
+    store = drop_columns(store, trained.dropped)
     record = train_run(store, out, _settings(trained), about, refit_of=first)
     if not distributed.leads():
         return record

@@ -1,41 +1,43 @@
 """Train a policy (Algorithm 1) and keep everything it produces in a run folder."""
 
+import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
 
-from ucfrec.acting.scorer import Scorer
-from ucfrec.arrays import IntArray
+from ucfrec import __version__, schema
+from ucfrec.acting.scorer import Scorer, logged_scores
 from ucfrec.choosing.by_ranking import choose_by_ranking
 from ucfrec.choosing.by_simulation import choose_by_simulation
 from ucfrec.choosing.choice import Problem
 from ucfrec.counterfactual.augmentation import (
     MODELS,
     AugmentationReport,
-    AugmentConfig,
     augment_episodes,
 )
-from ucfrec.counterfactual.generators import CSGConfig
-from ucfrec.counterfactual.reward_model import CRMConfig
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes
-from ucfrec.files.atomic import write_json
-from ucfrec.files.locks import lock_path, remove_leftovers, remove_leftovers_within
+from ucfrec.files.atomic import (
+    atomic_file,
+    atomic_folder,
+    claim,
+    lock_path,
+    remove_leftovers,
+    write_json,
+)
 from ucfrec.fitting import distributed
-from ucfrec.fitting.loop import SILENT, Callbacks, Fit
+from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import note_ignored
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import phase
+from ucfrec.processes import config_hash, phase, random_state_kept
 from ucfrec.runs.config import Config
-from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
     CANDIDATES,
     RUN,
@@ -45,20 +47,79 @@ from ucfrec.runs.record import (
     read_augmentation,
     read_record,
 )
-from ucfrec.runs.samples import SAMPLES, sample_recommendations
-from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec.runs.start import (
     begin,
+    fit_policy,
     new_policy,
     require_startable,
+    rule_to_start_from,
+    start_warm,
     training_views,
 )
 from ucfrec.runs.trained_policy import AUGMENTATION, INPUTS, REWARD_MODEL, RULE, TrainedPolicy
-from ucfrec.runs.warm_start import rule_to_start_from, start_warm
 from ucfrec.user_model.model import UserModel
 
-PHASES = 4
+SAMPLES: Final = "samples.json"
+PHASES: Final = 4
 """Phases of a training that have progress of their own."""
+_SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
+
+
+@dataclass(frozen=True)
+class SharedStages:
+    """Stages that several runs on one log have in common, made once and then copied.
+
+    Each lies in a folder of its own in `folder`; None shares nothing.
+    """
+
+    folder: Path | None
+
+    def provide(
+        self,
+        inputs: Mapping[str, Any],
+        stage: str,
+        out: Path,
+        names: Sequence[str],
+        make: Callable[[], object],
+    ) -> None:
+        """Copy the files of a stage to the run folder `out`, or make them there and keep a copy.
+
+        Another process that needs the same stage waits until it is made.
+
+        Args:
+            inputs: all that the stage depends on: data, settings, seed. Another version of the
+                package makes its own.
+            names: files and folders of the stage in `out`, those that are made; the last one marks
+                the stage as finished, and is copied last. No file is ever there in part.
+        """
+        if self.folder is None:
+            make()
+            return
+        stage_folder = self.folder / config_hash({**inputs, "stage": stage, "version": __version__})
+        with claim(stage_folder, wait=True):
+            if stage_folder.exists():
+                _copy(stage_folder, out, names)
+                return
+            make()
+            with atomic_folder(stage_folder) as scratch:
+                _copy(out, scratch, names)
+
+
+OWN: Final = SharedStages(None)
+"""For a run that makes all its stages itself."""
+
+
+def _copy(source: Path, to: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if (source / name).is_dir():
+            shutil.copytree(source / name, to / name, dirs_exist_ok=True, copy_function=_copy_file)
+        elif (source / name).exists():
+            _copy_file(source / name, to / name)
+
+
+def _copy_file(source: str | Path, to: str | Path) -> None:
+    with atomic_file(Path(to)) as scratch:
+        shutil.copyfile(source, scratch)
 
 
 @dataclass(frozen=True)
@@ -125,7 +186,7 @@ def train_run(
     with lock_path(out, "trained") if distributed.leads() else nullcontext():
         if distributed.leads():
             remove_leftovers(out.parent)
-            remove_leftovers_within(out)
+            remove_leftovers(out, within=True)
         start = time.perf_counter()
         run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
         if initial is not None:
@@ -133,25 +194,41 @@ def train_run(
         with phase("Counterfactual augmentation", 1, PHASES):
             augmented, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            fit = _train_policy(run, augmented, more_augmentation, refit_of, callbacks)
+            if more_augmentation is not None:
+                more = more_augmentation
+                augmented = more if augmented is None else augmented.join(more)
+            first: Path | None = None
+            validation: EpisodeStore | None = run.validation
+            updated = run.record.update
+            if refit_of is not None:
+                first, validation = refit_of / "policy" / "best.safetensors", None
+                updated = read_record(refit_of).update
+            newest = None
+            if updated is not None:
+                since = run.train.record.n_episodes - updated.episodes
+                newest = np.flatnonzero(run.train.episode_ids >= since)
+            policy, train, settings = run.policy, run.train, run.config
+            fit = fit_policy(
+                policy, train, validation, out, settings, first, newest, callbacks, augmented
+            )
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.copy_with(augmentation=augmentation, policy=fit)
-        if run.logged.has_items and config.rule.choose and not chosen:
-            record = record.copy_with(**_selected(run, initial))
-        _write_samples(run)
+        if run.logged.has_items:
+            users = None
+            if config.rule.choose and not chosen:
+                with phase("Fitting the user model", 3, PHASES):
+                    users = _fit_user_model(run, initial)
+            trained = TrainedPolicy.load(out, in_training=True)
+            if users is not None:
+                with phase("Selecting the decision rule", 4, PHASES):
+                    rule = _choose_rule(run, trained, users, initial)
+                record = record.copy_with(reward_model=users.reward_report, rule=rule)
+                trained = replace(trained, rule=rule.rule)
+            write_json(out / SAMPLES, sample_recommendations(trained.scorer(), run.held_out))
         seconds = record.wall_time_s + time.perf_counter() - start
         return record.copy_with(wall_time_s=seconds).seal(out)
-
-
-def _selected(run: _Inputs, initial: Path | None) -> dict[str, Any]:
-    """Entries of the record: the user model and the decision rule that is best in it."""
-    with phase("Fitting the user model", 3, PHASES):
-        user_model = _fit_user_model(run, initial)
-    with phase("Selecting the decision rule", 4, PHASES):
-        rule = _choose_rule(run, user_model, initial)
-    return {"reward_model": user_model.reward_report, "rule": rule}
 
 
 def _prepare_inputs(
@@ -189,10 +266,8 @@ def _prepare_inputs(
     if view is not train:
         policy = new_policy(view, config)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return _Inputs(
-        *(record, out, config, shared, device),
-        *(logged, held_out, view, validation, policy.to(device)),
-    )
+    policy = policy.to(device)
+    return _Inputs(record, out, config, shared, device, logged, held_out, view, validation, policy)
 
 
 def _augment(
@@ -204,12 +279,10 @@ def _augment(
     for a run without augmentation.
     """
     config, out = run.config, run.out
-    if refit_of is not None:
-        if not config.augment.augments:
-            return None, run.record.augmentation
-        return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
     if not config.augment.augments:
         return None, run.record.augmentation
+    if refit_of is not None:
+        return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
     settings = (config.crm, config.csg, config.augment)
     # A policy's own view of the episodes has augmentation of its own.
     has_own_view = run.train is not run.logged
@@ -231,65 +304,37 @@ def _augment(
         return augmented, read_augmentation(out / AUGMENTATION)
 
 
-def _train_policy(
-    run: _Inputs,
-    augmented: AugmentedEpisodes | None,
-    more: AugmentedEpisodes | None,
-    refit_of: Path | None,
-    callbacks: Callbacks,
-) -> Fit:
-    """Fit the policy to logged and augmented episodes (lines 4 and following of Algorithm 1)."""
-    if more is not None:
-        augmented = more if augmented is None else augmented.join(more)
-    start = None if refit_of is None else refit_of / "policy" / "best.safetensors"
-    validation = run.validation if refit_of is None else None
-    newest = _newest(run.record if refit_of is None else read_record(refit_of), run.train)
-    given = run.policy, run.train, validation, run.out, run.config, start, newest, callbacks
-    return fit_policy(*given, augmented)
-
-
-def _newest(record: RunRecord, train: EpisodeStore) -> IntArray | None:
-    """Positions among the training episodes of those that an update added; None for none."""
-    if record.update is None:
-        return None
-    first = train.record.n_episodes - record.update.episodes
-    return np.flatnonzero(train.episode_ids >= first)
-
-
 def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     """Fit what users would do: the reward of every item, session ends and fatigue."""
-    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
-    inputs = _dependencies(*views, run.config.seed, torch.device("cpu"))
-    inputs["simulated"] = simulated = run.record.return_to_go.per_session
-    inputs_of_fit = *views, run.out / REWARD_MODEL, run.config.seed
+    train, validation = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
+    simulated, folder = run.record.return_to_go.per_session, run.out / REWARD_MODEL
+    inputs = _dependencies(train, validation, run.config.seed, torch.device("cpu"))
+    inputs["simulated"] = simulated
     first = None if initial is None else initial / REWARD_MODEL
-    fit = partial(UserModel.fit, *inputs_of_fit, simulated, first)
+    fit = partial(UserModel.fit, train, validation, folder, run.config.seed, simulated, first)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
 
-def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
+def _choose_rule(
+    run: _Inputs, trained: TrainedPolicy, users: UserModel, initial: Path | None
+) -> RuleRecord:
     """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
-    trained = TrainedPolicy.load(run.out, in_training=True)
-    parts = trained.item_states, trained.returns, users.reward, users.session_end
-    scorer = Scorer(run.policy, trained.rule, *parts)
-    config = run.config.rule
-    targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
-    views = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
-    start = None if initial is None else rule_to_start_from(initial, trained)
-    problem = targets, *views, config, run.config.seed, start
-    choose = choose_by_simulation if trained.returns.per_session else choose_by_ranking
-    choice = choose(Problem(scorer, users, *problem))
+    states, returns, config = trained.item_states, trained.returns, run.config.rule
+    problem = Problem(
+        Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
+        users,
+        {quantile: trained.target_return(quantile) for quantile in config.quantiles},
+        run.logged.without_long_sessions(),
+        run.held_out.without_long_sessions(),
+        config,
+        run.config.seed,
+        None if initial is None else rule_to_start_from(initial, trained),
+    )
+    choice = choose_by_simulation(problem) if returns.per_session else choose_by_ranking(problem)
     write_json(run.out / RULE, choice.rule.as_dict())
     write_json(run.out / CANDIDATES, choice.list_candidates())
     return RuleRecord.model_validate(choice.as_dict())
-
-
-def _write_samples(run: _Inputs) -> None:
-    """Save a few recommendations for the report, by the run's decision rule."""
-    if run.held_out.has_items:
-        trained = TrainedPolicy.load(run.out, in_training=True)
-        write_json(run.out / SAMPLES, sample_recommendations(trained.scorer(), run.held_out))
 
 
 def _dependencies(
@@ -297,7 +342,7 @@ def _dependencies(
     validation: EpisodeStore,
     seed: int,
     device: torch.device,
-    *settings: CRMConfig | CSGConfig | AugmentConfig,
+    *settings: Any,
 ) -> dict[str, Any]:
     """All that a reward model or copies depend on."""
     return {
@@ -309,3 +354,38 @@ def _dependencies(
         "device": device.type,
         "settings": [asdict(table) for table in settings],
     }
+
+
+@torch.no_grad()
+def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str, Any]:
+    """Recommendations of a policy at the last step of a few validation sessions.
+
+    Args:
+        scorer: a policy of items under its rule.
+
+    Returns:
+        A JSON object: the `rule` in words, and `sessions` with up to 5 items before the last step
+        (`history`), their `rewards`, the item `logged` at the last step and the 5 items
+        `recommended`, best first. Items are row numbers of `items.parquet`.
+    """
+    long_enough = np.flatnonzero(validation.lengths >= min(2, validation.lengths.max()))
+    places = np.linspace(0, len(long_enough) - 1, min(_SESSIONS, len(long_enough)))
+    episodes = long_enough[places.astype(np.int64)]
+    last = validation.lengths[episodes] - 1
+    scores = logged_scores(scorer, validation, episodes, last)
+    best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
+    sessions = []
+    for place, episode in enumerate(episodes):
+        steps = np.arange(validation.lengths[episode])
+        of_session = np.full(len(steps), episode)
+        items = validation.step_values(schema.ITEM, of_session, steps)
+        rewards = validation.step_values(schema.REWARD, of_session, steps)
+        sessions.append(
+            {
+                "history": items[:-1][-_HISTORY:].tolist(),
+                "rewards": rewards[:-1][-_HISTORY:].tolist(),
+                "logged": int(items[-1]),
+                "recommended": best.indices[place].tolist(),
+            }
+        )
+    return {"rule": str(scorer.rule), "sessions": sessions}

@@ -7,15 +7,14 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ucfrec.counterfactual.augmentation import interventions
-from ucfrec.counterfactual.screening import MeasurementConfig, ScreeningReport, screen
+from ucfrec.counterfactual.screening import ScreeningReport, screen
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RUN, RunRecord, Screening, read_record
-from ucfrec.runs.run import train_run
-from ucfrec.runs.shared_stages import OWN, SharedStages
+from ucfrec.runs.run import OWN, SharedStages, train_run
 from ucfrec.runs.start import training_views
 
 SCREENINGS: Final = ("drop", "copies")
@@ -33,7 +32,7 @@ def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
     Raises:
         InputError: as `ucfrec.counterfactual.screening.screen`.
     """
-    return screen(training_views(store)[0], MeasurementConfig(), seed)
+    return screen(training_views(store)[0], seed)
 
 
 def train_screened(
@@ -87,7 +86,7 @@ def train_screened(
     entries: dict[str, Any] = {**(about or {}), SCREENING: screening}
     if how == "drop":
         entries["dropped_observations"] = flagged
-        selected = without_columns(store, flagged)
+        selected = drop_columns(store, flagged)
         return train_run(selected, out, config, entries, callbacks=callbacks)
     train, first = training_views(store)[0], store.state_size - store.observation_size
     places = [first + column for column in flagged]
@@ -113,6 +112,6 @@ def _screen_once(
         return report
 
 
-def without_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:
+def drop_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:
     """`store` without some columns of its observations; itself if there are none."""
     return store.without_observation_dimensions(columns) if columns else store

@@ -1,9 +1,9 @@
 """A trained policy, read back from its run folder."""
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,14 @@ from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, InputNote, damage_explained
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
-from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors, load_trained
+from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
+from ucfrec.fitting.loop import load_trained
+from ucfrec.logs.expressions import Expression
+from ucfrec.logs.mapping import Dataset, LogMapping
+from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
-from ucfrec.processes import random_state_kept
-from ucfrec.provenance import config_hash, versions
+from ucfrec.processes import config_hash, random_state_kept, versions
 from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
 from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
@@ -102,6 +105,8 @@ class TrainedPolicy:
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
+        for name in (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"):
+            record.checksums(folder).require(name)  # however large
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
@@ -356,3 +361,78 @@ def _ids(path: Path, column: str) -> Array:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
     return read_ids(path, column)
+
+
+def later_logs(
+    trained: TrainedPolicy, paths: Sequence[str | Path], given: LogMapping
+) -> tuple[tuple[Path, ...], LogMapping]:
+    """Log files of the dataset that a policy was trained on, whose columns may have plain names.
+
+    Args:
+        paths: files, folders and globs.
+        given: what the caller says of the columns.
+
+    Raises:
+        InputError: a path is missing, or holds no log of the dataset.
+    """
+    source = trained.record.data
+    # A record may also name a dataset that is not read by an adapter.
+    has_adapter = source.dataset in plugin_names("datasets")
+    dataset: Dataset = load_plugin("datasets", str(source.dataset) if has_adapter else "generic")
+    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
+    try:
+        files, mapping = dataset.resolve(paths, given)
+    except InputError:
+        files, mapping = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
+    columns = {name: text for name, text in mapping.columns.items() if name not in given.columns}
+    return files, replace(given, remembered=LogMapping(columns))
+
+
+def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+    """The mapping with what the run remembers of its training log."""
+    mapping = mapping.over(LogMapping.of_source(trained.record.data, str(trained.folder / RUN)))
+    if trained.record.observation_size:
+        return mapping
+    return LogMapping({schema.OBSERVATION: ""}).over(mapping)
+
+
+def reward_of(trained: TrainedPolicy) -> Expression:
+    """The run's reward, an SQL expression over the columns of its logs."""
+    return Expression(trained.record.reward, str(trained.folder / RUN))
+
+
+@dataclass(frozen=True)
+class RunOnWorkers:
+    """Which policy the workers load; small, as it is sent to them with each task."""
+
+    folder: Path
+    """The run folder, which every worker sees."""
+    checkpoint: str
+    """`best` or `last` weights."""
+    fingerprint: str
+
+    @classmethod
+    def of(cls, trained: TrainedPolicy, checkpoint: str) -> "RunOnWorkers":
+        """The policy that was loaded with this checkpoint."""
+        return cls(trained.folder.absolute(), checkpoint, trained.fingerprint)
+
+    def load(self) -> TrainedPolicy:
+        """The policy; kept for the next task of this worker.
+
+        Raises:
+            InputError: the folder is missing there, or holds another run.
+        """
+        return _loaded(self)
+
+
+@lru_cache(maxsize=1)
+def _loaded(run: RunOnWorkers) -> TrainedPolicy:
+    # A worker has one core; the cluster runs as many workers as it has cores.
+    torch.set_num_threads(1)
+    trained = TrainedPolicy.load(run.folder, run.checkpoint)
+    if trained.fingerprint != run.fingerprint:
+        raise InputError(
+            f"{run.folder} has changed since the command started, or is another folder on a "
+            "worker; run it again once all workers see the same run"
+        )
+    return trained

@@ -19,17 +19,13 @@ from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
-from ucfrec.evaluation.ranking_baselines import PolicyRanker
-from ucfrec.files.atomic import atomic_file
-from ucfrec.files.locks import lock_path
+from ucfrec.evaluation.ranking_table import PolicyRanker
+from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
-from ucfrec.processes import block_ctrl_c, pool_of_processes
-from ucfrec.progress import label_progress
-from ucfrec.provenance import config_hash
+from ucfrec.processes import block_ctrl_c, config_hash, label_progress, pool_of_processes
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import Config
-from ucfrec.runs.run import train_run
-from ucfrec.runs.shared_stages import SharedStages
+from ucfrec.runs.run import SharedStages, train_run
 from ucfrec.runs.start import returns_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search

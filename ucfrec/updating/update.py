@@ -11,7 +11,7 @@ import numpy as np
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
-from ucfrec.files.locks import lock_path
+from ucfrec.files.atomic import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
@@ -19,11 +19,10 @@ from ucfrec.runs.config import Config, config_from_dict
 from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
+from ucfrec.runs.start import SHARE, warm_settings
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.runs.warm_start import SHARE, warm_settings
-from ucfrec.updating.drift import measure_drift
-from ucfrec.updating.verdict import compare_runs
+from ucfrec.updating.verdict import compare_runs, measure_drift
 
 _COUNTS: Final = (
     *("rows_read", "steps", "new_users", "new_items", "new_user_steps", "new_item_steps"),
@@ -97,7 +96,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
-    opened = without_columns(EpisodeStore.open(grown), trained.dropped)
+    opened = drop_columns(EpisodeStore.open(grown), trained.dropped)
     full = _initial_settings(trained.record)
     config = warm_settings(full, options.share)
     if options.seed is not None:

@@ -1,5 +1,4 @@
-"""Main tags of items, and fatigue: how much less users reward anything once they liked one main tag
-many times in a row."""
+"""Main tags of items, and fatigue: users reward less once they liked one many times in a row."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -25,10 +24,7 @@ _EXPECTED: Final = 20.0
 
 @dataclass(frozen=True)
 class MainTags:
-    """The tag that each item is most typical of, and what counts as liked.
-
-    An item is typical of a tag if its embedding points to where those of the tag's items do.
-    """
+    """The tag whose items' embeddings each item's resembles most, and what counts as liked."""
 
     tags: Tensor
     """(n_items,) int64; −1 for items without tags."""
@@ -58,11 +54,8 @@ class MainTags:
         return rewards >= least_liked(self.reward_low, self.reward_high)
 
     def runs(self, history: Shown) -> Tensor:
-        """In how many steps in a row, up to each earlier one, one main tag was liked, (B, N).
-
-        0 where the item was not liked, has no tags, or none was shown. Only what `history` holds is
-        counted.
-        """
+        """In how many steps in a row, up to each earlier one, one main tag was liked, (B, N); 0
+        where the item was not liked, has no tags, or none was shown."""
         liked = self.liked(history.rewards) & (history.items >= 0)
         tags = torch.where(liked, self.tags[history.items], -1)
         lengths = []
@@ -130,9 +123,8 @@ def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
     """The fatigue that training rows show most clearly; None if there is none.
 
     The factor is the share of likes at which the log's policies arrived with fatigued users,
-    relative to the share in the rest of the same sessions. This is cautious: policies that knew of
-    the fatigue, and showed what no one likes, look as if the users would have liked nothing.
-    Fatigue must at least halve the likes, in held-out rows too.
+    relative to the share in the rest of the same sessions: of policies that knew of the fatigue,
+    too little. Likes must at least halve, in held-out rows too.
     """
     best, clearest, remembered = None, 0.0, training.runs.shape[1]
     for length in range(2, min(LONGEST, remembered) + 1):

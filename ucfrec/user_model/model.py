@@ -51,8 +51,7 @@ class UserModel:
     """None if the log shows none."""
     main_tags: MainTags
     calibration_report: UserCalibration | None = None
-    """How far the calibration can be trusted; None where validation users are new, whose tastes
-    no one knows."""
+    """How far the calibration can be trusted; None where validation users are new."""
     report: dict[str, Any] = field(default_factory=dict)
     """What simulated sessions are drawn from, as a JSON object."""
 
@@ -70,12 +69,10 @@ class UserModel:
 
         Args:
             simulated: whether sessions are simulated.
-            first: folder of the user model of an earlier state of the store of items, near whose
-                spreads of effects the search begins and ends.
+            first: folder of the user model of an earlier state of the store, where searches begin.
 
         Raises:
-            InputError: all training rewards are equal, there are no held-out steps, or a file is
-                damaged.
+            InputError: training rewards are equal, no steps are held out, or a file is damaged.
         """
         require_blas_memory()
         reward, report = fit_item_reward_model(train, validation, folder, seed, first)
@@ -198,8 +195,7 @@ class LoggedRewards:
 class UserSimulator:
     """N sessions of logged users at once, whose rewards and ends are drawn from a user model.
 
-    A session begins as a logged one did: its user, and its observations step by step. Sessions that
-    have ended are dropped: M ≤ N go on.
+    A session begins as a logged one did: its user, and its observations step by step. M ≤ N go on.
     """
 
     def __init__(
@@ -242,11 +238,7 @@ class UserSimulator:
         return np.asarray(values, dtype=np.float32)
 
     def step(self, actions: Array) -> tuple[Float32Array, IntArray]:
-        """Show one item (M,) in every session.
-
-        Returns:
-            Rewards (M,), and the positions of the sessions that go on.
-        """
+        """Show one item (M,) in every session: rewards (M,), and positions of those that go on."""
         items = torch.from_numpy(np.asarray(actions, dtype=np.int64))
         observations = torch.from_numpy(self.observations())
         states = self._sessions.latest_states(self._store.item_states, observations)
@@ -255,7 +247,7 @@ class UserSimulator:
         expected = self._model.expect(states, history, users, items)
         rewards = self._logged.draw(expected, self._draw_uniform())
         ends = self._model.session_end.probabilities(history, items, rewards, steps)
-        self._sessions = self._sessions.with_step(items, torch.from_numpy(rewards))
+        self._sessions = self._sessions.add_step(items, torch.from_numpy(rewards))
         ended = (self._draw_uniform() < ends) | (steps + 1 >= self._longest)
         going = np.flatnonzero(~ended)
         if len(going) < len(ended):
@@ -269,11 +261,8 @@ class UserSimulator:
 
 
 def longest_session(lengths: IntArray) -> int:
-    """Steps after which a simulated session ends in any case, from those of logged sessions (E,).
-
-    Policies may make sessions longer than any logged one, unless something ends them there: more
-    of the longest sessions than chance explains.
-    """
+    """Steps after which a simulated session ends in any case, from those of logged sessions (E,):
+    more than logged, unless more of the longest sessions end there than chance explains."""
     longest = int(lengths.max())
     late = lengths[lengths > longest // 2]
     ended = int((late < longest).sum())

@@ -1,7 +1,4 @@
-"""Expected reward of every item of a catalogue: additive effects of items, users and the state.
-
-Where users are new, the session shows their tastes (`UserPosterior`).
-"""
+"""Expected reward of every item of a catalogue: additive effects of items, users and the state."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -31,11 +28,10 @@ class UserPosterior(nn.Module):
     """Tastes of the users of B sessions, from what was shown to them, and its rewards.
 
     Tastes are a level and an affinity, v = (level, affinity), and add v · (1, e_i) to the score of
-    an item with the vector e_i. Before a session begins they are drawn from N(0, C), where C is how
-    training users differ. What a step showed is its reward less what the item usually gets,
-    v · (1, e_i) plus noise. The tastes after some steps are their posterior mean, a ridge
-    regression within the session (Rasmussen and Williams, 2006, Gaussian Processes for Machine
-    Learning, section 2.1).
+    an item with the vector e_i. Before a session they are drawn from N(0, C), where C is how
+    training users differ. What a step showed is its reward less what the item usually gets, v · (1,
+    e_i) plus noise. Tastes are their posterior mean, a ridge regression within the session
+    (Rasmussen and Williams, 2006, Gaussian Processes for Machine Learning, section 2.1).
     """
 
     root: Tensor
@@ -105,14 +101,9 @@ def compare_to_history(likeness: Likeness, history: Tensor, items: Tensor) -> Te
 
 
 def root_of_tastes(tastes: Tensor, vectors: Tensor) -> Tensor:
-    """L (D + 1, D + 1) with L Lᵀ ∝ C, the covariance of tastes around 0, such that tastes add 1 to
-    the variance of scores.
-
-    Args:
-        tastes: (U, D + 1) level and affinity of training users. Where they are few, C is shrunk
-            towards equal variances (Ledoit and Wolf, 2004).
-        vectors: (M, D) of the items of logged steps.
-    """
+    """L (D + 1, D + 1) with L Lᵀ ∝ C, the covariance around 0 of the tastes (U, D + 1) of training
+    users, shrunk where they are few (Ledoit and Wolf, 2004), such that they add 1 to the variance
+    of scores of logged items with the vectors (M, D)."""
     from sklearn.covariance import ledoit_wolf
 
     covariance = torch.from_numpy(ledoit_wolf(tastes.double().numpy(), assume_centered=True)[0])
@@ -184,18 +175,13 @@ class ItemRewardModel(nn.Module):
         return max(self.lags, MEMORY) if self.tastes.are_known else self.lags
 
     def scores(self, states: Tensor, history: Shown, users: Tensor | None = None) -> Tensor:
-        """Linear predictors of all items, (B, n_items).
+        """Linear predictors of all items, (B, n_items): log-odds of the higher reward if there are
+        two, otherwise rewards in standard deviations from their mean.
 
         Args:
             states: (B, S) before the step.
-            history: what the sessions showed before the step; more than `reach` items have no
-                effect.
-            users: (B,) int64 numbers in the training store, −1 for an unknown user; None if all
-                users are unknown.
-
-        Returns:
-            Log-odds of the higher reward if rewards have two values; otherwise rewards in standard
-            deviations from their mean.
+            history: what the sessions showed before it; more than `reach` items have no effect.
+            users: (B,) int64 numbers in the training store, −1 if unknown; None if all are.
         """
         items, repeated, alike = self.exposures(history)
         added = self.likeness.to_all(self.likeness.profile(items, alike))
@@ -254,12 +240,8 @@ class ItemRewardModel(nn.Module):
     def set_effects(
         self, effects: Mapping[str, Tensor], sum_content: Callable[[Tensor], Tensor]
     ) -> None:
-        """Set the fitted effects; those that are missing become 0.
-
-        Args:
-            effects: by the names of `ucfrec.user_model.reward_effects.EFFECTS`.
-            sum_content: effects (n_items,) of the items' tags and embeddings from those of content.
-        """
+        """Set the fitted effects, those of `EFFECTS` by name; missing ones become 0, and effects of
+        content those (n_items,) of the items' tags and embeddings."""
         for name in ("user", "affinity", "state", "interaction", "exposure"):
             buffer = self.get_buffer(name)
             buffer.copy_(effects.get(name, torch.zeros(buffer.shape)).view(buffer.shape))

@@ -254,10 +254,8 @@ def fit_effects(
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
-    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`.
-
-    Its second derivative should be about 1 in all directions: that is the first step's length.
-    """
+    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`; its second
+    derivative should be about 1 in all directions: that is the first step's length."""
 
     def evaluate(at: Tensor) -> tuple[float, Tensor]:
         at = at.detach().requires_grad_(True)
@@ -303,8 +301,7 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
 
 
 def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
-    """Maps of an effect to units in which the objective is about as curved in all directions, and
-    back."""
+    """Maps of an effect to units in which the objective is about evenly curved, and back."""
     if name in ("state", "exposure"):
         inputs = design.x if name == "state" else design.exposure
         factor, inverse = _factors(curvature * _moments(design, inputs), penalty)

@@ -1,13 +1,11 @@
 """Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
 Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
-knows. Where rewards are drawn from a model that learns tastes from the session, a policy is paid
-for its own guesses: an item that pays once, by luck, counts as liked and goes on paying.
-
-Logs of policies that knew more of their users than the log shows make what they showed look better
-than it is for anybody else. Where the log has all propensities, and users are new, rows are
-therefore weighted (`weigh_by_propensity`). Known users are calibrated on weighted validation rows
-instead (`UserCalibration`), and their tastes fitted without weights, which there only cost data.
+knows: where rewards are drawn from a model that learns tastes from the session, a policy is paid
+for its own guesses. Logs of policies that knew more of their users than the log shows make what
+they showed look better than it is for anybody else. Where the log has all propensities, and users
+are new, rows are therefore weighted (`weigh_by_propensity`). Known users are calibrated on weighted
+validation rows instead (`UserCalibration`): weights would cost their tastes data.
 """
 
 from dataclasses import dataclass
@@ -23,7 +21,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 from ucfrec.user_model.reward import FITTED, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import (
     CHEAP,
@@ -197,15 +195,8 @@ def fit_training_users(
 ) -> TrainingUsers:
     """Fit the effects of training users, or read them from `folder` if they were fitted before.
 
-    A fifth of the rows of the sessions of `draw_sessions` chooses the effects.
-
-    Args:
-        train: view of a store of items whose episodes name their users.
-        weighted: whether rows are weighted by propensities, if there are any.
-        first: see `fit_item_reward_model`.
-
-    Raises:
-        InputError: all training rewards are equal, or the file is damaged.
+    A fifth of the rows of the sessions of `draw_sessions` chooses the effects. Rows are `weighted`
+    by propensities, if there are any; the rest is as in `fit_item_reward_model`.
     """
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
     if (metadata := _read_fit(file, model)) is not None:

@@ -57,10 +57,7 @@ class RewardRows:
 
     @classmethod
     def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
-        """All steps of a view of a store of items; of more than `limit`, so many drawn by `seed`.
-
-        Nothing of a step but its item and reward is read, nor anything of later steps.
-        """
+        """All steps of a view of a store of items; of more than `limit`, so many drawn."""
         return cls.at(view, *draw_steps(view, limit, seed), lags)
 
     @classmethod
@@ -188,8 +185,7 @@ class ItemRewardReport:
     seconds: float
     """Processor time of the fit."""
     new_users: bool = False
-    """Whether held-out rows are of users without training rows: the effects of users only served to
-    tell those of items, and are not part of the model."""
+    """Whether held-out rows are of users without training rows, and no effects of users kept."""
 
     @property
     def kept(self) -> Mapping[str, float]:
@@ -223,10 +219,8 @@ def calibration(predicted: Float64Array, observed: Float64Array) -> Calibration:
 
 
 def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
-    """Slope and intercept of the scores (M,) that fit the target (M,) best.
-
-    By logistic regression of targets 0 and 1 if `binary`, by least squares otherwise.
-    """
+    """Slope and intercept of the scores (M,) that fit the target (M,) best: by logistic regression
+    if it is `binary`, otherwise by least squares."""
     from sklearn.linear_model import LinearRegression, LogisticRegression
 
     inputs, outcomes = scores.double().numpy().reshape(-1, 1), target.double().numpy()

@@ -1,8 +1,4 @@
-"""When users leave: the probability that a session ends with a step, fitted to logged steps.
-
-It may be that of gradient-boosted trees, fitted by scikit-learn and kept as tensors: data, never a
-program.
-"""
+"""When users leave: the probability that a session ends with a step, fitted to logged steps."""
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -26,8 +22,7 @@ from ucfrec.user_model.reward_report import SAVED
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
 _LAGS: Final = 10
-"""Items shown before that count: as many as a tag window of a decision rule may keep from being
-repeated."""
+"""Items shown before that count, as many as a tag window may keep from being repeated."""
 _INPUTS: Final = 4 + _LAGS + 4 + 3
 """Number of inputs; see `_columns`."""
 _STEPS: Final = [0, 1]
@@ -35,8 +30,7 @@ _STEPS: Final = [0, 1]
 _REWARD: Final = 3
 """Number of the input that is the step's reward."""
 _FEWEST: Final = 20
-"""Fewest steps that end a session, and that do not, from which more than their share is
-estimated."""
+"""Fewest steps that end a session, and that do not, that tell more than their share."""
 _STEP: Final = 2.0**-10
 """Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
 on one side of a tree's threshold."""
@@ -103,11 +97,8 @@ def last_sessions(store: EpisodeStore) -> BoolArray:
 def whole_sessions(
     train: EpisodeStore, validation: EpisodeStore
 ) -> tuple[EpisodeStore, EpisodeStore]:
-    """Sessions to fit models of their ends to, and held-out ones to choose a model by.
-
-    Where most validation sessions go on from training sessions that the split by time cut, they
-    lack the steps that say when they end: training sessions of a fifth of the users are held out.
-    """
+    """Sessions to fit models of their ends to, and held-out ones: training sessions of a fifth of
+    users where most validation sessions go on from training sessions that the split cut."""
     if not (train.has_users and validation.has_users):
         return train, validation
     users, cut = train.episode_values(schema.USER), ~train.terminated & last_sessions(train)
@@ -128,8 +119,7 @@ class SessionEndReport:
     loss: Mapping[str, float]
     """Held-out log loss (nats) of each kind of model: `constant`, `logistic` and `boosted`."""
     gain: Mapping[str, tuple[float, float]]
-    """By how much it is below that of the kind that would be kept otherwise, and the standard
-    error."""
+    """By how much it is below that of the best simpler kind, and the standard error."""
     kept: str
     """The kind that is kept: each must lower the loss of simpler ones by more than the error."""
     last_sessions: bool = True
@@ -156,11 +146,7 @@ class SessionEnd:
 
     @classmethod
     def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
-        """From tensors of a file.
-
-        Raises:
-            KeyError, ValueError: they are neither trees nor a regression of these inputs.
-        """
+        """From tensors of a file; KeyError or ValueError unless they fit these inputs."""
         if "thresholds" in tensors:
             parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
             _require_trees(**parts)
@@ -178,9 +164,9 @@ class SessionEnd:
     ) -> tuple["SessionEnd", SessionEndReport]:
         """Fit every kind to logged steps, and keep the best on held-out ones.
 
-        What looks like the end of a user's last session may only be the end of the user's rows. So
-        everything is fitted without these ends, too, and that is kept if it clearly (by three
-        standard errors) predicts held-out sessions better that another one follows.
+        The end of a user's last session may only be that of the user's rows. So everything is
+        fitted without these ends, too, and that is kept if it clearly (by three standard errors)
+        predicts held-out sessions better that another one follows.
         """
         best = cls._fit_best(likeness, logged, held_out, seed)
         certain = held_out.select(held_out.followed)
@@ -314,7 +300,7 @@ def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) ->
 
 
 class BoostedTrees:
-    """The sum of T regression trees of at most S splits.
+    """The sum of T regression trees of at most S splits: data, never a program.
 
     A tree is a table: which of its splits' inputs are at most their threshold selects the leaf.
     """
@@ -343,8 +329,8 @@ class BoostedTrees:
         return self._sums(self._bits @ self._compare(inputs))
 
     def replace_input(self, inputs: Tensor, number: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Log-odds (M,) as from `inputs` (M, F) with one of them replaced by each of some values
-        (M,); fastest if inputs are the transpose of columns (F, M)."""
+        """Log-odds (M,) as from `inputs` (M, F), fastest as a transpose, with one of them replaced
+        by each of some values (M,)."""
         first, end = (bisect_left(self._sorted, value) for value in (number, number + 1))
         at_most = self._compare(inputs)
         at_most[first:end] = 0.0
@@ -377,10 +363,8 @@ def _require_trees(inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Ten
 
 
 def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
-    """Tensors of `BoostedTrees`: log-odds of a bool target (M,), from inputs (M, F).
-
-    A tenth of the rows, drawn by `seed`, decides when to stop.
-    """
+    """Tensors of `BoostedTrees` of a bool target (M,), from inputs (M, F), of scikit-learn; a tenth
+    of the rows, drawn by `seed`, decides when to stop."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
@@ -393,10 +377,8 @@ def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
 
 
 def _tabulate(nodes: Array) -> tuple[Array, Array, Array]:
-    """Inputs (S,), thresholds (S,) and leaves (2^S,) of the nodes of one of scikit-learn's trees.
-
-    Splits that the tree lacks look at input 0, and select nothing.
-    """
+    """Inputs (S,), thresholds (S,) and leaves (2^S,) of the nodes of one of scikit-learn's trees;
+    splits that it lacks look at input 0, and select nothing."""
     inner = np.flatnonzero(nodes["is_leaf"] == 0)
     inputs, thresholds = np.zeros(_SPLITS, dtype=np.int64), np.zeros(_SPLITS)
     inputs[: len(inner)] = nodes["feature_idx"][inner]

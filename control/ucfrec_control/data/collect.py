@@ -16,11 +16,8 @@ from pydantic import Field
 from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json, write_json
-from ucfrec.files.locks import lock_path, remove_leftovers_within
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
-from ucfrec.provenance import provenance
+from ucfrec.files.atomic import lock_path, read_json, remove_leftovers, write_json
+from ucfrec.processes import progress, provenance, random_state_kept
 from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
@@ -146,7 +143,7 @@ def collect_agent(
 def _filled(out: Path) -> Iterator[None]:
     """Lock a folder that is not complete, without what an interrupted call left in it."""
     with lock_path(out, "filled"):
-        remove_leftovers_within(out)
+        remove_leftovers(out, within=True)
         if (out / "MANIFEST.json").exists():
             raise InputError(f"{out} is complete already; remove it or name another output folder")
         yield
@@ -223,7 +220,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
             due = sac.steps // config.every > steps_before // config.every
             if due or sac.steps >= config.steps:
                 _evaluate(training, evaluation_env, seed, config.episodes)
-                bar.update(0, mean_return=training.evaluations[-1]["return"])
+                bar.set_postfix(mean_return=training.evaluations[-1]["return"], refresh=False)
     env.close()
     evaluation_env.close()
     return training

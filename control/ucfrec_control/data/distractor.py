@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.writer import logged_observations, reward_bit, with_observations
+from ucfrec.episodes.writer import read_observations, reward_bit, write_observations
 from ucfrec.errors import InputError
 from ucfrec_control.data.d4rl import read_d4rl
 
@@ -40,10 +40,10 @@ def add_distractor(
         raise InputError(f"{store.path} is of item logs; distractors are for observed states")
     bit = reward_bit(store, flip, seed, early)
     added = {"dimension": store.observation_size, "flip": flip, "seed": seed, "early": early}
-    return with_observations(
+    return write_observations(
         store,
         out,
-        np.column_stack([logged_observations(store), bit]),
+        np.column_stack([read_observations(store), bit]),
         {"distractors": [*store.record.source.others.get("distractors", []), added]},
     )
 

@@ -20,7 +20,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file
 from ucfrec.fitting.checkpoint import load_tensors, save_tensors
-from ucfrec.progress import Progress
+from ucfrec.processes import Progress
 from ucfrec.settings import BatchSize, LearningRate, Share, Width, settings_table
 
 _COLUMNS: Final = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")

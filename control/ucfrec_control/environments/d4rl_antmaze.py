@@ -19,7 +19,7 @@ from gymnasium_robotics.envs.maze import maps
 from gymnasium_robotics.envs.maze.ant_maze_v5 import AntMazeEnv
 
 from ucfrec.arrays import Float64Array
-from ucfrec.files.locks import scratch_folder
+from ucfrec.files.atomic import scratch_folder
 
 _ANT = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "ant.xml"
 _START = (1, 1)

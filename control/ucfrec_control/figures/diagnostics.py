@@ -15,8 +15,7 @@ from ucfrec.counterfactual.generators import (
     TangentGenerator,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel
-from ucfrec.counterfactual.reward_model_fit import sample_transitions
+from ucfrec.counterfactual.reward_model import CausalRewardModel, sample_transitions
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
@@ -24,7 +23,7 @@ from ucfrec.fitting.checkpoint import load_tensors, load_weights
 from ucfrec.policies.ucf import UCFPolicy
 from ucfrec.runs.record import RunRecord, read_augmentation
 from ucfrec.runs.record import store_of as trained_store
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 
@@ -49,7 +48,7 @@ def store_of(run: Path) -> EpisodeStore:
             f"{run} was trained on {record.store}, which is gone or has changed; move the run "
             "together with its store, or train again"
         )
-    return without_columns(store, record.dropped_observations)
+    return drop_columns(store, record.dropped_observations)
 
 
 def is_augmented(run: Path) -> bool:

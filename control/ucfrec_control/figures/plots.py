@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ucfrec.arrays import Float64Array
-from ucfrec.reporting.charts import COLUMN, OURS, PAGE, PLAIN, styled
+from ucfrec.reporting.charts import COLUMN, OURS, PAGE, PLAIN, file_style
 from ucfrec.results.statistics import summary
 
 Row = Mapping[str, Any]
@@ -68,7 +68,7 @@ def colors(names: Iterable[str]) -> dict[str, str]:
     return {name: _FIXED.get(name) or next(free) for name in listed}
 
 
-@styled
+@file_style()
 def move_histogram(
     edges: Sequence[float], counts: Sequence[int], band: tuple[float, float], title: str = ""
 ) -> Figure:
@@ -88,7 +88,7 @@ def move_histogram(
     return figure
 
 
-@styled
+@file_style()
 def acceptance_heatmap(
     lows: Sequence[float],
     highs: Sequence[float],
@@ -124,7 +124,7 @@ def acceptance_heatmap(
     return figure
 
 
-@styled
+@file_style()
 def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") -> Figure:
     """Factual and edited states in the factual ones' first two principal components (Figures 5, 6).
 
@@ -155,7 +155,7 @@ def state_overlay(factual: Float64Array, edited: Float64Array, title: str = "") 
     return figure
 
 
-@styled
+@file_style()
 def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """Normalised score over λ, a line a dataset, mean ± standard deviation over seeds (Figure 2).
 
@@ -180,7 +180,7 @@ def lambda_curves(rows: Sequence[Row], title: str = "") -> Figure:
     return figure
 
 
-@styled
+@file_style()
 def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     """Return reached over target return, a line a method: mean over seeds, lowest to highest around
     it. On the dashed line, the target is reached.
@@ -207,7 +207,7 @@ def return_curves(rows: Sequence[Row], title: str = "") -> Figure:
     return figure
 
 
-@styled
+@file_style()
 def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "") -> Figure:
     """Bars of one dataset: methods side by side, a bar a distractor (Figures 3 and 4).
 
@@ -237,7 +237,7 @@ def robustness_bars(rows: Sequence[Row], value: str, ylabel: str, title: str = "
     return figure
 
 
-@styled
+@file_style()
 def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     """Normalised scores as bars, a panel a dataset: mean over seeds, with its standard error
     (Tables 1, 3, 9 and 10).
@@ -269,7 +269,7 @@ def score_panels(rows: Sequence[Row], title: str = "") -> Figure:
     return figure
 
 
-@styled
+@file_style()
 def training_curves(
     curves: Mapping[str, Sequence[Mapping[int, float]]], ylabel: str, title: str = ""
 ) -> Figure:
@@ -293,7 +293,7 @@ def training_curves(
     return figure
 
 
-@styled
+@file_style()
 def attention_map(weights: Float64Array, title: str = "") -> Figure:
     """How much the state token of every step of a window attends to every earlier token: (K, 3, K)
     weights by querying step, modality (return-to-go, state, action) and step."""

@@ -14,11 +14,11 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.provenance import config_hash, provenance
+from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval, summary
 from ucfrec.runs.record import RUN, RunRecord
-from ucfrec.runs.screened import without_columns
+from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.start import training_views
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
@@ -254,7 +254,7 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
     dropped = trained.dropped
-    _, validation = training_views(without_columns(store, dropped))
+    _, validation = training_views(drop_columns(store, dropped))
     generator = np.random.default_rng(0)
     sources = trained.record.data.others.get("distractors", [])
     distractors = [distractor["dimension"] for distractor in sources]

@@ -19,15 +19,11 @@ from ucfrec.acting.rollout import Memoryless
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec.files.locks import lock_path, remove_leftovers_within
+from ucfrec.files.atomic import atomic_file, atomic_folder, lock_path, remove_leftovers
 from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
-from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.fitting.metrics_log import MetricsLog
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
-from ucfrec.provenance import command_line, versions
+from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
+from ucfrec.processes import command_line, progress, random_state_kept, versions
 from ucfrec.runs.record import RUN, RunRecord, TrainingRecord
 from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES
@@ -188,7 +184,7 @@ def train_rl(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLR
             another process is training in it.
     """
     with lock_path(out, "trained"):
-        remove_leftovers_within(out)
+        remove_leftovers(out, within=True)
         if not (out / RUN).exists():
             return _train(store, out, config, seed)
         existing = RLRecord.read(out)

@@ -14,7 +14,7 @@ not help to predict the next state.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -26,17 +26,15 @@ from ucfrec.counterfactual.screening import (
     CLIP,
     MAX_TRANSITIONS,
     DimensionReport,
-    MeasurementConfig,
     ScreeningReport,
-    clustered_p_value,
+    compute_p_value,
     find_measurements,
     held_out_steps,
     standardise,
     steps_with_successor,
 )
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.processes import random_state_kept
-from ucfrec.progress import progress
+from ucfrec.processes import progress, random_state_kept
 from ucfrec.runs.start import training_views
 
 _CHUNK = 1024
@@ -71,8 +69,6 @@ class ScreeningConfig:
     """Level of the tests, over held-out episodes."""
     min_reward_r2: float = 0.9
     """Least R² of the reward at which no help is evidence."""
-    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
-    """The test whether a dimension measures the reward."""
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
@@ -95,8 +91,7 @@ def screen_states(train: EpisodeStore, config: ScreeningConfig, seed: int) -> Sc
     def measured(dimensions: Sequence[int]) -> list[int]:
         """Those of `dimensions` that measure the reward."""
         new = [dimension for dimension in dimensions if dimension not in measures]
-        most, settings = config.max_transitions, config.measurement
-        measures.update(find_measurements(train, settings, most, seed, new))
+        measures.update(find_measurements(train, config.max_transitions, seed, new))
         return [dimension for dimension in dimensions if measures[dimension]]
 
     tested: Sequence[int] = range(data.size)
@@ -301,10 +296,10 @@ class _Errors(NamedTuple):
             pair = self.next_state[[without, having]][:, :, helped]
             capped = pair.minimum(pair.flatten(0, 1).quantile(1 - config.capped, dim=0))
             saved = (capped[0] - capped[1]) / capped[0].mean(0).clamp(min=1e-12)
-            effect, p_value = float(saved.mean()), clustered_p_value(saved.mean(1), episodes)
+            effect, p_value = float(saved.mean()), compute_p_value(saved.mean(1), episodes)
         more = self.reward[without] - self.reward[having]
         of_reward = float(more.mean()) / data.reward_variance
-        reward_p_value = clustered_p_value(more, episodes)
+        reward_p_value = compute_p_value(more, episodes)
         report = DimensionReport(
             dimension, effect, tuple(helped.tolist()), p_value, of_reward, reward_p_value
         )

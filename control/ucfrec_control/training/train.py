@@ -11,11 +11,11 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.registry import BUILT_IN, policy_names
-from ucfrec.provenance import versions
+from ucfrec.processes import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
+from ucfrec.runs.run import OWN, SharedStages
 from ucfrec.runs.screened import train_screened
-from ucfrec.runs.shared_stages import OWN, SharedStages
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.scores import find_kind, find_task
 from ucfrec_control.training.screening import screen_store

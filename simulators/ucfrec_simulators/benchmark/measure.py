@@ -6,7 +6,7 @@ from typing import Any, Final
 from ucfrec.benchmark.cells import Cell, Measurement, open_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment
-from ucfrec.files.locks import claim
+from ucfrec.files.atomic import claim
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.screened import SCREENING, train_screened

@@ -20,12 +20,11 @@ from tests.support.real_data import data_folder
 from tests.support.result_rows import result_row
 from ucfrec import schema
 from ucfrec.benchmark.cells import Budget, Evaluation, open_store
-from ucfrec.counterfactual.screening import MeasurementConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.reporting.tables import NONE
 from ucfrec.results.rows import ResultRow, read_rows
 from ucfrec.runs.record import RunRecord
-from ucfrec.runs.shared_stages import SharedStages
+from ucfrec.runs.run import SharedStages
 from ucfrec.runs.start import training_views
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import BUDGETS
@@ -84,9 +83,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     assert math.isnan(found["early", 1]["drop"])
 
 
-QUICK = ScreeningConfig(
-    hidden=16, shared_steps=100, own_steps=50, measurement=MeasurementConfig(trees=5)
-)
+QUICK = ScreeningConfig(hidden=16, shared_steps=100, own_steps=50)
 
 
 def screenable() -> Columns:
@@ -109,6 +106,7 @@ def begin(
     monkeypatch.setattr(plan, "DISTRACTORS", kinds)
     write_hdf5(tmp_path / f"{MADE}.hdf5", screenable())
     # Begun here, where screening may be made quick, and gone on with by the command.
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
     runs, stages = {}, SharedStages(tmp_path / "stages")
     for cell in plan.robustness_cells(tmp_path, out, budget):
@@ -178,6 +176,7 @@ def test_training_with_screening_records_and_resumes(
 ) -> None:
     # Predictors this small reach no larger share of the reward.
     config = replace(QUICK, hidden=8, min_reward_r2=0.5)
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: config)
     store, run = tmp_path / "store", tmp_path / "run"
     control("prepare", write_hdf5(tmp_path / "hopper.hdf5", screenable()), "--out", store)

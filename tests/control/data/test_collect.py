@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ucfrec.errors import InputError
-from ucfrec.progress import progress
+from ucfrec.processes import progress
 
 pytest.importorskip("mujoco", reason="needs ucfrec[control]")
 pytest.importorskip("stable_baselines3", reason="needs ucfrec[collect]")

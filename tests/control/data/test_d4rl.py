@@ -24,7 +24,7 @@ from ucfrec import schema
 from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.files.locks import is_lock_or_scratch
+from ucfrec.files.atomic import LOCK, SCRATCH
 from ucfrec_control.data.d4rl import read_d4rl, require_inside, write_d4rl
 from ucfrec_control.data.minari import is_minari, read_minari, write_minari
 from ucfrec_control.environments.scores import find_kind, require_task
@@ -320,7 +320,7 @@ def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_no_scratch(
     assert [*minari_folder.rglob("main_data.hdf5")]
     folder = write_minari(read_d4rl(file), "mine/hopper/mine-v0")
     assert [path.parent.parent for path in minari_folder.rglob("main_data.hdf5")] == [folder]
-    assert not [path for path in minari_folder.rglob(".*") if is_lock_or_scratch(path.name)]
+    assert not [path for path in minari_folder.rglob(".*") if path.name.endswith((LOCK, SCRATCH))]
     assert "mine/hopper/mine-v0" in minari.list_local_datasets()
     assert read_minari("mine/hopper/mine-v0").lengths.tolist() == list(LENGTHS)
     assert {"mine", "mine/hopper"} <= set(minari.namespace.list_local_namespaces())

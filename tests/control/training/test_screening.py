@@ -5,11 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.causes import QUICK, planted_category, planted_vectors
+from tests.support.causes import planted_category, planted_vectors
+from ucfrec.counterfactual import screening
 from ucfrec.errors import InputError
 from ucfrec_control.training.screening import ScreeningConfig, screen_states
 
-FAST = ScreeningConfig(hidden=48, shared_steps=300, own_steps=100, measurement=QUICK)
+FAST = ScreeningConfig(hidden=48, shared_steps=300, own_steps=100)
+
+
+@pytest.fixture(autouse=True)
+def _few_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(screening, "TREES", 25)
 
 
 def test_what_causes_nothing_is_flagged_and_nothing_else(tmp_path: Path) -> None:

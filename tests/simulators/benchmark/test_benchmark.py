@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tests.support.causes import QUICK
 from tests.support.real_data import data_folder
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.benchmark.cells import Budget, Evaluation, make_key, training_config
@@ -217,7 +216,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(
 def test_screened_methods_are_rows_of_the_distractor_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ucfrec.runs.screened.MeasurementConfig", lambda: QUICK)
+    monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
     wanted = ("bc", *SCREENED)

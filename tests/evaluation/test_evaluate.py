@@ -17,20 +17,20 @@ from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.evaluation.collect import collect_store
-from ucfrec.evaluation.diversity import (
-    COLUMNS,
+from ucfrec.evaluation.evaluate import (
     Recommended,
     coverage,
     coverage_per_turn,
     diversity,
     dominance,
     dominant_tags,
+    evaluate_behavior,
+    evaluate_policy,
     novelty,
     tag_jaccard,
     variety_columns,
 )
-from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.simulator import Environment
+from ucfrec.evaluation.simulator import COLUMNS, Environment
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import training_views

@@ -63,9 +63,8 @@ def make_wide_log(folder: Path, rows: int, seed: int) -> None:
                 "observation": pa.FixedSizeListArray.from_arrays(pa.array(numbers), OBSERVATION),
             }
         )
-        table = table.set_column(
-            5, "observation", table["observation"].cast(pa.list_(pa.float32()))
-        )
+        lists = table["observation"].cast(pa.list_(pa.float32()))
+        table = table.set_column(5, "observation", lists)
         writer = writer or pq.ParquetWriter(folder / "log.parquet", table.schema)
         writer.write_table(table)
     assert writer is not None

@@ -176,22 +176,13 @@ def replication(environment: Environment, seed: int) -> Replication:
     return Replication(verdict.reliable, holds)
 
 
-@dataclass(frozen=True)
 class Coverage:
     """The replications of one environment."""
 
-    environment: str
-    found: list[Replication]
-
-    @property
-    def standing(self) -> list[Replication]:
-        """Those whose verdict stands."""
-        return [one for one in self.found if one.stands]
-
-    @property
-    def stands(self) -> float:
-        """Share of the replications whose verdict stands."""
-        return len(self.standing) / len(self.found)
+    def __init__(self, environment: str, found: list[Replication]) -> None:
+        self.environment, self.found = environment, found
+        self.standing = [one for one in found if one.stands]
+        self.stands = len(self.standing) / len(found)
 
     def covered(self, name: str, of: list[Replication]) -> float:
         """Share of intervals that hold the truth; NaN of no replication."""
@@ -223,16 +214,10 @@ class Coverage:
         found = [ResultRow(method="verdict", metric="stands", metrics=stands, **common)]
         for name in SHOWN if self.standing else ():
             covered = self.covered(name, self.standing)
-            everywhere = self.covered(name, self.found)
-            found.append(
-                ResultRow(
-                    method=name,
-                    metric="coverage",
-                    metrics={"coverage": covered, "coverage_of_all": everywhere},
-                    interval=share_interval(covered, len(self.standing)),
-                    **common,
-                )
-            )
+            metrics = {"coverage": covered, "coverage_of_all": self.covered(name, self.found)}
+            interval = share_interval(covered, len(self.standing))
+            about: dict[str, Any] = {"method": name, "metric": "coverage", "interval": interval}
+            found.append(ResultRow(metrics=metrics, **about, **common))
         return found
 
 

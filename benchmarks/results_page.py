@@ -647,12 +647,8 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
     about = "\n".join(fill(f"- {each}", subsequent_indent="  ") for each in ENVIRONMENTS)
     parts = ["# Tables", head, "## What each simulator can and cannot show", about]
-    parts += [
-        "## Names of methods",
-        markdown_table(
-            ("name", "meaning"), [(f"`{name}`".replace(", ", "`, `"), said) for name, said in NAMES]
-        ),
-    ]
+    names = [(f"`{name}`".replace(", ", "`, `"), said) for name, said in NAMES]
+    parts += ["## Names of methods", markdown_table(("name", "meaning"), names)]
     parts += [section.text(files) for section in SECTIONS if section.rows(files)]
     parts += ["## The paper's Table 2", paper, PAPER]
     parts += ["## Pictures", shown] if pictures else []
@@ -660,9 +656,7 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in FILES}

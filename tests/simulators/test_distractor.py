@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
-from tests.support.single_session import SingleSession
+from tests.support.single_session import check_environment
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, rollout
@@ -126,8 +125,7 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
 @pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
 def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
     folder = kuairand_folder / "environment"
-    environment = Environment(name, folder).simulator().make(1, folder)
-    check_env(SingleSession(environment), skip_render_check=True)
+    check_environment(Environment(name, folder).simulator().make(1, folder))
 
 
 def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:

@@ -54,8 +54,7 @@ class SardineEnvironment(GymnasiumCatalog):
     def favourites(self) -> IntArray:
         """(N,) the item that each user is most likely to click now."""
         tastes = np.stack([_sardine(env).cur_user_embedd for env in self.envs])
-        chosen: IntArray = np.argmax(tastes @ self.vectors.T, axis=1)
-        return chosen
+        return np.asarray(np.argmax(tastes @ self.vectors.T, axis=1))
 
 
 def _sardine(env: gymnasium.Env[Any, Any]) -> Any:

@@ -80,7 +80,7 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             process, the environment cannot be created or has no step limit, its action space is not
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
-    with _filled(out):
+    with _lock_incomplete(out):
         training = _train(env_id, out / "training", seed, config)
         medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
         parts = {
@@ -125,7 +125,7 @@ def collect_agent(
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
-    with _filled(out):
+    with _lock_incomplete(out):
         env = make_env(env_id, 1)
         shape, space = env.single_observation_space.shape or (), env.single_action_space
         env.close()
@@ -140,7 +140,7 @@ def collect_agent(
 
 
 @contextmanager
-def _filled(out: Path) -> Iterator[None]:
+def _lock_incomplete(out: Path) -> Iterator[None]:
     """Lock a folder that is not complete, without what an interrupted call left in it."""
     with lock_path(out, "filled"):
         remove_leftovers(out, within=True)

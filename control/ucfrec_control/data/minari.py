@@ -151,7 +151,7 @@ def _buffers(trajectories: Trajectories) -> list[EpisodeBuffer]:
     finals, buffers = trajectories.final_observations, []
     ends = np.cumsum(trajectories.lengths)
     for number, (end, length) in enumerate(zip(ends, trajectories.lengths, strict=True)):
-        rows, before = slice(end - length, end), [False] * (length - 1)
+        rows, earlier = slice(end - length, end), [False] * (length - 1)
         seen, terminated = trajectories.observations[rows], bool(trajectories.terminated[number])
         buffers.append(
             EpisodeBuffer(
@@ -159,8 +159,8 @@ def _buffers(trajectories: Trajectories) -> list[EpisodeBuffer]:
                 observations=np.vstack([seen, seen[-1:] if finals is None else finals[number]]),
                 actions=trajectories.actions[rows],
                 rewards=trajectories.rewards[rows].tolist(),
-                terminations=[*before, terminated],
-                truncations=[*before, not terminated],
+                terminations=[*earlier, terminated],
+                truncations=[*earlier, not terminated],
                 infos={},
             )
         )

@@ -51,8 +51,8 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     targets: list[float] = []
     text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
-        named = {key: rule.get(key, value) for key, value in run.items()}
-        if any(run[k] not in ([n] if isinstance(n, str) else n) for k, n in named.items()):
+        names = {key: rule.get(key, value) for key, value in run.items()}
+        if any(run[k] not in ([n] if isinstance(n, str) else n) for k, n in names.items()):
             continue
         for table, values in rule.get("set", {}).items():
             tables[table] = tables.get(table, {}) | values
@@ -94,5 +94,5 @@ def train_control(
         InputError: as `train_screened`, or the store is not a control store.
     """
     dataset_of(store)
-    about = {"versions": versions(PACKAGES)}
-    return train_screened(store, out, config, screening, about, shared, screen=screen_store)
+    entries = {"versions": versions(PACKAGES)}
+    return train_screened(store, out, config, screening, entries, shared, screen=screen_store)

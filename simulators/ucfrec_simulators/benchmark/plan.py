@@ -86,8 +86,8 @@ class RecommendationCells:
     def _select_tasks(self, table: str) -> Sequence[str]:
         if not self._request.tasks:
             return self._budget.tasks_in(table)
-        known = _TASKS_OF.get(table, tuple(TASKS))
-        return [name for name in self._request.tasks if name in known]
+        available = _TASKS_OF.get(table, tuple(TASKS))
+        return [name for name in self._request.tasks if name in available]
 
     def _sweeps(self, task: Task) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""

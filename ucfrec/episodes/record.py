@@ -18,9 +18,6 @@ LONG: Final = 100
 _Positive = Annotated[int, Field(strict=True, ge=1, lt=2**48)]
 _Width = Annotated[int, Field(strict=True, ge=1, le=2**24)]
 
-LONG: Final = 100
-"""Times the median from which on a session is hardly a person's."""
-
 
 class Distribution(Entry):
     """A histogram of values of the logs, with quantiles."""

@@ -164,8 +164,8 @@ class MatrixFactorisation:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        known = np.where(steps.users < len(self._users) - 1, steps.users, -1)
-        return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
+        rows = np.where(steps.users < len(self._users) - 1, steps.users, -1)
+        return self._users[torch.from_numpy(rows)] @ self._items.T + self._tie_break
 
 
 def recent_rankers(
@@ -305,10 +305,10 @@ def _rankers(
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
     model = [] if trained.reward_model is None else [reward_ranker(trained.scorer())]
-    others = baselines(counts, fitted_on, seed, liked)
+    rankers = baselines(counts, fitted_on, seed, liked)
     if train is not None and fitted_on is not None:
-        others += recent_rankers(fitted_on, train, liked)
-    return name_rankers([*policies, *model, *others]), liked
+        rankers += recent_rankers(fitted_on, train, liked)
+    return name_rankers([*policies, *model, *rankers]), liked
 
 
 def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:

@@ -30,13 +30,7 @@ from ucfrec.runs.record import RunRecord
 from ucfrec_control.benchmark.budgets import budget_of
 from ucfrec_control.benchmark.measure import RATE, SCORE_MEASUREMENT, config, train
 from ucfrec_control.benchmark.methods import MAIN
-from ucfrec_control.benchmark.plan import (
-    SEARCHED,
-    presets_of,
-    score_cells,
-    set_contexts,
-    stores_of,
-)
+from ucfrec_control.benchmark.plan import SEARCHED, presets_of, score_cells, set_contexts
 from ucfrec_control.data.distractor import zoo_store
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.training.rl_baselines import ALGORITHMS, RLPolicy
@@ -60,7 +54,7 @@ def rate_cells(data: Path, out: Path, budget: Budget) -> Iterator[Cell]:
         return (*budget.settings, *policy_settings, *method.settings, *searched)
 
     for file in FILES:
-        store = zoo_store(data, stores_of(out), file)
+        store = zoo_store(data, out / "stores", file)
         for rate in RATES[budget.name]:
             at_rate = partial(settings, rate)
             plan = Plan("rates", out / budget.name, budget, at_rate, presets_of)
@@ -112,20 +106,14 @@ def context_cells(data: Path, out: Path, budget: Budget) -> Iterator[Cell]:
 def best(rows: Sequence[ResultRow], condition: str, relative: bool) -> dict[str, object]:
     """The value of `condition` with the lowest (relative) or the highest mean, by method."""
     choice: dict[str, object] = {}
-    for method, method_rows in grouped(rows, lambda row: row.method).items():
-        lowest = {
-            task: min(row.value for row in task_rows)
-            for task, task_rows in grouped(method_rows, lambda row: row.task).items()
-        }
-        means = {
-            value: summary(
-                -row.value / lowest[row.task] if relative else row.value for row in value_rows
-            ).mean
-            for value, value_rows in grouped(
-                method_rows, lambda row: row.conditions[condition]
-            ).items()
-        }
-        choice[method] = max(means, key=lambda value: means[value])
+    for method, own in grouped(rows, lambda row: row.method).items():
+        tasks = grouped(own, lambda row: row.task).items()
+        lowest = {task: min(row.value for row in task_rows) for task, task_rows in tasks}
+        scale = {task: -1 / least if relative else 1.0 for task, least in lowest.items()}
+        values = grouped(own, lambda row: row.conditions[condition])
+        choice[method] = max(
+            values, key=lambda v: summary(row.value * scale[row.task] for row in values[v]).mean
+        )
     return choice
 
 

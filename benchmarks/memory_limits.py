@@ -18,8 +18,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from measured_rows import append_row, make_parser
@@ -63,17 +63,15 @@ def make_wide_log(folder: Path, rows: int, seed: int) -> None:
                 "observation": pa.FixedSizeListArray.from_arrays(pa.array(numbers), OBSERVATION),
             }
         )
-        table = table.set_column(
-            5, "observation", table["observation"].cast(pa.list_(pa.float32()))
-        )
+        lists = table["observation"].cast(pa.list_(pa.float32()))
+        table = table.set_column(5, "observation", lists)
         writer = writer or pq.ParquetWriter(folder / "log.parquet", table.schema)
         writer.write_table(table)
     assert writer is not None
     writer.close()
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """What a command took."""
 
     wall_s: float

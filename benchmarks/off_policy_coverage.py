@@ -33,13 +33,13 @@ replications (seeds from 5000 on), DR held the truth in 35, SNIPS in 37, logged 
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from measured_rows import make_parser
 
 from ucfrec.arrays import Float64Array, IntArray
-from ucfrec.off_policy.estimators import Estimate, estimate
+from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.models import fit_models
 from ucfrec.off_policy.verdict import conclude
@@ -154,8 +154,7 @@ def drawn(probabilities: Float64Array, rng: np.random.Generator) -> IntArray:
     return np.asarray(np.minimum(beyond.sum(axis=1), probabilities.shape[1] - 1))
 
 
-@dataclass(frozen=True)
-class Replication:
+class Replication(NamedTuple):
     """What one set of logs says."""
 
     stands: bool
@@ -167,36 +166,23 @@ class Replication:
 def replication(environment: Environment, seed: int) -> Replication:
     steps, (truth, as_logged) = environment.logged(seed), environment.value(seed)
     verdict, found = conclude(steps, seed), estimate(steps, seed)
-    holds: dict[str, bool] = {}
-    for name in SHOWN[:-1]:
-        holds[name] = held(found.get(name), as_logged if name == "logged" else truth)
-    low, high = verdict.lift_low, verdict.lift_high
-    holds["lift"] = low is not None and high is not None and low <= truth - as_logged <= high
+    intervals = {name: (one.low, one.high, truth) for name, one in found.items()}
+    intervals["lift"] = (verdict.lift_low, verdict.lift_high, truth - as_logged)
+    if "logged" in found:
+        intervals["logged"] = (found["logged"].low, found["logged"].high, as_logged)
+    holds = dict.fromkeys(SHOWN, False)
+    for name, (low, high, value) in intervals.items():
+        holds[name] = low is not None and high is not None and low <= value <= high
     return Replication(verdict.reliable, holds)
 
 
-def held(found: Estimate | None, truth: float) -> bool:
-    if found is None or found.low is None or found.high is None:
-        return False
-    return found.low <= truth <= found.high
-
-
-@dataclass(frozen=True)
 class Coverage:
     """The replications of one environment."""
 
-    environment: str
-    found: list[Replication]
-
-    @property
-    def standing(self) -> list[Replication]:
-        """Those whose verdict stands."""
-        return [one for one in self.found if one.stands]
-
-    @property
-    def stands(self) -> float:
-        """Share of the replications whose verdict stands."""
-        return len(self.standing) / len(self.found)
+    def __init__(self, environment: str, found: list[Replication]) -> None:
+        self.environment, self.found = environment, found
+        self.standing = [one for one in found if one.stands]
+        self.stands = len(self.standing) / len(found)
 
     def covered(self, name: str, of: list[Replication]) -> float:
         """Share of intervals that hold the truth; NaN of no replication."""
@@ -228,16 +214,10 @@ class Coverage:
         found = [ResultRow(method="verdict", metric="stands", metrics=stands, **common)]
         for name in SHOWN if self.standing else ():
             covered = self.covered(name, self.standing)
-            everywhere = self.covered(name, self.found)
-            found.append(
-                ResultRow(
-                    method=name,
-                    metric="coverage",
-                    metrics={"coverage": covered, "coverage_of_all": everywhere},
-                    interval=share_interval(covered, len(self.standing)),
-                    **common,
-                )
-            )
+            metrics = {"coverage": covered, "coverage_of_all": self.covered(name, self.found)}
+            interval = share_interval(covered, len(self.standing))
+            about: dict[str, Any] = {"method": name, "metric": "coverage", "interval": interval}
+            found.append(ResultRow(metrics=metrics, **about, **common))
         return found
 
 

@@ -59,15 +59,8 @@ def make_log(folder: Path, rows: int, seed: int) -> None:
         twice = generator.integers(n, size=n // 100)
         for column in (user, item, times):
             column[: len(twice)] = column[twice]
-        table = pa.table(
-            {
-                "user_id": user,
-                "item_id": item,
-                "timestamp": times,
-                "is_click": click,
-                "propensity": propensity,
-            }
-        )
+        columns = {"user_id": user, "item_id": item, "timestamp": times, "is_click": click}
+        table = pa.table({**columns, "propensity": propensity})
         if begin % FILE_ROWS == 0:
             if writer is not None:
                 writer.close()
@@ -80,7 +73,8 @@ def make_log(folder: Path, rows: int, seed: int) -> None:
 
 
 def run_prepare(log: Path, out: Path, memory_limit: str) -> None:
-    from ucfrec.logs import LogMapping, PrepareOptions, prepare
+    from ucfrec.logs.mapping import LogMapping
+    from ucfrec.logs.prepare import PrepareOptions, prepare
 
     options = PrepareOptions(memory_limit=memory_limit)
     prepare([log], LogMapping(reward="is_click"), out, options)

@@ -62,15 +62,8 @@ BASELINES = (
 )
 SEQUENCE = ("sasrec", "gsasrec", "bpr", "bc", "bc-10", "dt", "dt4rec", "cdt4rec", "edt4rec")
 UCF = (
-    *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure"),
-    *(
-        "ucf-wo-reward-weight",
-        "ucf-wo-lookahead",
-        "ucf-wo-policy",
-        "ucf-wo-rule",
-        "ucf-weights",
-        "ucf-max-return",
-    ),
+    *("ucf-paper", "ucf-paper-algorithm-5", "ucf-plain", "ucf-wo-exposure", "ucf-wo-reward-weight"),
+    *("ucf-wo-lookahead", "ucf-wo-policy", "ucf-wo-rule", "ucf-weights", "ucf-max-return"),
     *("ucf-actions", "ucf-both", "ucf-wo-count", "ucf-wo-arch", "ucf"),
 )
 METHODS = (*BUILT_IN, *BASELINES, *SEQUENCE, *(f"{name}+shared" for name in SEQUENCE), *UCF)
@@ -180,18 +173,16 @@ def minus_ucf(rows: Sequence[ResultRow]) -> Callable[[str, str, Sequence[ResultR
 
 def returns(rows: Sequence[ResultRow]) -> str:
     """Returns, average rewards, and returns minus those of UCF."""
-    best: dict[str, float] = {}
-    for (environment, method), own in grouped(
-        rows, lambda row: (str(row.environment), row.method)
-    ).items():
-        if method not in KNOWING:
-            mean = summary(row.value for row in own).mean
-            best[environment] = max(best.get(environment, mean), mean)
+    fair = grouped(
+        [row for row in rows if row.method not in KNOWING],
+        lambda row: (str(row.environment), row.method),
+    )
+    means = {key: summary(row.value for row in own).mean for key, own in fair.items()}
 
     def cell(environment: str, method: str, group: Sequence[ResultRow]) -> str:
-        found = summary(row.value for row in group)
-        text = level(found)
-        return f"**{text}**" if found.mean == best[environment] and method not in KNOWING else text
+        text, own = level(summary(row.value for row in group)), means.get((environment, method))
+        best = max(mean for (where, _), mean in means.items() if where == environment)
+        return f"**{text}**" if own == best else text
 
     parts = [
         "R_cum, mean ± standard deviation over logs and training seeds:",
@@ -210,14 +201,12 @@ def returns(rows: Sequence[ResultRow]) -> str:
 def components(rows: Sequence[ResultRow]) -> str:
     """The return of UCF, and differences without or with one component more."""
     less = minus_ucf(rows)
-    return pivot(
-        rows,
-        lambda environment, method, own: (
-            level(summary(row.value for row in own))
-            if method == "ucf"
-            else less(environment, method, own)
-        ),
-    )
+
+    def cell(environment: str, method: str, own: Sequence[ResultRow]) -> str:
+        itself = level(summary(row.value for row in own))
+        return itself if method == "ucf" else less(environment, method, own)
+
+    return pivot(rows, cell)
 
 
 def estimated(files: _Files) -> Sequence[ResultRow]:
@@ -232,16 +221,17 @@ def estimates(rows: Sequence[ResultRow]) -> str:
         estimate = summary(row.metrics["estimated_value"] for row in group).mean
         return f"{rounded(estimate)} → {rounded(summary(row.value for row in group).mean)}"
 
+    def error_of(row: ResultRow) -> float:
+        return abs(row.metrics["estimated_value"] - row.value)
+
     def off(own: Sequence[ResultRow]) -> str:
-        return rounded(
-            summary(abs(row.metrics["estimated_value"] - row.value) for row in own).mean, 2
-        )
+        return rounded(summary(map(error_of, own)).mean, 2)
 
     lines = []
     for environment, own in grouped(rows, lambda row: str(row.environment)).items():
         logs = grouped(own, lambda row: str(row.log_seed)).items()
         of_logs = ", ".join(f"log {name}: {off(group)}" for name, group in logs)
-        near = sum(abs(r.metrics["estimated_value"] - r.value) <= r.value / 10 for r in own)
+        near = sum(error_of(row) <= row.value / 10 for row in own)
         lines.append((environment, len(own), near, off(own), of_logs))
     head = ("environment", "rows", "within 10%", "mean absolute error", "by log")
     return f"{pivot(rows, cell)}\n\n{markdown_table(head, lines)}"
@@ -319,10 +309,8 @@ def scores(rows: Sequence[ResultRow], references: Sequence[str] = ("ucf",)) -> s
     methods = dict.fromkeys(row.method for row in rows)
     values = {name: [by_seeds(of.get((name, task), ())) for task in tasks] for name in methods}
     found = {name: _with_mean(own) for name, own in values.items()}
-    best = [
-        max(each.mean for each in column if each.count)
-        for column in zip(*found.values(), strict=True)
-    ]
+    columns = zip(*found.values(), strict=True)
+    best = [max(each.mean for each in column if each.count) for column in columns]
 
     def cell(sample: Summary, highest: float) -> str:
         text = level(sample, standard_error=True)
@@ -420,9 +408,8 @@ def contexts(rows: Sequence[ResultRow]) -> str:
     tasks = list(dict.fromkeys(row.task for row in rows))
     lines = []
     ordered = sorted(rows, key=lambda row: (row.method, str(row.conditions["context"]).zfill(4)))
-    for (method, context), own in grouped(
-        ordered, lambda row: (row.method, row.conditions["context"])
-    ).items():
+    cases = grouped(ordered, lambda row: (row.method, row.conditions["context"]))
+    for (method, context), own in cases.items():
         found = {row.task: row.value for row in own}
         mean = rounded(summary(found.values()).mean) if len(found) == len(tasks) else NONE
         cells = (rounded(found[task]) if task in found else NONE for task in tasks)
@@ -660,12 +647,8 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
     shown = "\n".join(f"![{name}](assets/tables/{name}.svg)" for name in pictures)
     about = "\n".join(fill(f"- {each}", subsequent_indent="  ") for each in ENVIRONMENTS)
     parts = ["# Tables", head, "## What each simulator can and cannot show", about]
-    parts += [
-        "## Names of methods",
-        markdown_table(
-            ("name", "meaning"), [(f"`{name}`".replace(", ", "`, `"), said) for name, said in NAMES]
-        ),
-    ]
+    names = [(f"`{name}`".replace(", ", "`, `"), said) for name, said in NAMES]
+    parts += ["## Names of methods", markdown_table(("name", "meaning"), names)]
     parts += [section.text(files) for section in SECTIONS if section.rows(files)]
     parts += ["## The paper's Table 2", paper, PAPER]
     parts += ["## Pictures", shown] if pictures else []
@@ -673,9 +656,7 @@ def page(files: _Files, pictures: Sequence[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     options = parser.parse_args()
     files = {name: latest(read_rows(RESULTS / f"{name}.jsonl")) for name in FILES}

@@ -9,7 +9,6 @@ of clients and prints a table. Requests/s are of wall time. Client and server sh
 CPU time of either, unlike the rate, hardly depends on what else these do.
 """
 
-import argparse
 import asyncio
 import json
 import re
@@ -131,21 +130,6 @@ def measured(address: str, body: bytes, clients: int, seconds: float) -> dict[st
     return found
 
 
-def measurements(
-    run: Path, options: argparse.Namespace, workers: int, rule: list[str]
-) -> Iterator[tuple[int, dict[str, float], float]]:
-    """For each number of clients: what is measured, and the seconds that it took."""
-    trained = TrainedPolicy.load(run)
-    body = request(trained, options.history)
-    how = ["--workers", str(workers), "--threads", str(options.threads), *rule]
-    with served(run, *how) as address:
-        measured(address, body, 4 * workers, options.seconds)  # warms the server up
-        for clients in options.clients:
-            began = time.perf_counter()
-            found = measured(address, body, clients, options.seconds)
-            yield clients, found, time.perf_counter() - began
-
-
 def main() -> None:
     parser = make_parser(__doc__, SUITE)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder of `ucfrec train`")
@@ -159,21 +143,23 @@ def main() -> None:
     tool = "wrk" if shutil.which("wrk") else "httpx"
     assert trained.item_ids is not None
     lines = list[tuple[object, ...]]()
+    body = request(trained, options.history)
+    known = {name: getattr(options, name) for name in ("history", "threads", "seconds")}
+    known["options"] = " ".join(rule)
+    about: dict[str, Any] = {"policy": trained.name}
+    about["data_fingerprint"] = trained.record.fingerprint
+    task = f"{len(trained.item_ids):,} items"
     for workers in options.workers:
-        for clients, found, wall_time_s in measurements(options.run, options, workers, rule):
-            lines.append((workers, clients, *(f"{value:,.4g}" for value in found.values())))
-            given = {name: getattr(options, name) for name in ("history", "threads", "seconds")}
-            about = {
-                "conditions": {
-                    **{"clients": clients, "workers": workers, **given},
-                    "options": " ".join(rule),
-                },
-                "policy": trained.name,
-                "data_fingerprint": trained.record.fingerprint,
-                "wall_time_s": wall_time_s,
-            }
-            task = f"{len(trained.item_ids):,} items"
-            append_row(options.results, SUITE, task, tool, found, **about)
+        how = ("--workers", str(workers), "--threads", str(options.threads), *rule)
+        with served(options.run, *how) as address:
+            measured(address, body, 4 * workers, options.seconds)  # warms the server up
+            for clients in options.clients:
+                began = time.perf_counter()
+                found = measured(address, body, clients, options.seconds)
+                about["wall_time_s"] = time.perf_counter() - began
+                about["conditions"] = {"clients": clients, "workers": workers, **known}
+                append_row(options.results, SUITE, task, tool, found, **about)
+                lines.append((workers, clients, *(f"{value:,.4g}" for value in found.values())))
     heads = ("workers", "clients", "requests/s", "p50 ms", "p90 ms", "p99 ms")
     print(markdown_table((*heads, "CPU of the server, ms", "of the client, ms"), lines))
 

@@ -91,8 +91,7 @@ def traced(arguments: Sequence[str]) -> Tracer:
 
 def tiny_job(folder: Path) -> dict[str, Tracer]:
     """Trace `train`, `ope` and `recommend` on a small log in `folder`."""
-    random = np.random.default_rng(0)
-    rows = 2000
+    random, rows = np.random.default_rng(0), 2000
     log = pd.DataFrame(
         {
             "user_id": random.integers(0, 100, rows),
@@ -117,21 +116,14 @@ def tiny_job(folder: Path) -> dict[str, Tracer]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--top", type=int, default=0, help="pairs of files to list (default: 0)")
     parser.add_argument("command", nargs=argparse.REMAINDER, help="of ucfrec (default: tiny job)")
     options = parser.parse_args()
-    if options.command:
-        found = {options.command[0]: traced(options.command)}
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            found = tiny_job(Path(folder))
-    lines = [
-        (name, len(tracer.files), f"{tracer.hops.total():,}", len(tracer.hops))
-        for name, tracer in found.items()
-    ]
+    with tempfile.TemporaryDirectory() as folder:
+        given = options.command
+        found = {given[0]: traced(given)} if given else tiny_job(Path(folder))
+    lines = [(name, len(t.files), f"{t.hops.total():,}", len(t.hops)) for name, t in found.items()]
     print(text_table(("command", "files", "hops", "pairs of files"), lines))
     for name, tracer in found.items():
         for (caller, callee), count in tracer.hops.most_common(options.top):

@@ -57,7 +57,6 @@ def seconds(folder: Path, rows: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Measure and print a table."""
     parser = argparse.ArgumentParser(description="CPU time of an update.")
     parser.add_argument("--rows", type=int, action="append", metavar="N")
     lines = []

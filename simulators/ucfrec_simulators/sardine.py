@@ -33,8 +33,7 @@ class SardineEnvironment(GymnasiumCatalog):
     """N sessions of a SARDINE environment of single items.
 
     Args:
-        variant: the part of the identifier that names the environment, `Static` or `BoredInf`.
-        num_envs: N.
+        variant: `Static` or `BoredInf`.
 
     Raises:
         InputError: `sardine-rec` is not installed.
@@ -55,8 +54,7 @@ class SardineEnvironment(GymnasiumCatalog):
     def favourites(self) -> IntArray:
         """(N,) the item that each user is most likely to click now."""
         tastes = np.stack([_sardine(env).cur_user_embedd for env in self.envs])
-        chosen: IntArray = np.argmax(tastes @ self.vectors.T, axis=1)
-        return chosen
+        return np.asarray(np.argmax(tastes @ self.vectors.T, axis=1))
 
 
 def _sardine(env: gymnasium.Env[Any, Any]) -> Any:
@@ -81,8 +79,6 @@ class GreedyOracle:
     because the draw of ε does not depend on what happens in the session.
 
     Args:
-        env: the environment that it acts in.
-        seed: seed of its draws.
         epsilons: values of ε, all equally likely.
 
     Raises:

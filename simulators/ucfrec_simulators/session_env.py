@@ -32,8 +32,7 @@ def draw_categories(
         uniforms: (M,) uniform draws from [0, 1).
     """
     cumulative = np.cumsum(probabilities, axis=1, dtype=np.float64)
-    chosen: IntArray = np.argmax(cumulative > uniforms[:, None] * cumulative[:, -1:], axis=1)
-    return chosen
+    return np.asarray(np.argmax(cumulative > uniforms[:, None] * cumulative[:, -1:], axis=1))
 
 
 class SessionsEnv(VectorEnv[Float32Array, Array, Array], ABC):

@@ -180,8 +180,6 @@ class SoftmaxGuess(Memoryless):
     sessions of a bad mood, of odd tags; its propensities are those given the mood.
 
     Args:
-        environment: the environment that it acts in.
-        seed: seed of its draws.
         error: standard deviation of the fixed error of each (user, item) log-odds.
         temperature: temperature of the softmax.
         epsilon: probability of a uniformly drawn item.
@@ -205,11 +203,8 @@ class SoftmaxGuess(Memoryless):
         self._guess = environment.logits + error * errors.standard_normal(environment.logits.shape)
 
     def probabilities(self, live: BoolArray | None = None) -> Float64Array:
-        """(N, n_items) probability of each item in each session's next step.
-
-        Args:
-            live: (N,) marks the sessions of interest; None for all.
-        """
+        """(N, n_items) probability of each item in the next step of the sessions that `live` (N,)
+        marks; None for all."""
         environment, rows = self._environment, slice(None) if live is None else live
         repeated = (environment.recent_tags[rows, :, None] == environment.tags).any(axis=1)
         scores = self._guess[environment.users[rows]] - self._variety * repeated
@@ -229,27 +224,20 @@ class SoftmaxGuess(Memoryless):
 
 
 def _catalog(env: VectorEnv[Any, Any, Any]) -> SyntheticCatalog:
+    """The catalogue within `env`, whose policies refuse any other environment."""
     if not isinstance(env.unwrapped, SyntheticCatalog):
         raise InputError(f"this behavior policy serves SyntheticCatalog, not {type(env).__name__}")
     return env.unwrapped
 
 
 def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
-    """The optimal policy: `Rotation` with the true probabilities; `seed` is unused.
-
-    Raises:
-        InputError: `env` is not a SyntheticCatalog.
-    """
+    """The optimal policy: `Rotation` with the true probabilities; `seed` is unused."""
     environment = _catalog(env)
     return Rotation(environment, environment.favourites(environment.click_probabilities))
 
 
 def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
-    """`Rotation` by mean probabilities over users: a non-personalised policy; `seed` is unused.
-
-    Raises:
-        InputError: `env` is not a SyntheticCatalog.
-    """
+    """`Rotation` by mean probabilities over users: a non-personalised policy; `seed` is unused."""
     environment = _catalog(env)
     favourites = environment.favourites(environment.click_probabilities.mean(axis=0, keepdims=True))
     return Rotation(environment, np.tile(favourites, (len(environment.logits), 1)))
@@ -267,9 +255,6 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform items, the others one of the policies of `QUALITIES`.
-
-    Raises:
-        InputError: `env` is not a SyntheticCatalog.
     """
     environment = _catalog(env)
     guesses: list[Actor] = [SoftmaxGuess(environment, seed, *knobs) for *knobs, _ in QUALITIES]
@@ -279,11 +264,7 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
 
 
 def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
-    """A logging policy that tries much: other policies can be evaluated on its logs.
-
-    Raises:
-        InputError: `env` is not a SyntheticCatalog.
-    """
+    """A logging policy that tries much: other policies can be evaluated on its logs."""
     knobs = {"error": 0.5, "temperature": 5.0, "epsilon": 0.1, "variety": 0.0}
     return SoftmaxGuess(_catalog(env), seed, **knobs)
 

@@ -26,49 +26,35 @@ POLICIES: dict[str, tuple[type[SequencePolicy], PolicyConfig]] = {
     "dc": (DCPolicy, DCConfig(**SHAPE)),
     "lsdt": (LSDTPolicy, LSDTConfig(**SHAPE, heads=2, kernel_groups=2)),
 }
-SHARED = {
-    "embed_timestep": "embed.embed_timestep",
-    "embed_return": "embed.embed_return",
-    "embed_rtg": "embed.embed_return",
-    "embed_state": "embed.embed_state",
-    "embed_action": "head.embed_action",
-    "embed_ln": "embed.norm",
-    "predict_action.0": "head.out",
-    "transformer.ln_f": "final_norm",
-}
-"""Our name of a layer by the authors' name of it."""
+
+
+def named(text: str) -> dict[str, str]:
+    """Our name of a layer by the authors' name of it."""
+    return dict(pair.split("=") for pair in text.split())
+
+
+SHARED = named(
+    "embed_timestep=embed.embed_timestep embed_return=embed.embed_return "
+    "embed_rtg=embed.embed_return embed_state=embed.embed_state embed_action=head.embed_action "
+    "embed_ln=embed.norm predict_action.0=head.out transformer.ln_f=final_norm"
+)
 BLOCKS = {
-    "dt": {
-        "ln_1": "attention_norm",
-        "attn.c_attn": "query_key_value",
-        "attn.c_proj": "out",
-        "ln_2": "mlp_norm",
-        "mlp.c_fc": "mlp.0",
-        "mlp.c_proj": "mlp.2",
-    },
-    "dc": {
-        "ln_1": "mixer_norm",
-        "conv.rtg_conv1d": "mixers.0",
-        "conv.obs_conv1d": "mixers.1",
-        "conv.act_conv1d": "mixers.2",
-        "ln_2": "mlp_norm",
-        "mlp.0": "mlp.0",
-        "mlp.2": "mlp.2",
-    },
-    "lsdt": {
-        "attention.fmlp.0": "squeeze",
-        "attention.fl1": "gates.0",
-        "attention.fl2": "gates.1",
-        "attention.proj_net": "out",
-        "attention.Dynamicconv_layer.linear1": "short.gated",
-        "attention.Dynamicconv_layer.linear2": "short.out",
-        "ln1": "norm",
-        "mlp.0": "mlp.0",
-        "mlp.2": "mlp.2",
-        "ln2": "mlp_norm",
-    },
+    "dt": named(
+        "ln_1=attention_norm attn.c_attn=query_key_value attn.c_proj=out ln_2=mlp_norm "
+        "mlp.c_fc=mlp.0 mlp.c_proj=mlp.2"
+    ),
+    "dc": named(
+        "ln_1=mixer_norm conv.rtg_conv1d=mixers.0 conv.obs_conv1d=mixers.1 "
+        "conv.act_conv1d=mixers.2 ln_2=mlp_norm mlp.0=mlp.0 mlp.2=mlp.2"
+    ),
+    "lsdt": named(
+        "attention.fmlp.0=squeeze attention.fl1=gates.0 attention.fl2=gates.1 "
+        "attention.proj_net=out attention.Dynamicconv_layer.linear1=short.gated "
+        "attention.Dynamicconv_layer.linear2=short.out ln1=norm mlp.0=mlp.0 mlp.2=mlp.2 "
+        "ln2=mlp_norm"
+    ),
 }
-"""The same within a block."""
+"""Names within a block."""
 UNUSED = ("transformer.wte", "predict_return", "predict_rtg", "predict_state")
 
 
@@ -123,18 +109,17 @@ def windows_of(inputs: dict[str, Tensor]) -> Windows:
 @pytest.mark.parametrize("policy_name", POLICIES)
 def test_outputs_equal_those_of_the_authors_code(policy_name: str) -> None:
     fixture = load_file(FIXTURES / f"{policy_name}.safetensors")
-    parts: dict[str, dict[str, Tensor]] = {"weight": {}, "input": {}}
-    for name, value in fixture.items():
-        part, _, rest = name.partition(".")
-        if rest:
-            parts[part][rest] = value
+    theirs, inputs = (
+        {k.removeprefix(part): v for k, v in fixture.items() if k.startswith(part)}
+        for part in ("weight.", "input.")
+    )
     kind, config = POLICIES[policy_name]
     policy = kind(config, SIZES).eval()
     buffers = {name for name, _ in policy.named_buffers()}
-    weights = renamed(policy_name, parts["weight"])
+    weights = renamed(policy_name, theirs)
     assert weights.keys() == policy.state_dict().keys() - buffers
     policy.load_state_dict(weights, strict=False)
-    windows = windows_of(parts["input"])
+    windows = windows_of(inputs)
     assert bool(windows.mask.all()) == (policy_name != "dt")
     with torch.no_grad():
         actions = policy.head.predict(policy.features(windows))

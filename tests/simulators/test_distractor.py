@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 
 from tests.simulators.kuai.test_kuairand import QUICK, planted_store
-from tests.support.single_session import SingleSession
+from tests.support.single_session import check_environment
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import Step, rollout
@@ -66,9 +65,8 @@ def test_the_distractor_goes_with_the_reward_and_nothing_else_changes(
     assert observed.shape[1] == planted.observation_size == store.observation_size + 1
     agreed = float((observed[:, 0] == high).mean())
     assert agreed == 1 if flip == 0 else agreed == pytest.approx(agreement, abs=0.03)
-    assert planted.record.source.others["distractor"]["rate"] == pytest.approx(
-        observed[:, 0].mean()
-    )
+    rate = planted.record.source.others["distractor"]["rate"]
+    assert rate == pytest.approx(observed[:, 0].mean())
     if store.observation_size:
         before = store.step_values(schema.OBSERVATION, *store.all_steps())
         np.testing.assert_array_equal(observed[:, 1:], before)
@@ -127,8 +125,7 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
 @pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
 def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
     folder = kuairand_folder / "environment"
-    environment = Environment(name, folder).simulator().make(1, folder)
-    check_env(SingleSession(environment), skip_render_check=True)
+    check_environment(Environment(name, folder).simulator().make(1, folder))
 
 
 def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
@@ -156,9 +153,8 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
     folder = kuairand_folder / "environment"
     for rate in (0.0, 1.0):
         environment = DistractorEnvironment(name, folder, rate)
-        assert (
-            evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))["episodes"] == 20
-        )
+        row = evaluate_policy(environment, trained, "bc", 20, 0, DecisionRule(1.0))
+        assert row["episodes"] == 20
         env = environment.simulator().make(8, folder)
         ids = np.arange(len(trained.item_ids)) if trained.item_ids is not None else None
         steps_played, states_shown = _play_and_watch(env, trained, ids)

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from tests.support.played import play
-from tests.support.single_session import SingleSession
+from tests.support.single_session import check_environment
 from ucfrec.acting.rollout import Episodes, rollout
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
@@ -30,7 +29,7 @@ def played(simulator: Simulator, behavior: str, episodes: int, seed: int = 0) ->
 
 @pytest.mark.parametrize("environment", [SyntheticTaobao, SyntheticCatalog])
 def test_gymnasium_accepts_it(environment: type[SyntheticTaobao] | type[SyntheticCatalog]) -> None:
-    check_env(SingleSession(environment(1)), skip_render_check=True)
+    check_environment(environment(1))
 
 
 @pytest.mark.parametrize("simulator", [TAOBAO, CATALOG])

@@ -1,5 +1,7 @@
 """Control datasets made up for tests, and commands on them."""
 
+import json
+import shutil
 from collections.abc import Iterable
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -9,6 +11,7 @@ import h5py
 import numpy as np
 
 from ucfrec.arrays import Array
+from ucfrec.files.atomic import read_json
 from ucfrec_control.cli import main
 
 Columns = dict[str, Array]
@@ -72,3 +75,17 @@ def refused(*arguments: object) -> str:
     lines = control(*arguments, status=2)[1].strip().splitlines()
     assert len(lines) == 1 or lines[0].startswith("usage: ")
     return lines[-1]
+
+
+def changed(run: Path, to: Path, entry: tuple[str, ...], value: object) -> Path:
+    """A copy of a run with another value of an entry of its record; None takes it out."""
+    shutil.copytree(run, to)
+    record = read_json(run / "run.json")
+    inner = record
+    for name in entry[:-1]:
+        inner = inner[name]
+    inner[entry[-1]] = value
+    if value is None:
+        del inner[entry[-1]]
+    (to / "run.json").write_text(json.dumps(record))
+    return to

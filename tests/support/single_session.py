@@ -4,6 +4,7 @@ from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import VectorEnv
 
 from ucfrec.arrays import Array, Float32Array
@@ -38,3 +39,8 @@ class SingleSession(gymnasium.Env[Float32Array, Array]):
 
 def _first(infos: dict[str, Any]) -> dict[str, Any]:
     return {key: value[0] for key, value in infos.items() if not key.startswith("_")}
+
+
+def check_environment(environment: VectorEnv[Float32Array, Array, Array]) -> None:
+    """Gymnasium's own checks of a vector environment with one session."""
+    check_env(SingleSession(environment), skip_render_check=True)

@@ -224,45 +224,40 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
         )
     columns = {}
     for column in frame.columns:
-        try:
-            columns[str(column)] = _convert_column(frame[column])
-        except _UnusableError as error:
-            if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
-                raise InputError(f"{name}: {column} {error}") from None
-            warn_user(f"{name}: column {column} is left out: it {error}")
+        array = _convert_column(frame[column])
+        if not isinstance(array, str):
+            columns[str(column)] = array
+        elif column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
+            raise InputError(f"{name}: {column} {array}")
+        else:
+            warn_user(f"{name}: column {column} is left out: it {array}")
     return pa.table(columns)
 
 
-class _UnusableError(Exception):
-    """A column cannot be read; the message says why, and what to do."""
-
-
-def _convert_column(values: "pd.Series[Any]") -> pa.Array:
-    """A column of a data frame, or _UnusableError."""
+def _convert_column(values: "pd.Series[Any]") -> pa.Array | str:
+    """A column of a data frame, or why it cannot be read and what to do."""
     import pandas as pd
 
     if isinstance(values.dtype, pd.PeriodDtype):
-        raise _UnusableError("holds periods; convert them with .dt.to_timestamp()")
+        return "holds periods; convert them with .dt.to_timestamp()"
     try:
         array = pa.Array.from_pandas(values)
     except OverflowError:
-        raise _UnusableError(
-            "holds whole numbers of more than 64 bits; convert them with .astype(str)"
-        ) from None
+        return "holds whole numbers of more than 64 bits; convert them with .astype(str)"
     except (TypeError, ValueError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
-        raise _UnusableError(f"holds values of several types ({reason}); make them one") from None
+        return f"holds values of several types ({reason}); make them one"
     if pa.types.is_duration(array.type):
-        raise _UnusableError("holds durations; convert them with .dt.total_seconds()")
+        return "holds durations; convert them with .dt.total_seconds()"
     dates = values.dtype == object and pa.types.is_date(array.type)
     if dates and any(isinstance(value, datetime) for value in values):
         # Arrow would cut off the time of day.
-        raise _UnusableError("holds dates and times; convert them with pandas.to_datetime")
+        return "holds dates and times; convert them with pandas.to_datetime"
     if pa.types.is_float16(array.type):
         return array.cast(pa.float32())
     for kind in _list_types(array.type):
         if any(is_kind(kind) for is_kind in _UNREAD) or kind == pa.struct([]):
-            raise _UnusableError(f"is of type {kind}, which is not read; convert it")
+            return f"is of type {kind}, which is not read; convert it"
     return array
 
 

@@ -26,11 +26,6 @@ from ucfrec_control.training.rl_baselines import ALGORITHMS
 from ucfrec_control.training.train import dataset_of, preset_of
 
 
-def stores_of(folder: Path) -> Path:
-    """The folder of the stores."""
-    return folder / "stores"
-
-
 def score_cells(
     data: Path, folder: Path, budget: Budget, table: str, methods: Sequence[str] = ()
 ) -> Iterator[Cell]:
@@ -38,6 +33,7 @@ def score_cells(
 
     Args:
         data: folder of the HDF5 files.
+        folder: gets runs, and stores in `stores`.
         budget: as `budget_of` returns it.
         table: a key of `TABLES`.
         methods: rows of the table; empty for all.
@@ -49,7 +45,7 @@ def score_cells(
     plan = _plan(SCORES, folder, budget)
     for file in budget.tasks:
         if file not in budget.optional or (data / f"{file}.hdf5").exists():
-            store = zoo_store(data, stores_of(folder), file)
+            store = zoo_store(data, folder / "stores", file)
             yield from plan.list_trained(table, Task(file, store), selected)
 
 
@@ -74,7 +70,7 @@ def robustness_cells(
     plan = _plan(ROBUSTNESS, folder, budget)
     for file in budget.tasks:
         for distractor in distractors or DISTRACTORS:
-            store = zoo_store(data, stores_of(folder), file, distractor)
+            store = zoo_store(data, folder / "stores", file, distractor)
             task = Task(file, store, conditions={DISTRACTOR: distractor})
             yield from plan.list_trained(ROBUSTNESS, task, selected)
 

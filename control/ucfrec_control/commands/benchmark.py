@@ -3,12 +3,7 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from ucfrec.benchmark.tables import (
-    average_seeds,
-    difference_table,
-    score_table,
-    select_best_target,
-)
+from ucfrec.benchmark.tables import average_seeds, difference_table, score_table, select_best_target
 from ucfrec.commands.options import Names
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow

@@ -97,8 +97,8 @@ class Reproduce(ControlGridOptions):
         budget = self.narrow_budget(part.budget(self.budget))
         cells: list[Cell] = []
         if self.show_only:
-            kept = latest(read_rows(results))
-            of_budget = [row for row in kept if row.conditions.get("budget") == self.budget]
+            last = latest(read_rows(results))
+            of_budget = [row for row in last if row.conditions.get("budget") == self.budget]
             rows = [row for row in of_budget if part.has(row)]
             if not rows:
                 raise InputError(

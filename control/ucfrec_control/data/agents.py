@@ -99,10 +99,10 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
     tensors, settings = _contents(file)
     kind, names = _kind_of(file, tensors)
     expected = {name for name in tensors if name.startswith((*names, "log_std", "actor.log_std"))}
-    others = [n for n in tensors if n not in expected and n.startswith(("actor.", "features"))]
-    if others:
-        found = min(others)
-        raise _refusal(file, f"its network has {found}, which is not a layer of a perceptron")
+    unexpected = [n for n in tensors if n not in expected and n.startswith(("actor.", "features"))]
+    if unexpected:
+        tensor_name = min(unexpected)
+        raise _refusal(file, f"its network has {tensor_name}, which is not a layer of a perceptron")
     for name in (f"{name}.{part}" for name in names for part in ("weight", "bias")):
         if not _is_plain(tensors[name]):
             raise _refusal(file, f"{name} is not of finite numbers stored one by one")
@@ -111,11 +111,11 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
         if first.shape[0] != second.shape[1]:
             sizes = f"{name} has {first.shape[0]} outputs, {next_name} {second.shape[1]} inputs"
             raise _refusal(file, sizes)
-    taken, given = layers[0].shape[1], layers[-1].shape[0]
-    if (taken, given) != (observations, space.shape[0]):
+    observed, acted = layers[0].shape[1], layers[-1].shape[0]
+    if (observed, acted) != (observations, space.shape[0]):
         raise InputError(
-            f"{file}: the agent maps observations of size {taken} to actions of size {given}; the "
-            f"environment's are {observations} and {space.shape[0]}"
+            f"{file}: the agent maps observations of size {observed} to actions of size {acted}; "
+            f"the environment's are {observations} and {space.shape[0]}"
         )
     kwargs = settings.get("policy_kwargs")
     kwargs = kwargs if isinstance(kwargs, dict) else {}

@@ -80,7 +80,7 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
             process, the environment cannot be created or has no step limit, its action space is not
             a `Box`, Stable-Baselines3 is not installed, or no policy beat the random policy.
     """
-    with _filled(out):
+    with _lock_incomplete(out):
         training = _train(env_id, out / "training", seed, config)
         medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
         parts = {
@@ -125,7 +125,7 @@ def collect_agent(
     """
     if not 0 <= noise < np.inf or size < 1:
         raise InputError(f"--noise {noise:g} and --size {size}: give at least 0, and at least 1")
-    with _filled(out):
+    with _lock_incomplete(out):
         env = make_env(env_id, 1)
         shape, space = env.single_observation_space.shape or (), env.single_action_space
         env.close()
@@ -140,7 +140,7 @@ def collect_agent(
 
 
 @contextmanager
-def _filled(out: Path) -> Iterator[None]:
+def _lock_incomplete(out: Path) -> Iterator[None]:
     """Lock a folder that is not complete, without what an interrupted call left in it."""
     with lock_path(out, "filled"):
         remove_leftovers(out, within=True)
@@ -271,13 +271,20 @@ def _choose(
 
 def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
     replay = training.sac.replay(training.evaluations[medium]["steps"])
-    ends = np.flatnonzero(replay["terminals"] | replay["timeouts"])
+    return _trajectories(replay, replay["terminals"], replay["timeouts"], env_id)
+
+
+def _trajectories(
+    columns: Mapping[str, Array], terminated: BoolArray, truncated: BoolArray, env_id: str
+) -> Trajectories:
+    """Steps of whole episodes, one after another."""
+    ends = np.flatnonzero(terminated | truncated)
     return Trajectories(
-        **{name: replay[name] for name in _COLUMNS},
+        **{name: columns[name].astype(np.float32) for name in _COLUMNS},
         lengths=np.diff(ends, prepend=-1),
-        terminated=replay["terminals"][ends],
-        final_observations=replay["next_observations"][ends],
-        source=_source(env_id),
+        terminated=terminated[ends],
+        final_observations=columns["next_observations"][ends].astype(np.float32),
+        source={"where": f"episodes of {env_id}", "env_id": env_id},
     )
 
 
@@ -314,32 +321,17 @@ def roll_out(
 def _sort_by_episode(steps: list[Step], env_id: str) -> Trajectories:
     """Reorder the steps of episodes that ran in parallel so that each episode is contiguous."""
     order = np.argsort(np.concatenate([step.episodes for step in steps]), kind="stable")
-
-    def column(name: str) -> Array:
-        return np.concatenate([getattr(step, name) for step in steps])[order]
-
-    terminated = column("terminated")
-    ends = np.flatnonzero(terminated | column("truncated"))
-    return Trajectories(
-        **{
-            name: column(name).astype(np.float32) for name in ("observations", "actions", "rewards")
-        },
-        lengths=np.diff(ends, prepend=-1),
-        terminated=terminated[ends],
-        final_observations=column("next_observations")[ends].astype(np.float32),
-        source=_source(env_id),
-    )
+    names = (*_COLUMNS, "next_observations", "terminated", "truncated")
+    columns = {
+        name: np.concatenate([getattr(step, name) for step in steps])[order] for name in names
+    }
+    return _trajectories(columns, columns["terminated"], columns["truncated"], env_id)
 
 
 def _join(*parts: Trajectories) -> Trajectories:
     """Concatenate trajectories; the source is that of the first."""
-
-    def column(name: str) -> Any:
-        return np.concatenate([getattr(part, name) for part in parts])
-
     names = (*_COLUMNS, "lengths", "terminated", "final_observations")
-    return Trajectories(**{name: column(name) for name in names}, source=parts[0].source)
-
-
-def _source(env_id: str) -> dict[str, Any]:
-    return {"where": f"episodes of {env_id}", "env_id": env_id}
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
+    return Trajectories(**columns, source=parts[0].source)

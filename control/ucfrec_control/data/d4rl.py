@@ -13,7 +13,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError, damage_explained, one_line
 from ucfrec.files.atomic import atomic_file, read_json
 from ucfrec_control.data.trajectories import Trajectories, count_of
@@ -51,9 +51,8 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
                 f"{', '.join(list(file)[:20]) or 'nothing'}"
             )
         steps = {name: read_numbers(file, path, name) for name in _REQUIRED}
-        for name in ("timeouts", "next_observations", _FINAL):
-            if name in file:
-                steps[name] = read_numbers(file, path, name)
+        more = [name for name in ("timeouts", "next_observations", _FINAL) if name in file]
+        steps |= {name: read_numbers(file, path, name) for name in more}
         recorded = file.attrs.get("env_id")
     _require_aligned(steps, path)
     environment = env_id or (recorded if isinstance(recorded, str) else None)
@@ -62,10 +61,13 @@ def read_d4rl(path: Path, env_id: str | None = None) -> Trajectories:
     check_sizes(task, sizes, str(path))
     terminals = _flags(steps["terminals"], "terminals", path)
     ends = np.flatnonzero(terminals | _timeouts(steps, path))
-    finals = _final_observations(steps, ends, path)
+    finals = steps.get(_FINAL)
+    if "next_observations" in steps:
+        finals = steps["next_observations"][ends]
+    elif finals is not None and len(finals) != len(ends):
+        raise InputError(f"{path}: {_FINAL} has {len(finals)} rows for {len(ends)} trajectories")
     lengths = np.diff(ends, prepend=-1)
-    shortest = 2 if task is not None and task.name == "antmaze" else 1
-    keep = lengths >= shortest
+    keep = lengths > (task is not None and task.name == "antmaze")
     n = int(ends[-1]) + 1 if len(ends) else 0
     rows = np.repeat(keep, lengths)
     source = {
@@ -156,20 +158,6 @@ def _timeouts(steps: Mapping[str, Array], path: Path) -> BoolArray:
         )
     goes_on = (steps["next_observations"][:-1] == steps["observations"][1:]).all(axis=1)
     return np.append(~goes_on, False)
-
-
-def _final_observations(
-    steps: Mapping[str, Array], ends: IntArray, path: Path
-) -> Float32Array | None:
-    if "next_observations" in steps:
-        return steps["next_observations"][ends]
-    if _FINAL not in steps:
-        return None
-    if len(steps[_FINAL]) != len(ends):
-        raise InputError(
-            f"{path}: {_FINAL} has {len(steps[_FINAL])} rows for {len(ends)} trajectories"
-        )
-    return steps[_FINAL]
 
 
 def _made_with(path: Path) -> dict[str, str]:

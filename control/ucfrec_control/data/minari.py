@@ -22,7 +22,7 @@ from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec_control.data.d4rl import convert_singles, first_line, require_inside
 from ucfrec_control.data.trajectories import Trajectories
-from ucfrec_control.environments.antmaze import antmaze_settings, is_antmaze
+from ucfrec_control.environments.environments import antmaze_settings, is_antmaze
 from ucfrec_control.environments.scores import check_sizes, dataset_name, find_task
 
 _ROOT = "MINARI_DATASETS_PATH"
@@ -148,26 +148,22 @@ def write_minari(trajectories: Trajectories, identifier: str) -> Path:
 
 
 def _buffers(trajectories: Trajectories) -> list[EpisodeBuffer]:
-    finals = trajectories.final_observations
-    buffers, start = [], 0
-    for number, length in enumerate(trajectories.lengths):
-        rows = slice(start, start + length)
-        seen = trajectories.observations[rows]
-        ended = np.zeros(length, dtype=bool)
-        ended[-1] = True
-        terminated = bool(trajectories.terminated[number])
+    finals, buffers = trajectories.final_observations, []
+    ends = np.cumsum(trajectories.lengths)
+    for number, (end, length) in enumerate(zip(ends, trajectories.lengths, strict=True)):
+        rows, earlier = slice(end - length, end), [False] * (length - 1)
+        seen, terminated = trajectories.observations[rows], bool(trajectories.terminated[number])
         buffers.append(
             EpisodeBuffer(
                 id=number,
                 observations=np.vstack([seen, seen[-1:] if finals is None else finals[number]]),
                 actions=trajectories.actions[rows],
                 rewards=trajectories.rewards[rows].tolist(),
-                terminations=(ended & terminated).tolist(),
-                truncations=(ended & (not terminated)).tolist(),
+                terminations=[*earlier, terminated],
+                truncations=[*earlier, not terminated],
                 infos={},
             )
         )
-        start += length
     return buffers
 
 
@@ -206,15 +202,14 @@ def _root() -> Path:
 @contextmanager
 def _root_is(folder: Path) -> Iterator[None]:
     """Have Minari write its datasets to another folder."""
-    previous = os.environ.get(_ROOT)
+    previous = dict(os.environ)
     folder.mkdir()
     os.environ[_ROOT] = str(folder)
     try:
         yield
     finally:
         del os.environ[_ROOT]
-        if previous is not None:
-            os.environ[_ROOT] = previous
+        os.environ.update(previous)
 
 
 def _spec(env_id: str | None) -> gymnasium.envs.registration.EnvSpec | None:

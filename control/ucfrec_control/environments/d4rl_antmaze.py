@@ -61,18 +61,15 @@ class D4RLAntMaze(AntMazeEnv):
 
     def _center(self, cell: tuple[int, int]) -> Float64Array:
         row, column = cell
-        center: Float64Array = self.maze.cell_rowcol_to_xy(
-            np.array([self.maze.map_length - 1 - row, column])
-        )
-        return center
+        cell_from_below = np.array([self.maze.map_length - 1 - row, column])
+        return np.asarray(self.maze.cell_rowcol_to_xy(cell_from_below))
 
     def generate_target_goal(self) -> Float64Array:
         """Draw the goal (2,): each coordinate is that of its cell's center or above, by less than
         3/8 of the cell's side."""
         quarter = self.maze.maze_size_scaling / 4
         offset = self.np_random.uniform(0, quarter, 2) + self.np_random.uniform(0, quarter / 2, 2)
-        goal: Float64Array = self._center(self._goal_cell) + offset
-        return goal
+        return np.asarray(self._center(self._goal_cell) + offset)
 
     def generate_reset_pos(self) -> Float64Array:
         """Return the start position (2,), without noise; the ant adds its own when it is reset."""

@@ -47,7 +47,7 @@ def _plain(name: str) -> str:
 
 
 D4RL_ANTMAZE = "d4rl/antmaze-{maze}-v2"
-"""Identifier of a rebuilt AntMaze; `ucfrec_control.environments.antmaze` registers it."""
+"""Identifier of a rebuilt AntMaze; `ucfrec_control.environments.environments` registers it."""
 _MAZES = {
     # D4RL's files are named differently (`Ant_maze_big-maze_…`) from the datasets they hold.
     **{"umaze": "umaze", "medium": "medium", "bigmaze": "medium"},

@@ -112,18 +112,15 @@ class Editing:
         rows = torch.from_numpy(rng.permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS])
         fields = fitted.__dataclass_fields__
         factual = Transitions(*(getattr(fitted, name)[rows] for name in fields))
-        generator: TangentGenerator | CounterfactualStateGenerator
         if config.csg.kind == "faithful":
-            generator = CounterfactualStateGenerator(crm, config.csg)
+            faithful = CounterfactualStateGenerator(crm, config.csg)
             weights = run / "csg" / "best.safetensors"
-            load_weights(weights, generator, load_tensors(weights)[0])
-            generator.eval()
-        else:
-            # Nothing of it is learned but covariances, the same for the same seed.
-            made = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
-            assert isinstance(made, TangentGenerator)
-            generator = made
-        return cls(crm, generator, factual, report.epsilon_r)
+            load_weights(weights, faithful, load_tensors(weights)[0])
+            return cls(crm, faithful.eval(), factual, report.epsilon_r)
+        # Nothing of it is learned but covariances, the same for the same seed.
+        tangent = make_generator(fitted, crm, config.csg, run / "csg", config.seed)
+        assert isinstance(tangent, TangentGenerator)
+        return cls(crm, tangent, factual, report.epsilon_r)
 
     def acceptance(self, band: tuple[float, float], seed: int = 0) -> float:
         """Share of proposals under `band` (ρ_low, ρ_high) that pass both gates of Eq. 4 and move

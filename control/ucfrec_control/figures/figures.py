@@ -148,14 +148,14 @@ def _runs(folder: Path) -> Iterator[_Run]:
 
 def _distinguish_runs(runs: Sequence[_Run]) -> list[_Run]:
     """The runs, of which those with other settings go by their folder's name, less the seed."""
-    of = grouped(runs, lambda run: (run.group, run.method))
-    settings = {named: {run.settings for run in same} for named, same in of.items()}
-    return [
-        replace(run, method=re.sub(r"(-[0-9a-f]{12})?-\d+$", "", run.path.resolve().name))
-        if len(settings[run.group, run.method]) > 1
-        else run
-        for run in runs
-    ]
+    distinct = []
+    for run in runs:
+        same = [r for r in runs if (r.group, r.method) == (run.group, run.method)]
+        if len({sibling.settings for sibling in same}) > 1:
+            folder = run.path.resolve().name
+            run = replace(run, method=re.sub(r"(-[0-9a-f]{12})?-\d+$", "", folder))
+        distinct.append(run)
+    return distinct
 
 
 def _plan_runs(runs: Sequence[_Run]) -> Iterator[_Plan]:

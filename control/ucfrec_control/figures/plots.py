@@ -33,9 +33,7 @@ _FIXED = {
     "ucf-screened": "#CC79A7",
     "ucf-dropped": "#F0E442",
     "ucf-wo-count": "#E69F00",
-    "ucf-no-augmentation": "#E69F00",
     "ucf-wo-arch": "#000000",
-    "dt-augmented": "#000000",
     "none": "#8C8C8C",
     "deterministic": "#0072B2",
     "stochastic": "#56B4E9",
@@ -50,9 +48,7 @@ _LABELS = {
     "ucf-screened": "UCF, screened",
     "ucf-dropped": "UCF, dropped",
     "ucf-wo-count": "w/o Count",
-    "ucf-no-augmentation": "w/o Count",
     "ucf-wo-arch": "w/o Arch",
-    "dt-augmented": "w/o Arch",
     "none": "no distractor",
 }
 _PANELS = 3

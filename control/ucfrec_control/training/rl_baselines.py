@@ -375,8 +375,7 @@ def _cql(d3rlpy: Any, config: RLConfig) -> Any:
 
 
 def _normalise(states: Array, mean: Array, std: Array) -> Float32Array:
-    normalised: Float32Array = ((states - mean) / std).astype(np.float32)
-    return normalised
+    return np.asarray(((states - mean) / std).astype(np.float32))
 
 
 def _d3rlpy() -> Any:

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.registry import BUILT_IN, policy_names
 from ucfrec.processes import versions
 from ucfrec.runs.config import Config
@@ -52,8 +51,8 @@ def find_preset(task: str, kind: str, policy: str) -> Preset:
     targets: list[float] = []
     text = files("ucfrec_control.training").joinpath("presets.toml").read_text(encoding="utf-8")
     for rule in tomllib.loads(text)["rule"]:
-        named = {key: rule.get(key, value) for key, value in run.items()}
-        if any(run[k] not in ([n] if isinstance(n, str) else n) for k, n in named.items()):
+        names = {key: rule.get(key, value) for key, value in run.items()}
+        if any(run[k] not in ([n] if isinstance(n, str) else n) for k, n in names.items()):
             continue
         for table, values in rule.get("set", {}).items():
             tables[table] = tables.get(table, {}) | values
@@ -88,20 +87,12 @@ def train_control(
     *,
     screening: str | None = None,
     shared: SharedStages = OWN,
-    callbacks: Callbacks = SILENT,
 ) -> RunRecord:
-    """`ucfrec.runs.screened.train_screened` on a control store.
-
-    Args:
-        out: run folder; an interrupted run resumes.
-        screening: one of `ucfrec.runs.screened.SCREENINGS`; None for none.
-        shared, callbacks: as `ucfrec.runs.run.train_run` has them.
+    """`ucfrec.runs.screened.train_screened` on a control store; `screening` is its `how`.
 
     Raises:
         InputError: as `train_screened`, or the store is not a control store.
     """
     dataset_of(store)
-    package_versions = {"versions": versions(PACKAGES)}
-    return train_screened(
-        *(store, out, config, screening, package_versions, shared, callbacks), screen_store
-    )
+    entries = {"versions": versions(PACKAGES)}
+    return train_screened(store, out, config, screening, entries, shared, screen=screen_store)

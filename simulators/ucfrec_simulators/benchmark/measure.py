@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any, Final
 
-from ucfrec.acting.decision import DecisionRule
 from ucfrec.benchmark.cells import Cell, Measurement, open_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment
@@ -41,7 +40,9 @@ def measure(cell: Cell, row_key: RowKey) -> list[ResultRow]:
     if record.screening is not None:
         training_metrics[SCREENING] = list(record.screening.flagged)
     trained = TrainedPolicy.load(cell.run, CHECKPOINT)
-    rule = _rule(cell, trained)
+    rule, quantile = trained.rule, cell.evaluation.target_quantile
+    if quantile is not None and cell.conditioned:  # the plan's target
+        rule = replace(rule, target=trained.target_return(quantile))
     for environment in cell.environments:
         evaluation = evaluate_policy(environment, trained, cell.method, episodes, seed, rule)
         # Other methods are given a rule, but do not look at its target.
@@ -78,14 +79,6 @@ def _training_metrics(record: RunRecord) -> dict[str, Any]:
         "crm_r2": augmentation.reward_model.r2,
         "crm_r2_without_z": augmentation.reward_model.r2_without_z,
     }
-
-
-def _rule(cell: Cell, trained: TrainedPolicy) -> DecisionRule:
-    """The run's own rule, or with the plan's target."""
-    quantile = cell.evaluation.target_quantile
-    if quantile is None or not cell.conditioned:
-        return trained.rule
-    return replace(trained.rule, target=trained.target_return(quantile))
 
 
 MEASUREMENT: Final = Measurement(measure)

@@ -61,8 +61,8 @@ class RecommendationCells:
 
     def cells(self, table: str) -> Iterator[Cell]:
         """The cells of a table."""
-        made_by: dict[str, Callable[[Task, int], Iterator[Cell]]] = {
-            "main": self._main,
+        made_by: dict[str, Callable[[Task], Iterator[Cell]]] = {
+            "main": partial(self._list_trained, "main", METHODS),
             "shared": partial(self._list_trained, "shared", _SHARED),
             "sweeps": self._sweeps,
             "distractor": self._distractor,
@@ -72,7 +72,10 @@ class RecommendationCells:
             names = [self._request.environment.title]
         for name in names:
             for log in range(self._budget.logs):
-                yield from made_by[table](self._task(name, log), log)
+                task = self._task(name, log)
+                if table == "main" and log == 0:
+                    yield from self._plan.list_built_in(table, task, METHODS)
+                yield from made_by[table](task)
 
     def missing(self) -> list[str]:
         """Tasks of the main table that are excluded: their files or package are missing."""
@@ -83,16 +86,10 @@ class RecommendationCells:
     def _select_tasks(self, table: str) -> Sequence[str]:
         if not self._request.tasks:
             return self._budget.tasks_in(table)
-        known = _TASKS_OF.get(table, tuple(TASKS))
-        return [name for name in self._request.tasks if name in known]
+        available = _TASKS_OF.get(table, tuple(TASKS))
+        return [name for name in self._request.tasks if name in available]
 
-    def _main(self, task: Task, log: int) -> Iterator[Cell]:
-        """Cells of Table 2 with Table 3's ablations, and of the environments' built-in policies."""
-        if log == 0:
-            yield from self._plan.list_built_in("main", task, METHODS)
-        yield from self._list_trained("main", METHODS, task, log)
-
-    def _sweeps(self, task: Task, log: int) -> Iterator[Cell]:
+    def _sweeps(self, task: Task) -> Iterator[Cell]:
         """Cells of UCF with other λ, bands and gates; the main table has the defaults."""
         store = EpisodeStore.open(task.store)
         spread = float(store.step_values(schema.REWARD, *store.all_steps()).std())
@@ -102,9 +99,9 @@ class RecommendationCells:
             **{f"ε_r = {x:g} σ": f"augment.epsilon_r={x * spread}" for x in GATES},
         }
         methods = {f"ucf, {name}": make_augmented_ucf(s) for name, s in sweeps.items()}
-        yield from self._list_trained("sweeps", {**methods, **PAPER}, task, log)
+        yield from self._list_trained("sweeps", {**methods, **PAPER}, task)
 
-    def _distractor(self, task: Task, log: int) -> Iterator[Cell]:
+    def _distractor(self, task: Task) -> Iterator[Cell]:
         """Cells of methods that are trained without and with a distractor in the logs.
 
         Those trained with it are evaluated with the distractor off and on. Every method is given
@@ -133,7 +130,7 @@ class RecommendationCells:
             )
 
     def _list_trained(
-        self, table: str, methods: Mapping[str, Method], task: Task, log: int
+        self, table: str, methods: Mapping[str, Method], task: Task
     ) -> Iterator[Cell]:
         return self._plan.list_trained(table, task, methods, conditions={"quantiles": "rule"})
 

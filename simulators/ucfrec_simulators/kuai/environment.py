@@ -155,11 +155,8 @@ class KuaiEnv(SessionsEnv):
         return pa.table({"item_id": pa.array(self.item_ids), "tags": pa.array(self.tags)})
 
     def boring(self, exit_rule: ExitRule | None = None) -> BoolArray:
-        """(N, n_items) whether each item would end each session by the exit rule in this step.
-
-        Args:
-            exit_rule: another rule than the environment's.
-        """
+        """(N, n_items) whether each item would end each session in this step by an exit rule, the
+        environment's if None."""
         tiresome = self._tiresome(exit_rule or self.exit_rule)
         boring = np.zeros((self.num_envs, len(self._codes)), dtype=np.bool_)
         for codes in self._codes.T:
@@ -195,12 +192,10 @@ class KuaiEnv(SessionsEnv):
         if self.regime.masked:
             self._require_new(actions)
         rewards = np.asarray(self.rewards[self.users, actions], dtype=np.float32)
+        bored = np.zeros(self.num_envs, dtype=np.bool_)
         if self.regime.steps is None:
-            bored = np.asarray(
-                self._tiresome(self.exit_rule)[rows[:, None], self._codes[actions]].any(axis=1)
-            )
-        else:
-            bored = np.zeros(self.num_envs, dtype=np.bool_)
+            tiresome = self._tiresome(self.exit_rule)
+            bored |= tiresome[rows[:, None], self._codes[actions]].any(axis=1)
         self._shown[rows, self.turns] = actions
         self.turns += 1
         return rewards, bored, np.asarray((self.turns >= self._shown.shape[1]) & ~bored)

@@ -11,12 +11,7 @@ from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.session_env import data_folder
 from ucfrec_simulators.taobao import ddpg
-from ucfrec_simulators.taobao.environment import (
-    ACTION_DIM,
-    MAX_CLICKS,
-    PAGE_INDICES,
-    USER_BITS,
-)
+from ucfrec_simulators.taobao.environment import ACTION_DIM, MAX_CLICKS, PAGE_INDICES, USER_BITS
 from ucfrec_simulators.taobao.virtual import VirtualTaobao, mixture
 
 WINDOW: Final = 5

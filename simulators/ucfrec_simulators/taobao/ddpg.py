@@ -85,11 +85,6 @@ class Training:
     the live rows only, which are those that are logged. The value after the end of a session is 0,
     whether it terminated or was truncated.
 
-    Args:
-        env: the Taobao environment.
-        seed: seed of the networks, the noise and the batches.
-        config: settings of the training.
-
     Raises:
         InputError: `env` is not a Taobao environment, or Stable-Baselines3 is not installed.
     """

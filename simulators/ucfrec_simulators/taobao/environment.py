@@ -163,9 +163,5 @@ def zero_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
 
 
 def best_constant_actor(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
-    """A non-personalised baseline: always the action of `best_constant`.
-
-    Raises:
-        InputError: `env` is not a Taobao environment.
-    """
+    """A non-personalised baseline: always the action of `best_constant`."""
     return repeat_action(best_constant(taobao(env), seed))

@@ -103,15 +103,13 @@ class VirtualTaobao(TaobaoEnv):
         """Logits (M, 21) of clicks and page indices."""
         page = np.asarray(pages, dtype=np.float32)[:, None]
         inputs = np.concatenate([users, page, actions], axis=1, dtype=np.float32)
-        logits: torch.Tensor = self._action_model(torch.from_numpy(inputs))
-        return logits
+        return self._action_model(torch.from_numpy(inputs))  # type: ignore[no-any-return]
 
 
 def _weights(logits: torch.Tensor) -> Float32Array:
     """Numbers (M, K) proportional to the probabilities; a softmax of few columns takes six times
     as long, and drawing needs no normalisation."""
-    weights: Float32Array = (logits - logits.amax(1, keepdim=True)).exp().numpy()
-    return weights
+    return np.asarray((logits - logits.amax(1, keepdim=True)).exp().numpy())
 
 
 def _load(path: Path, *sizes: int) -> nn.Sequential:

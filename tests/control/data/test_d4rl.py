@@ -361,26 +361,19 @@ def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder
     sizes = {"observation": 27, "achieved_goal": 2, "desired_goal": 2}
     rng = np.random.default_rng(0)
     seen = [{k: rng.uniform(size=(5, n)) for k, n in sizes.items()} for _ in range(2)]
+    no = [False] * 4
+    steps = {"rewards": [0.0, 0.0, 0.0, 1.0], "terminations": no, "infos": {}}
     buffers = [
         EpisodeBuffer(
-            observations=observations,
-            actions=rng.uniform(size=(4, 8)),
-            rewards=[0.0, 0.0, 0.0, 1.0],
-            terminations=[False] * 4,
-            truncations=[False, False, False, ends],
-            infos={},
+            observations=states, actions=rng.uniform(size=(4, 8)), truncations=ends, **steps
         )
-        for observations, ends in zip(seen, (True, False), strict=True)
+        for states, ends in zip(seen, ([*no[1:], True], no), strict=True)
     ]
     boxes = {name: spaces.Box(shape=(n,), **box) for name, n in sizes.items()}
+    of = {"observation_space": spaces.Dict(boxes), "action_space": spaces.Box(shape=(8,), **box)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        minari.create_dataset_from_buffers(
-            "antmaze/made-v0",
-            buffers,
-            observation_space=spaces.Dict(boxes),
-            action_space=spaces.Box(shape=(8,), **box),
-        )
+        minari.create_dataset_from_buffers("antmaze/made-v0", buffers, **of)
     read = read_minari("antmaze/made-v0", env_id="AntMaze_UMaze-v4")
     wanted = np.hstack([seen[0]["achieved_goal"], seen[0]["observation"]]).astype(np.float32)
     np.testing.assert_array_equal(read.observations, wanted[:4])

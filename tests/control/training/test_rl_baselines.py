@@ -2,6 +2,7 @@
 
 import re
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.processes import random_state_kept
-from ucfrec.results.rows import ResultRow, read_rows
+from ucfrec.results.rows import read_rows
 from ucfrec_control.benchmark.measure import SCORE_MEASUREMENT
 from ucfrec_control.benchmark.methods import TABLES
 from ucfrec_control.benchmark.plan import score_cells
@@ -99,11 +100,10 @@ def agent_of(task: str, kind: str, algorithm: str = "cql", **settings: float) ->
 def test_cql_has_the_settings_of_corl() -> None:
     scalers = {
         (task, kind): type(agent_of(task, kind).config.reward_scaler).__name__
-        for task in ("hopper", "walker2d")
-        for kind in ("medium", "mixed", "medium-expert")
+        for task, kind in product(("hopper", "walker2d"), ("medium", "mixed", "medium-expert"))
     }
-    assert {key for key, name in scalers.items() if name != "NoneType"} == {("hopper", "medium")}
-    assert scalers["hopper", "medium"] == "ReturnBasedRewardScaler"
+    assert scalers.pop(("hopper", "medium")) == "ReturnBasedRewardScaler"
+    assert set(scalers.values()) == {"NoneType"}
     for task, hidden in (("walker2d", 3), ("antmaze", 5)):
         modules = agent_of(task, "medium").impl.modules
         for critic in modules.q_funcs:
@@ -120,13 +120,13 @@ def test_cql_has_the_settings_of_corl() -> None:
 @pytest.mark.parametrize("algorithm", ["iql", "cql"])
 @pytest.mark.parametrize("task", ["hopper", "antmaze"])
 def test_all_rates_keep_their_proportion(algorithm: str, task: str) -> None:
-    usual, ten = (
-        {
-            name: rate
-            for name, rate in vars(agent_of(task, "medium", algorithm, **settings).config).items()
-            if name.endswith("learning_rate")
-        }
+    agents = [
+        agent_of(task, "medium", algorithm, **settings)
         for settings in ({}, {"learning_rate": 3e-3})
+    ]
+    usual, ten = (
+        {name: rate for name, rate in vars(agent.config).items() if name.endswith("learning_rate")}
+        for agent in agents
     )
     assert usual["critic_learning_rate"] == 3e-4
     assert ten == pytest.approx({name: 10 * rate for name, rate in usual.items()})
@@ -171,17 +171,11 @@ def test_the_benchmark_finds_its_rl_rows_again(
     monkeypatch.setitem(TABLES, "main", {"iql": Method("iql")})
     settings = {"iql": ("steps=2",)}
     budget = Budget("full", (MADE,), 1, Evaluation(2, 1000), of_policies=settings)
-    results = tmp_path / "rows.jsonl"
-
-    def measured() -> list[ResultRow]:
-        cells = list(score_cells(tmp_path, tmp_path / "runs", budget, "main"))
-        return run_grid(cells, SCORE_MEASUREMENT, results, 1)
-
-    (row,) = measured()
+    cells, results = score_cells(tmp_path, tmp_path / "runs", budget, "main"), tmp_path / "rows"
+    (cell,) = cells
+    (row,) = run_grid([cell], SCORE_MEASUREMENT, results, 1)
     assert (row.table, row.method, row.checkpoint) == ("main", "iql", "last")
-    assert measured() == [row]
-    assert len(results.read_text().splitlines()) == 1
-    assert read_rows(results) == [row]
+    assert run_grid([cell], SCORE_MEASUREMENT, results, 1) == read_rows(results) == [row]
     printed = capfd.readouterr()
     assert "1 cells, 1 of them left" in printed.err
     assert "1 cells, 0 of them left" in printed.err

@@ -1,15 +1,22 @@
 """Control runs end to end: presets, training, normalised scores, distractors."""
 
-import json
-import shutil
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.support.control_files import MADE, TINY, control, refused, set_options, write_made
+from tests.support.control_files import (
+    MADE,
+    TINY,
+    changed,
+    control,
+    refused,
+    set_options,
+    write_made,
+)
 from tests.support.real_data import data_folder
 from ucfrec import schema
 from ucfrec.acting.rollout import Memoryless, rollout
@@ -167,34 +174,25 @@ def test_policies_that_know_their_largest_return_are_asked_for_it(
 
 
 def test_presets_have_the_widths_of_the_paper() -> None:
-    widths = {
-        (task, kind): find_preset(task, kind, policy).tables["policy"].get("dim", 128)
-        for policy in ("ucf", "ucf-paper")
-        for task in ("halfcheetah", "hopper", "walker2d")
-        for kind in ("medium", "medium-replay", "mixed", "medium-expert")
-    }
-    wide = {("hopper", kind) for kind in ("medium", "medium-replay", "mixed")}
-    assert widths == {key: 256 if key in wide else 128 for key in widths}
+    tasks, kinds = ("halfcheetah", "hopper", "walker2d"), ("medium", "medium-replay", "mixed")
+    for policy, task, kind in product(("ucf", "ucf-paper"), tasks, (*kinds, "medium-expert")):
+        width = find_preset(task, kind, policy).tables["policy"].get("dim", 128)
+        assert width == (256 if task == "hopper" and kind in kinds else 128)
     paper = find_preset("antmaze", "diverse", "ucf-paper").tables
     assert (paper["policy"]["context"], paper["crm"]["latent_dim"]) == (50, 32)
     # Copies are the same whichever policy learns from them.
     assert find_preset("antmaze", "diverse", "dt").tables["crm"] == paper["crm"]
-    scales = {
-        name: find_preset("antmaze", "", name).tables["policy"]["return_scale"]
-        for name in ("ucf", "dt", "dc", "lsdt")
-    }
-    assert scales == {"ucf": 1.0, "dt": 1.0, "dc": 1.0, "lsdt": 1000.0}
+    for name, scale in {"ucf": 1.0, "dt": 1.0, "dc": 1.0, "lsdt": 1000.0}.items():
+        assert find_preset("antmaze", "", name).tables["policy"]["return_scale"] == scale
     assert "max_timestep" not in paper["policy"]
 
 
 def test_presets_are_configurations_with_targets() -> None:
     kinds = ("medium", "medium-replay", "medium-expert", "mixed", "diverse", "")
-    for policy in BUILT_IN:
-        for task in TASKS:
-            for kind in kinds:
-                preset = find_preset(task.name, kind, policy)
-                resolve_config(policy, presets=preset.tables)
-                assert preset.targets
+    for policy, task, kind in product(BUILT_IN, TASKS, kinds):
+        preset = find_preset(task.name, kind, policy)
+        resolve_config(policy, presets=preset.tables)
+        assert preset.targets
     for task_name, expected in (("hopper", (8, 256, 1e-4)), ("walker2d", (20, 128, 1e-3))):
         dc = resolve_config("dc", presets=find_preset(task_name, "medium", "dc").tables)
         assert (dc.policy.context, dc.policy.dim, dc.train.learning_rate) == expected
@@ -283,20 +281,6 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
         ("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)
     ]
     assert {r.evaluation_seed for r in more} == {1000}
-
-
-def changed(run: Path, to: Path, entry: tuple[str, ...], value: object) -> Path:
-    """A copy of a run with another value of an entry of its record; None takes it out."""
-    shutil.copytree(run, to)
-    record = read_json(run / "run.json")
-    inner = record
-    for name in entry[:-1]:
-        inner = inner[name]
-    inner[entry[-1]] = value
-    if value is None:
-        del inner[entry[-1]]
-    (to / "run.json").write_text(json.dumps(record))
-    return to
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Frames and videos of an episode: what they show, and that nothing is half-written."""
 
-import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -9,9 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from tests.support.control_files import control, refused
+from tests.support.control_files import changed, control, refused
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import read_json
 from ucfrec_control.environments.environments import make_env
 from ucfrec_control.training.evaluate import evaluate_run
 from ucfrec_control.training.video import record_episode
@@ -22,11 +19,8 @@ SMALL = {"width": 64, "height": 48, "max_episode_steps": 4}
 @pytest.fixture(scope="module")
 def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose data is of a Hopper of four steps, drawn small."""
-    run = shutil.copytree(folder / "store-run", tmp_path_factory.mktemp("video") / "run")
-    record = read_json(run / "run.json")
-    record["data"]["env_settings"] = SMALL
-    (run / "run.json").write_text(json.dumps(record))
-    return run
+    to = tmp_path_factory.mktemp("video") / "run"
+    return changed(folder / "store-run", to, ("data", "env_settings"), SMALL)
 
 
 def record(run: Path, out: Path) -> float:

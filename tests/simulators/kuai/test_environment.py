@@ -9,13 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.kuai_reference import Plain
 from tests.support.played import play
-from tests.support.single_session import SingleSession
+from tests.support.single_session import check_environment
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.rollout import Uniform, rollout
@@ -88,8 +87,8 @@ def small(num_envs: int = 6, items: int = 40, rule: str = "dorl", regime: str = 
 
 
 def test_gymnasium_accepts_it() -> None:
-    check_env(SingleSession(small(1)), skip_render_check=True)
-    check_env(SingleSession(small(1, 5000, regime="NX_0")), skip_render_check=True)
+    check_environment(small(1))
+    check_environment(small(1, 5000, regime="NX_0"))
 
 
 @pytest.mark.parametrize("regime", REGIMES)

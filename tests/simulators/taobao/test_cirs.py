@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from tests.support.real_data import data_folder
-from tests.support.single_session import SingleSession
+from tests.support.single_session import check_environment
 from ucfrec.acting.rollout import rollout
 from ucfrec_simulators.taobao.cirs import SIMULATOR, CirsTaobao
 
@@ -13,7 +12,7 @@ pytestmark = pytest.mark.realdata
 
 
 def test_gymnasium_accepts_it() -> None:
-    check_env(SingleSession(CirsTaobao(data_folder("virtualtaobao"))), skip_render_check=True)
+    check_environment(CirsTaobao(data_folder("virtualtaobao")))
 
 
 def test_exits_and_observations_agree_with_a_plain_reading() -> None:

@@ -13,14 +13,7 @@ import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
 
-from tests.support.control_files import (
-    TINY,
-    control,
-    hopper_like,
-    refused,
-    set_options,
-    write_hdf5,
-)
+from tests.support.control_files import TINY, control, hopper_like, refused, set_options, write_hdf5
 from ucfrec.acting.rollout import Memoryless, rollout
 from ucfrec.arrays import Float32Array, Float64Array
 from ucfrec.episodes.record import Source
@@ -29,8 +22,7 @@ from ucfrec.results.rows import read_results
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.d4rl import read_d4rl
 from ucfrec_control.data.minari import read_minari
-from ucfrec_control.environments.antmaze import antmaze_settings
-from ucfrec_control.environments.environments import make_env, mismatches
+from ucfrec_control.environments.environments import antmaze_settings, make_env, mismatches
 from ucfrec_control.environments.scores import find_kind, require_task
 from ucfrec_control.training.evaluate import load_run, open_environment
 
@@ -198,14 +190,10 @@ def test_minari_mazes_are_those_of_the_data(
         env = gymnasium.make("AntMaze_UMaze-v4", maze_map=maze, continuing_task=True)
         seen = [env.reset(seed=0)[0]]
         seen += [env.step(np.zeros(8))[0] for _ in range(3)]
-        buffer = EpisodeBuffer(
-            observations={name: np.array([s[name] for s in seen]) for name in seen[0]},
-            actions=np.zeros((3, 8)),
-            rewards=[0.0] * 3,
-            terminations=[False] * 3,
-            truncations=[False, False, True],
-            infos={},
-        )
+        columns = {name: np.array([s[name] for s in seen]) for name in seen[0]}
+        ends = {"terminations": [False] * 3, "truncations": [False, False, True], "infos": {}}
+        steps = {"actions": np.zeros((3, 8)), "rewards": [0.0] * 3, **ends}
+        buffer = EpisodeBuffer(observations=columns, **steps)
         minari.create_dataset_from_buffers(
             "D4RL/antmaze/umaze-v1", [buffer], env=env, requirements=["gymnasium-robotics==1.2.0"]
         )

@@ -34,7 +34,7 @@ from ucfrec.evaluation.ranking import (
     measure,
     rank_steps,
 )
-from ucfrec.evaluation.ranking_table import ItemNeighbours, PolicyRanker, baselines
+from ucfrec.evaluation.ranking_table import PolicyRanker, baselines, neighbour_ranker
 from ucfrec.files.atomic import write_json
 from ucfrec.logs.expressions import Expression
 from ucfrec.logs.mapping import LogMapping
@@ -290,7 +290,7 @@ def test_a_later_log_is_ranked_as_recommend_would_for_the_whole_history(
         later = Later(logged.store, logged.rows, filter_seen=True)
         found = rank_steps(ranker, later, 10)
         assert (logged.store.lengths.sum() > logged.store.n_steps) is np.True_
-        knn = ItemNeighbours(EpisodeStore.open(tmp_path / "store"), torch.ones(30))
+        knn = neighbour_ranker(EpisodeStore.open(tmp_path / "store"), torch.ones(30))
         assert len(np.unique(rank_steps(knn, later, 3).top, axis=0)) > 10
         times = logged.store.column(schema.TIMESTAMP)
         _, places = logged.store.all_steps()

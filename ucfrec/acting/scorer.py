@@ -591,7 +591,7 @@ class _ItemProduct:
 
 def _are_equal(first: Likeness, second: Likeness) -> bool:
     pairs = (first.tags, second.tags), (first.directions, second.directions)
-    return all(torch.equal(one.cpu(), another.cpu()) for one, another in pairs)
+    return all(torch.equal(left.cpu(), right.cpu()) for left, right in pairs)
 
 
 def _pad(values: Tensor, length: int, padding: int) -> Tensor:

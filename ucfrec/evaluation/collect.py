@@ -138,9 +138,9 @@ class _SessionLog:
         observations = np.concatenate([step.observations for step in steps])
         if observations.shape[1]:
             columns[OBSERVATION] = _lists(observations)
-        known = [step.propensities for step in steps if step.propensities is not None]
-        if len(known) == len(steps):
-            columns[PROPENSITY] = pa.array(np.concatenate(known))
+        propensities = [step.propensities for step in steps if step.propensities is not None]
+        if len(propensities) == len(steps):
+            columns[PROPENSITY] = pa.array(np.concatenate(propensities))
         return columns
 
 

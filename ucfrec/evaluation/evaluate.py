@@ -76,7 +76,7 @@ def evaluate_policy(
     numbers, rule = _item_numbers(environment, env, trained), rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
     record = trained.record
-    about = {
+    columns = {
         "method": name,
         "policy": record.config.policy_name,
         "training_seed": record.seed,
@@ -86,12 +86,12 @@ def evaluate_policy(
         "rule": rule.hash,
         "details": {"decision_rule": rule.as_dict()},
     }
-    return _row(environment, about, env, actor, episodes, seed, trained.counts, numbers)
+    return _row(environment, columns, env, actor, episodes, seed, trained.counts, numbers)
 
 
 def _row(
     environment: Environment,
-    about: dict[str, Any],
+    columns: dict[str, Any],
     env: Any,
     actor: Actor,
     episodes: int,
@@ -100,7 +100,7 @@ def _row(
     numbers: IntArray | None = None,
 ) -> ResultRow:
     start = time.perf_counter()
-    recommended, describe = Recommended(), f"{about['method']} in {environment.name}"
+    recommended, describe = Recommended(), f"{columns['method']} in {environment.name}"
     played = rollout(env, actor, episodes, seed, recommended.record, describe)
     seconds = time.perf_counter() - start
     variety: Mapping[str, float | None] = {}
@@ -118,7 +118,7 @@ def _row(
         metrics={},
         interval=bootstrap_interval(played.returns, seed),
         wall_time_s=seconds,
-        **about,
+        **columns,
         **provenance(),
     )
     return row.extended({**session_metrics(played), **variety})
@@ -311,7 +311,7 @@ def _read_incidence(env: VectorEnv[Any, Any, Any]) -> BoolArray | None:
     if TAGS not in table.column_names:
         return None
     column = table[TAGS].combine_chunks()
-    known, places = np.unique(np.asarray(column.flatten()), return_inverse=True)
-    incidence = np.zeros((len(column), len(known)), dtype=np.bool_)
+    tag_ids, places = np.unique(np.asarray(column.flatten()), return_inverse=True)
+    incidence = np.zeros((len(column), len(tag_ids)), dtype=np.bool_)
     incidence[np.repeat(np.arange(len(column)), np.diff(np.asarray(column.offsets))), places] = True
     return incidence

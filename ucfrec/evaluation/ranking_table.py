@@ -2,7 +2,7 @@
 training rows, on the same later steps."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -75,77 +75,56 @@ class PolicyRanker:
 
 
 @dataclass(frozen=True)
-class RewardRanker:
-    """Ranks items by the run's reward model alone."""
-
-    scorer: Scorer
-    name: str = "reward model"
-
-    def scores(self, steps: Steps) -> Tensor:
-        """Predicted rewards (B, n_items), in the model's units, up to a constant per step."""
-        sessions = sessions_before(self.scorer, steps.store, steps.episodes, steps.steps)
-        return self.scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
-
-
-@dataclass(frozen=True)
-class SameForAll:
-    """Ranks items by fixed scores, the same for all users."""
+class NamedRanker:
+    """Ranks items by a function of the steps; see `Ranker`."""
 
     name: str
-    items: Tensor
-    """(n_items,) score of each item."""
-
-    def scores(self, steps: Steps) -> Tensor:
-        """The fixed scores (1, n_items)."""
-        return self.items.unsqueeze(0)
+    scores: Callable[[Steps], Tensor]
 
 
-class Random:
-    """Ranks items by uniform random scores."""
+def reward_ranker(scorer: Scorer) -> NamedRanker:
+    """Ranks items by the run's reward model alone."""
 
-    name = "random"
+    def scores(steps: Steps) -> Tensor:
+        sessions = sessions_before(scorer, steps.store, steps.episodes, steps.steps)
+        return scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
 
-    def __init__(self, n_items: int, seed: int) -> None:
-        self._n_items, self._generator = n_items, torch.Generator().manual_seed(seed)
-
-    def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items), uniform in [0, 1)."""
-        return torch.rand(len(steps.steps), self._n_items, generator=self._generator)
+    return NamedRanker("reward model", scores)
 
 
-class ItemNeighbours:
-    """Ranks items by their cosine to the user's latest rewarded items; ties go to the popular ones.
+def same_for_all(name: str, items: Tensor) -> NamedRanker:
+    """Ranks items by fixed scores (n_items,), the same for all users."""
+    return NamedRanker(name, lambda _: items.unsqueeze(0))
 
-    See `ItemKNNPolicy`; the items are those of all the user's sessions, also before the log.
-    """
 
-    name = "item-knn"
+def random_ranker(n_items: int, seed: int) -> NamedRanker:
+    """Ranks items by scores that are uniform in [0, 1)."""
+    drawn = torch.Generator().manual_seed(seed)
+    return NamedRanker(
+        "random", lambda steps: torch.rand(len(steps.steps), n_items, generator=drawn)
+    )
 
-    def __init__(self, train: EpisodeStore, popularity: Tensor) -> None:
-        self._knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
-        self._knn.start_from(train)
-        self._tie_break = 1e-6 * popularity / popularity.max()
 
-    def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items)."""
+def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> NamedRanker:
+    """Ranks items by their cosine to the user's latest rewarded items, of all sessions, also before
+    the log; ties go to the popular ones. See `ItemKNNPolicy`."""
+    knn = ItemKNNPolicy(ItemKNNConfig(context=_KNN_HISTORY, dim=1), policy_sizes(train))
+    knn.start_from(train)
+    tie_break = 1e-6 * popularity / popularity.max()
+
+    def scores(steps: Steps) -> Tensor:
         items, rewards = map(torch.from_numpy, steps.rows.recent(steps.numbers, _KNN_HISTORY))
-        return self._knn.similarity(items, rewards) + self._tie_break
+        return knn.similarity(items, rewards) + tie_break
+
+    return NamedRanker("item-knn", scores)
 
 
-class BoostedClicks:
+def boosted_ranker(train: EpisodeStore, seed: int) -> NamedRanker:
     """Ranks items by gradient-boosted clicks; see `BoostedPolicy`."""
-
-    name = "boosted clicks"
-
-    def __init__(self, train: EpisodeStore, seed: int) -> None:
-        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
-        self._policy = BoostedPolicy(config, policy_sizes(train))
-        self._policy.start_from(train)
-        self._policy.make_solver(train, None, Path(), seed)()
-
-    def scores(self, steps: Steps) -> Tensor:
-        """Log-odds of a like (B, n_items)."""
-        return self._policy.act(steps.windows(_KNN_HISTORY + 1))
+    policy = BoostedPolicy(BoostedConfig(context=_KNN_HISTORY + 1, dim=1), policy_sizes(train))
+    policy.start_from(train)
+    policy.make_solver(train, None, Path(), seed)()
+    return NamedRanker("boosted clicks", lambda steps: policy.act(steps.windows(_KNN_HISTORY + 1)))
 
 
 class MatrixFactorisation:
@@ -186,8 +165,8 @@ class MatrixFactorisation:
 
     def scores(self, steps: Steps) -> Tensor:
         """Scores (B, n_items)."""
-        known = np.where(steps.users < len(self._users) - 1, steps.users, -1)
-        return self._users[torch.from_numpy(known)] @ self._items.T + self._tie_break
+        rows = np.where(steps.users < len(self._users) - 1, steps.users, -1)
+        return self._users[torch.from_numpy(rows)] @ self._items.T + self._tie_break
 
 
 def recent_rankers(
@@ -201,7 +180,7 @@ def recent_rankers(
     for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
         hours = kind.best_half_life(first, validation, liked_of)
         scores = kind.scores_of(count_decayed(train, hours, liked_of))
-        rankers.append(SameForAll(f"recent {name}", scores.double()))
+        rankers.append(same_for_all(f"recent {name}", scores.double()))
     return rankers
 
 
@@ -222,14 +201,14 @@ def baselines(
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     rankers: list[Ranker] = [
-        Random(len(shown), seed),
-        SameForAll("most shown", shown),
-        SameForAll("most clicked", liked),
-        SameForAll("item click rate", shrink_rates(counts)),
+        random_ranker(len(shown), seed),
+        same_for_all("most shown", shown),
+        same_for_all("most clicked", liked),
+        same_for_all("item click rate", shrink_rates(counts)),
     ]
     if train is not None:
-        rankers.append(ItemNeighbours(train, shown.float()))
-        rankers.append(BoostedClicks(train, seed))
+        rankers.append(neighbour_ranker(train, shown.float()))
+        rankers.append(boosted_ranker(train, seed))
         if find_spec("implicit") is not None:
             rankers += [
                 MatrixFactorisation(name, train, shown.float(), seed, liked_of)
@@ -326,11 +305,11 @@ def _rankers(
     if liked is not None and fitted_on is not None:
         counts = TrainingCounts.of(fitted_on, liked)
     liked = liked or LikedByRange(trained.item_states)
-    model = [] if trained.reward_model is None else [RewardRanker(trained.scorer())]
-    others = baselines(counts, fitted_on, seed, liked)
+    model = [] if trained.reward_model is None else [reward_ranker(trained.scorer())]
+    rankers = baselines(counts, fitted_on, seed, liked)
     if train is not None and fitted_on is not None:
-        others += recent_rankers(fitted_on, train, liked)
-    return name_rankers([*policies, *model, *others]), liked
+        rankers += recent_rankers(fitted_on, train, liked)
+    return name_rankers([*policies, *model, *rankers]), liked
 
 
 def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:

@@ -186,8 +186,8 @@ class Chooser:
         rule = self.scorer.rule
         sessions = sessions_of(self.trained, latest, self.scorer.length)
         # What was seen, and what the latest sessions have shown, if the rule excludes it.
-        known = latest.seen_ids >= 0
-        rows, seen = latest.seen_owner[known], latest.seen_ids[known]
+        in_catalogue = latest.seen_ids >= 0
+        rows, seen = latest.seen_owner[in_catalogue], latest.seen_ids[in_catalogue]
         if rule.exclude_seen:
             rows = np.concatenate([rows, latest.owner])
             seen = np.concatenate([seen, latest.item_ids])

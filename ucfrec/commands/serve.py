@@ -91,7 +91,7 @@ class Serve(AnswerOptions):
         from ucfrec.recommending.responder import Served, parse_split
         from ucfrec.recommending.server import server_config
         from ucfrec.recommending.web import ServerLimits, application
-        from ucfrec.runs.record import RUN, verified
+        from ucfrec.runs.record import RUN, verify_run
         from ucfrec.runs.trained_policy import TrainedPolicy
 
         several, threads = self.workers > 1, self.threads
@@ -103,7 +103,7 @@ class Serve(AnswerOptions):
         limits = ServerLimits(**settings, **settings_given(self, ServerLimits))
 
         def make(run: Path) -> "Responder":
-            verified(run)
+            verify_run(run)
             return self.make_responder(TrainedPolicy.load(run, self.checkpoint))
 
         shares = None if self.split is None else parse_split(self.split)

@@ -269,7 +269,7 @@ class _Training:
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
         with nullcontext() if self._average is None else self._average.applied():
-            about: dict[str, float] = {"step": step}
+            metadata: dict[str, float] = {"step": step}
             if validate is not None:
                 self._module.eval()
                 with torch.no_grad():
@@ -279,10 +279,10 @@ class _Training:
                     self.counters["stale"] += 1
                     return {"validation_loss": loss}
                 self.counters |= {"best_validation": loss, "stale": 0}
-                about["validation_loss"] = loss
+                metadata["validation_loss"] = loss
             self.counters["best_step"] = step
             if distributed.leads():
-                save_tensors(self._best, self._module.state_dict(), about)
+                save_tensors(self._best, self._module.state_dict(), metadata)
         return {} if validate is None else {"validation_loss": loss}
 
     def _require_finite(self, quantity: str, value: float, step: int) -> None:
@@ -394,7 +394,7 @@ class WeightAverage:
         self._log = 0.0  # Σ log d of the steps so far
         # A checkpoint has shared weights once for each name, so their averages are, too.
         self._gradients = dict(module.named_parameters(remove_duplicate=False))
-        self._weights = {name: each.detach() for name, each in self._gradients.items()}
+        self._weights = {name: weights.detach() for name, weights in self._gradients.items()}
         self._means = {name: weights.clone() for name, weights in self._weights.items()}
         self._when: dict[str, Tensor] = {}  # `_log` at the last average of each row of a table
 
@@ -440,13 +440,13 @@ class WeightAverage:
     @contextmanager
     def applied(self) -> Iterator[None]:
         """Inside, the module's weights are the averages."""
-        kept = {name: weights.clone() for name, weights in self._weights.items()}
+        own_weights = {name: weights.clone() for name, weights in self._weights.items()}
         tensors, counters = self.state()
-        self._put(_averages(tensors, kept, counters))
+        self._put(_averages(tensors, own_weights, counters))
         try:
             yield
         finally:
-            self._put(kept)
+            self._put(own_weights)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Named tensors and counters, for `restore`."""
@@ -484,8 +484,8 @@ def _averages(
     for name, table in weights.items():
         if (mean := tensors.get(f"{_AVERAGE}{name}")) is not None:
             when = tensors.get(f"{_AVERAGE}{name}{_WHEN}")
-            rest = None if when is None else counters["average_log"] - when
-            means[name] = mean if rest is None else _rested(mean, table, rest)
+            log_shares = None if when is None else counters["average_log"] - when
+            means[name] = mean if log_shares is None else _rested(mean, table, log_shares)
     return means
 
 

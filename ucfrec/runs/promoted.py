@@ -11,7 +11,7 @@ from pydantic import Field
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
 from ucfrec.files.record import Record, Text
-from ucfrec.runs.record import RunRecord, verified
+from ucfrec.runs.record import RunRecord, verify_run
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 POINTER: Final = "promoted.json"
@@ -69,17 +69,17 @@ def promote(run: Path, force: bool = False) -> Promoted:
             f"name the run itself, {run.resolve()}"
         )
     run = run.resolve()
-    verified(run)
+    verify_run(run)
     folder = run.parent
     with claim(folder / POINTER, wait=True):
-        before = promoted(folder)
-        if before is None:
+        pointer = promoted(folder)
+        if pointer is None:
             return _current(run, ()).write(folder)
         fingerprint = TrainedPolicy.load(run).fingerprint
-        again = before.current == run.name
-        if not force and not (again and before.fingerprint in ("", fingerprint)):
-            _require_verdict(run, before.run(folder))
-        previous = before.previous if again else (*before.previous, before.current)[-_MOST:]
+        again = pointer.current == run.name
+        if not force and not (again and pointer.fingerprint in ("", fingerprint)):
+            _require_verdict(run, pointer.run(folder))
+        previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
         return _current(run, previous).write(folder)
 
@@ -91,12 +91,12 @@ def promote_back(folder: Path) -> Promoted:
         InputError: there is none, or it is gone or damaged.
     """
     with claim(folder / POINTER, wait=True):
-        before = promoted(folder)
-        if before is None or not before.previous:
+        pointer = promoted(folder)
+        if pointer is None or not pointer.previous:
             raise InputError(f"{folder}: no run was current before; promote one")
-        back = Promoted(files={}, current=before.previous[-1]).run(folder)
-        verified(back)
-        return _current(back, before.previous[:-1]).write(folder)
+        back = Promoted(files={}, current=pointer.previous[-1]).run(folder)
+        verify_run(back)
+        return _current(back, pointer.previous[:-1]).write(folder)
 
 
 def _current(run: Path, previous: tuple[str, ...]) -> Promoted:

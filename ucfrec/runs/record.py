@@ -435,7 +435,7 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
     return None
 
 
-def verified(run: Path) -> None:
+def verify_run(run: Path) -> None:
     """Read every file of a run and compare it with its checksum.
 
     Raises:
@@ -447,7 +447,7 @@ def verified(run: Path) -> None:
     for name, fault in record.checksums(run).faults():
         raise InputError(f"{run / name} {fault}; restore the file, or train again")
     if (run / REFIT / RUN).is_file():
-        verified(run / REFIT)
+        verify_run(run / REFIT)
 
 
 def _describe_augmentation(report: AugmentationReport) -> list[str]:

@@ -44,20 +44,20 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         )
     if trained.record.policy is None:
         raise InputError(f"{first} is not finished; train it to its end first")
-    about: dict[str, Any] = {
+    entries: dict[str, Any] = {
         "refit_of": _identity(trained),
         "dropped_observations": trained.dropped,
         "augmentation": trained.record.augmentation,
     }
     if out == first / REFIT:
-        about |= place_of(store.path, first)
+        entries |= place_of(store.path, first)
     store = drop_columns(store, trained.dropped)
     config = trained.record.config
     steps = max(1, round(SHARE * trained.record.finished.best_step))
     warmup = min(config.train.warmup_steps, steps // 10)
     train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
     config = replace(config, train=train, rule=replace(config.rule, choose=False))
-    record = train_run(store, out, config, about, refit_of=first)
+    record = train_run(store, out, config, entries, refit_of=first)
     if not distributed.leads():
         return record
     record = record.reopen(out, INPUTS)

@@ -148,7 +148,7 @@ def train_run(
     store: EpisodeStore,
     out: Path,
     config: Config,
-    about: Mapping[str, Any] | None = None,
+    additions: Mapping[str, Any] | None = None,
     more_augmentation: AugmentedEpisodes | None = None,
     refit_of: Path | None = None,
     shared: SharedStages = OWN,
@@ -166,7 +166,7 @@ def train_run(
 
     Args:
         out: run folder, new or interrupted.
-        about: entries of `RunRecord` that the caller adds.
+        additions: entries of `RunRecord` that the caller adds.
         more_augmentation: augmented training episodes that are used in addition to the
             counterfactual ones.
         refit_of: a finished run whose weights go on learning, from the validation and test
@@ -188,7 +188,7 @@ def train_run(
             remove_leftovers(out.parent)
             remove_leftovers(out, within=True)
         start = time.perf_counter()
-        run = _prepare_inputs(store, out, config, about or {}, refit_of, shared)
+        run = _prepare_inputs(store, out, config, additions or {}, refit_of, shared)
         if initial is not None:
             start_warm(run.policy, out, initial)
         with phase("Counterfactual augmentation", 1, PHASES):
@@ -235,7 +235,7 @@ def _prepare_inputs(
     store: EpisodeStore,
     out: Path,
     config: Config,
-    about: Mapping[str, Any],
+    additions: Mapping[str, Any],
     refit_of: Path | None,
     shared: SharedStages,
 ) -> _Inputs:
@@ -249,13 +249,13 @@ def _prepare_inputs(
     policy = new_policy(train, config)
     if distributed.leads():
         if not (out / RUN).exists():
-            begin(store, train, validation, out, config, about)
+            begin(store, train, validation, out, config, additions)
         record = RunRecord.read(out).reopen(out, INPUTS)
         distributed.wait()  # the others wait at the beginning of the command
     else:
         record = RunRecord.read(out)
     # The store may have been moved, or prepared again.
-    place = {name: about.get(name, at) for name, at in place_of(store.path, out).items()}
+    place = {name: additions.get(name, at) for name, at in place_of(store.path, out).items()}
     record = record.copy_with(config=config, **place)
     with distributed.leader_first():
         view = policy.training_view(train, config.policy, out / "view", config.seed)

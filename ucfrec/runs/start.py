@@ -114,7 +114,7 @@ def begin(
     validation: EpisodeStore,
     out: Path,
     config: Config,
-    about: Mapping[str, Any],
+    additions: Mapping[str, Any],
 ) -> None:
     """Write the folder of a run with its record and all that training does not change.
 
@@ -149,7 +149,7 @@ def begin(
         "versions": versions([package] if package else []),
         "policy_package": package or None,
         "wall_time_s": 0.0,
-        **about,
+        **additions,
     }
     people = train.without_long_sessions() if train.has_items else train
     returns = people.returns
@@ -410,9 +410,9 @@ def _fit_once(
     log = MetricsLog(folder, 0)
     log.add(1, logged)
     log.close()
-    about = {"step": 1, "best_step": 1, "best_validation": loss, "seconds": seconds}
-    save_tensors(folder / "best.safetensors", module.state_dict(), about)
-    save_tensors(last, module.state_dict(), about)
+    metadata = {"step": 1, "best_step": 1, "best_validation": loss, "seconds": seconds}
+    save_tensors(folder / "best.safetensors", module.state_dict(), metadata)
+    save_tensors(last, module.state_dict(), metadata)
     if callbacks.on_validation is not None and distributed.leads():
         callbacks.on_validation(1, logged)
     return Fit(1, 1, loss, seconds)

@@ -148,21 +148,21 @@ class TrainedPolicy:
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
         state = self.record.observation_size + (0 if states is None else states.size)
-        found: dict[str, tuple[Any, Any]] = {}
+        sizes_found: dict[str, tuple[Any, Any]] = {}
         if states is None:
-            found[RUN] = (sizes["state"], state)
+            sizes_found[RUN] = (sizes["state"], state)
         else:
             table = sizes["items"], sizes["action"], sizes["state"]
-            found[ITEM_STATES] = (table, (*states.embeddings.shape, state))
+            sizes_found[ITEM_STATES] = (table, (*states.embeddings.shape, state))
         # A store that was not made from logs has no tables of items and users.
         if self.item_ids is not None and (self.folder / ITEMS).exists():
-            found[ITEMS] = (sizes["items"], len(self.item_ids))
+            sizes_found[ITEMS] = (sizes["items"], len(self.item_ids))
         if states is not None and len(states.user_features) and (self.folder / USERS).exists():
-            found[USERS] = (len(states.user_features), len(self.user_ids))
+            sizes_found[USERS] = (len(states.user_features), len(self.user_ids))
         if self.counts is not None:
             shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
-            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
-        for name, (stated, actual) in found.items():
+            sizes_found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in sizes_found.items():
             if stated != actual:
                 raise InputError(
                     f"{self.folder / name} does not fit the run: it has {actual}, the run "

@@ -73,7 +73,8 @@ def make_log(folder: Path, rows: int, seed: int) -> None:
 
 
 def run_prepare(log: Path, out: Path, memory_limit: str) -> None:
-    from ucfrec.logs import LogMapping, PrepareOptions, prepare
+    from ucfrec.logs.mapping import LogMapping
+    from ucfrec.logs.prepare import PrepareOptions, prepare
 
     options = PrepareOptions(memory_limit=memory_limit)
     prepare([log], LogMapping(reward="is_click"), out, options)

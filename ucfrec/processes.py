@@ -321,6 +321,8 @@ def progress(
     """
     from tqdm import tqdm
 
+    if not hasattr(tqdm, "_lock"):
+        tqdm.set_lock(threading.RLock())  # one between processes would import multiprocessing
     label = _LABEL.get()
     # Bars of several processes would overwrite each other.
     layout: dict[str, Any] = {}

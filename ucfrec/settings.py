@@ -222,7 +222,8 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     """A type and its range, in words."""
     if get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
-        return _allowed(annotation, [*_constraints(more), *metadata])
+        constraints = [c for m in more for c in getattr(m, "metadata", [m])]
+        return _allowed(annotation, [*constraints, *metadata])
     if get_origin(annotation) in (Union, UnionType):
         kinds = [_allowed(kind, metadata) for kind in get_args(annotation) if kind is not NoneType]
         return f"{' or '.join(kinds)}, or unset"
@@ -235,10 +236,6 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         return f"{count} values, each {_allowed(inner[0])}"
     kinds_by_type = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     return kinds_by_type.get(annotation, str(annotation)) + _range(metadata)
-
-
-def _constraints(metadata: Sequence[Any]) -> list[Any]:
-    return [c for m in metadata for c in (m.metadata if hasattr(m, "metadata") else [m])]
 
 
 def _range(metadata: Sequence[Any]) -> str:

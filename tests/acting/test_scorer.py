@@ -36,7 +36,7 @@ from ucfrec.episodes.windows import Windows, seen_before
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import Later
 from ucfrec.evaluation.ranking_table import PolicyRanker
-from ucfrec.logs import LogMapping
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.score import read_logged_sessions, score_steps
 from ucfrec.policies.baselines import ItemKNNPolicy
 from ucfrec.recommending.histories import histories_of_frame

@@ -22,7 +22,8 @@ from ucfrec.commands.settings import settings_text
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
 from ucfrec.processes import provenance
 from ucfrec.results.rows import ResultRow, ResultTable, read_results

@@ -22,20 +22,13 @@ from ucfrec.counterfactual.generators import (
     Generator,
     NoiseGenerator,
     StateClusters,
-    _products,
     make_generator,
 )
 from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm
 from ucfrec.episodes.windows import Transitions
-from ucfrec.errors import InputError
 
 TANGENT = CSGConfig()
 FAITHFUL = CSGConfig(kind="faithful", epochs=4)
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def made(config: CSGConfig, folder: Path) -> Generator:
@@ -110,11 +103,6 @@ def test_few_states_and_no_shape_at_all(tmp_path: Path) -> None:
     assert len(proposed(generator, crm, planted(0, 0).transitions)[0]) == 0
 
 
-def test_an_unknown_kind_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"csg\.kind is 'magic'"):
-        made(CSGConfig(kind="magic"), tmp_path)  # type: ignore[arg-type]
-
-
 @pytest.fixture(scope="module")
 def hopper(
     tmp_path_factory: pytest.TempPathFactory,
@@ -175,14 +163,6 @@ def test_noise_fills_the_band_in_every_direction_and_spares_what_never_varies(
     assert (moves[:, CONSTANT] == 0).all()
     varying = moves[:, crm.state_std > 0]
     assert varying.mean(0).abs().max() < 0.03
-
-
-def test_products_are_those_of_every_steps_own_matrix() -> None:
-    matrices, vectors = torch.randn(4, 3, 3), torch.randn(9, 3)
-    rows = [2, 0, 6, 1]
-    own = matrices[torch.tensor([0, 0, 2, 2, 2, 2, 2, 2, 3])]
-    expected = torch.einsum("mij,mj->mi", own, vectors)
-    torch.testing.assert_close(_products(matrices, vectors, rows), expected)
 
 
 @pytest.mark.parametrize("kind", ["noise", "faithful"])

@@ -21,11 +21,6 @@ from ucfrec.counterfactual.reward_model import (
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    torch.set_num_threads(1)
-
-
 def test_the_planted_disturbance_is_abduced() -> None:
     crm, report = fitted()
     unseen = planted(4_000, 2)

@@ -167,16 +167,6 @@ def test_gradients_are_those_of_differences(kind: str) -> None:
     assert torch.autograd.gradcheck(additions, leaves)
 
 
-@given(kinds, seeds)
-def test_without_anything_shown_nothing_is_added(kind: str, seed: int) -> None:
-    made = term(kind, seed)
-    rewards, returns = torch.full((3, LAGS), HIGH), torch.tensor([-9.0, 0.0, 9.0])
-    nothing = Exposed(torch.full((3, LAGS), -1), rewards, returns)
-    assert (to_all(made, nothing) == 0).all()
-    assert (to_some(made, nothing, torch.arange(ITEMS)) == 0).all()
-    assert (made.to_items(nothing, torch.zeros(3, 1, dtype=torch.int64)) == 0).all()
-
-
 def weights_at(made: ExposureTerm, returns: Tensor, reward: float) -> Tensor:
     """Weights (2, M, LAGS) at returns (M,) of items that all had the same reward."""
     shape = (len(returns), LAGS)
@@ -265,7 +255,8 @@ def test_padding_is_never_shown(seed: int, kind: str) -> None:
     assert torch.equal(to_all(made, shown), to_all(made, again))
     rows = before.mask.flatten()
     torch.testing.assert_close(
-        to_all(made, shown.select(rows)), to_all(made, shown).view(B * K, ITEMS)[rows]
+        to_all(made, Exposed.before(before, LAGS, before.mask)),
+        to_all(made, shown).view(B * K, ITEMS)[rows],
     )
     # The first step of a session has been shown nothing.
     firsts = torch.zeros_like(before.mask)

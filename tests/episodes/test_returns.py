@@ -21,25 +21,6 @@ def flat(episodes: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(episodes), np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
 
-def test_the_documented_example() -> None:
-    got = returns_to_go(np.array([1.0, 0.0, 2.0, 5.0]), np.array([0, 3, 4]))
-    assert got.tolist() == [3, 2, 2, 5]
-
-
-@given(episodes_of_eighths)
-def test_equals_brute_force(episodes: list[list[float]]) -> None:
-    got = returns_to_go(*flat(episodes))
-    assert got.dtype == np.float32
-    assert got.tolist() == [sum(e[t:]) for e in episodes for t in range(len(e))]
-
-
-@given(st.lists(st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=9), min_size=1))
-def test_other_rewards_within_rounding(episodes: list[list[float]]) -> None:
-    got = returns_to_go(*flat(episodes))
-    expected = [math.fsum(e[t:]) for e in episodes for t in range(len(e))]
-    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
-
-
 def test_a_long_store_keeps_its_digits() -> None:
     """Prefix sums are differenced: in float32 they would have lost the last episodes."""
     rng = np.random.default_rng(0)
@@ -78,22 +59,8 @@ def test_every_definition_equals_brute_force(
     got = definition.of_logs(*flat(episodes))
     assert got.dtype == np.float32
     expected = [slowly(definition, e, t) for e in episodes for t in range(len(e))]
-    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_what_the_definitions_have_in_common() -> None:
-    rewards, offsets = flat([[1.0, 0.5, -2.0, 4.0], [3.0]])
-    whole = returns_to_go(rewards, offsets)
-    for same in (ReturnToGo("discounted", discount=1.0), ReturnToGo("horizon", horizon=4)):
-        np.testing.assert_array_equal(same.of_logs(rewards, offsets), whole)
-    now = ReturnToGo("horizon", horizon=1).of_logs(rewards, offsets)
-    np.testing.assert_array_equal(now, rewards)
-    assert ReturnToGo("horizon", horizon=2).of_logs(rewards, offsets).tolist() == [
-        *(1.5, -1.5, 2.0, 4.0, 3.0)
-    ]
-    assert ReturnToGo("discounted", discount=0.5).of_logs(rewards, offsets).tolist() == [
-        *(1.25, 0.5, 0.0, 4.0, 3.0)
-    ]
+    exact = definition.definition != "discounted"
+    np.testing.assert_allclose(got, expected, *((0, 0) if exact else (1e-6, 1e-6)))
 
 
 def test_no_episodes_have_no_returns() -> None:

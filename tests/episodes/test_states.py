@@ -18,7 +18,6 @@ from tests.support.episodes import (
     Logged,
     random_episodes,
     some_states,
-    state_before,
     write_store,
 )
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
@@ -152,26 +151,6 @@ def after(states: ItemStates, items: Tensor, rewards: Tensor) -> Tensor:
     return sessions.latest_states(states, torch.zeros(len(items), 0))
 
 
-def test_what_was_just_shown_and_earned_does_enter() -> None:
-    states = some_states()
-    seen = after(states, torch.tensor([4, 4, 5]), torch.tensor([1.0, 2.0, 1.0]))
-    assert torch.equal(seen[:, :DIM], states.embeddings[[4, 4, 5]])
-    assert torch.equal(seen[:, 2 * DIM : 3 * DIM], states.embeddings[[4, 4, 5]])
-    assert seen[:, 3 * DIM].tolist() == [0.5, 0.75, 0.5]  # of rewards from −1 to 3
-    assert torch.equal(seen[:, 3 * DIM + 1], torch.full((3,), 2.0).log())
-
-
-@given(st.integers(1, 12), st.integers(1, 5), st.integers(0, 99))
-def test_acting_follows_the_documented_formula(length: int, window: int, seed: int) -> None:
-    states = some_states(2, window, seed)
-    episodes = random_episodes([length], seed)
-    played = acted(episodes, states, 1)[0]
-    expected = [state_before(episodes[0], step, states) for step in range(length)]
-    np.testing.assert_allclose(played, expected, rtol=1e-5, atol=1e-6)
-    assert played.shape == (length, states.size + 2)
-    assert played.dtype == torch.float32
-
-
 def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
     states = some_states(low=0.0, high=1.0)
     seen = after(states, torch.tensor([1, 1, 1, 1]), torch.tensor([-7.0, 0.0, 1.0, 99.0]))
@@ -179,16 +158,6 @@ def test_rewards_out_of_range_count_as_no_or_full_liking() -> None:
     assert torch.equal(seen[2], seen[3])
     assert not seen[0, DIM : 2 * DIM].any()
     assert torch.equal(seen[3, DIM : 2 * DIM], states.embeddings[1])
-
-
-def test_an_unknown_user_has_zero_features() -> None:
-    states, sessions = some_states(users=2), Sessions.begun(3, 10)
-    assert sessions.users.tolist() == [-1, -1, -1]
-    sessions.users[1] = 4
-    seen = sessions.latest_states(states, torch.zeros(3, 0))
-    features = slice(states.size - 2, states.size)
-    assert not seen[[0, 2], features].any()
-    assert torch.equal(seen[1, features], states.user_features[4])
 
 
 def test_a_session_that_begins_afresh_forgets() -> None:
@@ -201,13 +170,6 @@ def test_a_session_that_begins_afresh_forgets() -> None:
     assert torch.equal(seen[0], before[0])
     assert not seen[1].any()
     assert sessions.collected.tolist() == [3.0, 0.0]
-
-
-def test_rewards_of_another_type_give_the_same_states() -> None:
-    states, rewards = some_states(), torch.rand(4, dtype=torch.float64)
-    seen = [after(states, torch.arange(4), values) for values in (rewards, rewards.float())]
-    assert seen[0].dtype == torch.float32
-    assert torch.equal(seen[0], seen[1])
 
 
 @pytest.mark.parametrize("users", [0, 3])

@@ -38,8 +38,8 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.episodes.writer import StoreWriter
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import atomic_folder, read_json
-from ucfrec.logs import LogMapping
+from ucfrec.files.atomic import read_json
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
@@ -117,19 +117,12 @@ def test_large_stores_are_cut_between_episodes(tmp_path: Path) -> None:
 def test_splits_are_counted_in_the_record(tmp_path: Path) -> None:
     episodes = random_episodes(LENGTHS)
     store = write_store(tmp_path / "store", episodes, shard_steps=6)
+    steps = {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))}
+    unsplit = EpisodeStore.from_arrays(steps, np.array([3]))
+    assert [unsplit.split(name).n_steps for name in schema.SPLITS] == [3, 0, 0]
     for number, name in enumerate(schema.SPLITS):
         mine = [e for e in episodes if e.split == number]
         assert store.record.splits[name] == {"episodes": len(mine), "steps": sum(map(len, mine))}
-
-
-def test_without_a_split_everything_is_for_training(tmp_path: Path) -> None:
-    store = EpisodeStore.write(
-        tmp_path / "store",
-        {schema.REWARD: np.ones(3), schema.ACTION: np.ones((3, 1))},
-        np.array([3]),
-    )
-    assert store.split("train").n_steps == 3
-    assert store.split("test").n_episodes == 0
 
 
 def fingerprint(
@@ -246,13 +239,10 @@ def test_a_store_says_what_it_holds(tmp_path: Path) -> None:
     assert (
         repr(train) == "EpisodeStore(700 steps, 1 episodes, 11 items, reward=reward, split=train)"
     )
-    at = np.array([0, 1, 1]), np.array([5, 6, 7])
-    assert repr(store.windows(*at, 4)) == (
-        f"Windows(3 of 4 steps, states of {store.state_size}, actions are items)"
-    )
-    assert repr(store.transitions(*at)) == (
-        f"Transitions(3 steps, states of {store.state_size}, actions of 4)"
-    )
+    at, size = (np.array([0, 1, 1]), np.array([5, 6, 7])), store.state_size
+    windows = f"Windows(3 of 4 steps, states of {size}, actions are items)"
+    assert repr(store.windows(*at, 4)) == windows
+    assert repr(store.transitions(*at)) == f"Transitions(3 steps, states of {size}, actions of 4)"
 
 
 def contents(tmp_path: Path) -> dict[str, str]:
@@ -294,34 +284,11 @@ def test_a_write_that_fails_leaves_nothing(tmp_path: Path, case: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_half_way_leaves_nothing(tmp_path: Path) -> None:
-    steps = {schema.REWARD: np.ones(4), schema.ITEM: np.arange(4)}
-
-    def write() -> None:
-        with atomic_folder(tmp_path / "store") as scratch:
-            writer = StoreWriter(scratch, shard_steps=2)
-            for _ in range(3):
-                first = np.array([True, False, True, False])
-                writer.append(steps, first, {schema.SPLIT: np.zeros(4, dtype=int)})
-            assert len(list(scratch.iterdir())) > 2
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_store_is_never_overwritten(tmp_path: Path) -> None:
-    write_store(tmp_path / "store", random_episodes(LENGTHS))
-    before = contents(tmp_path)
-    with pytest.raises(InputError, match="exists already"):
-        write_store(tmp_path / "store", random_episodes([2, 2]))
-    assert contents(tmp_path) == before
-
-
-def test_the_same_episodes_make_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_episodes_make_the_same_bytes_that_are_never_overwritten(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_store(tmp_path / name, random_episodes(LENGTHS), shard_steps=6)
+    with pytest.raises(InputError, match="exists already"):
+        write_store(tmp_path / "b", random_episodes([2, 2]))
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 

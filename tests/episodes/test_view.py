@@ -17,7 +17,6 @@ from scipy.stats import chisquare
 from tests.support.episodes import (
     LENGTHS,
     SHARDS,
-    Logged,
     all_windows,
     are_equal,
     random_episodes,
@@ -86,17 +85,6 @@ def test_windows_equal_a_row_by_row_reading(
             np.testing.assert_allclose(got.states[b, k], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_the_documented_example(tmp_path: Path) -> None:
-    steps = {schema.REWARD: np.array([9.0, 5, 6, 7, 8]), schema.ACTION: np.zeros((5, 1))}
-    steps[schema.OBSERVATION] = np.zeros((5, 1))
-    store = EpisodeStore.write(tmp_path / "store", steps, np.array([1, 4]))
-    window = store.windows(np.array([1]), np.array([1]), 3)
-    assert window.rewards.tolist() == [[0, 5, 6]]
-    assert window.mask.tolist() == [[False, True, True]]
-    assert window.timesteps.tolist() == [[0, 0, 1]]
-    assert window.returns_to_go.tolist() == [[0, 26, 21]]
-
-
 @pytest.mark.parametrize("items", [True, False])
 def test_padding_is_zero_with_a_plus_sign(tmp_path: Path, items: bool) -> None:
     episodes = random_episodes(LENGTHS, items=items)
@@ -121,12 +109,6 @@ def test_padding_is_zero_with_a_plus_sign(tmp_path: Path, items: bool) -> None:
     assert not torch.signbit(beyond).any()
 
 
-def test_a_window_of_no_rows_is_empty(tmp_path: Path) -> None:
-    store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
-    none = np.empty(0, dtype=np.int64)
-    assert store.windows(none, none, 4).states.shape == (0, 4, store.state_size)
-
-
 @pytest.mark.parametrize("shard_steps", SHARDS)
 def test_views_see_their_episodes_only(tmp_path: Path, shard_steps: int) -> None:
     episodes = random_episodes(LENGTHS)
@@ -138,6 +120,8 @@ def test_views_see_their_episodes_only(tmp_path: Path, shard_steps: int) -> None
     assert view.returns.tolist() == [episodes[4].return_to_go(0), episodes[6].return_to_go(0)]
     at = np.array([0, 0, 1]), np.array([1, 4, 0])
     assert are_equal(view.windows(*at, 5), store.windows(np.array([4, 4, 6]), at[1], 5))
+    nothing = np.empty(0, dtype=np.int64)
+    assert store.windows(nothing, nothing, 4).states.shape == (0, 4, store.state_size)
     walked = view.all_steps()
     assert np.array_equal(view.locate(np.arange(view.n_steps)), walked)
     assert walked[0].tolist() == [0] * LENGTHS[4] + [1] * LENGTHS[6]
@@ -375,15 +359,3 @@ def test_views_share_mapped_columns_with_their_store(tmp_path: Path) -> None:
     for column in tmp_path.glob("store/shard-*/reward.npy"):
         column.unlink()
     assert are_equal(all_windows(store.select(np.arange(len(LENGTHS))), 3), whole)
-
-
-def test_user_rows_are_those_of_the_source(tmp_path: Path) -> None:
-    states = some_states(users=2)
-    logged = [
-        Logged([1.0], np.zeros((1, 0)), items=[0], user=3),
-        Logged([1.0], np.zeros((1, 0)), items=[0], user=-1),
-    ]
-    store = write_store(tmp_path / "store", logged, states)
-    seen = all_windows(store, 1).states[:, 0, -2:]
-    assert torch.equal(seen[0], states.user_features[3])
-    assert not seen[1].any()

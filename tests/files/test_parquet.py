@@ -16,7 +16,8 @@ from ucfrec.errors import InputError
 from ucfrec.evaluation.gymnasium_environment import item_table
 from ucfrec.files import parquet
 from ucfrec.files.parquet import read_ids, require_plausible_rows, require_plausible_size
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.reporting.training import read_features
 
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from tests.support.logs import list_users
 from ucfrec import Recommender
 from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
@@ -245,10 +246,10 @@ def rewards_of(columns: dict[str, object], reward: str, folder: Path) -> list[fl
     frame = frame.assign(user_id=1, item_id=2, timestamp=START + np.arange(len(frame)))
     frame.to_parquet(folder / "log.parquet")
     (batch,) = read_histories([folder / "log.parquet"], LogMapping(), reward, last=len(frame))
-    found: list[float] = batch["rewards"][0].as_py()
+    found: list[float] = batch.rewards.tolist()
     if len(found) == len(frame):
         (batch,) = frame_histories(frame, LogMapping(), reward, last=len(frame))
-        assert batch["rewards"][0].as_py() == found
+        assert batch.rewards.tolist() == found
     return found
 
 
@@ -315,7 +316,7 @@ def test_what_is_undefined_is_above_no_threshold(
     }
     pq.write_table(pa.table(columns), tmp_path / "log.parquet")
     (batch,) = read_histories([tmp_path / "log.parquet"], LogMapping(), reward, last=4)
-    assert batch["rewards"][0].as_py() == pytest.approx(wanted)
+    assert batch.rewards.tolist() == pytest.approx(wanted)
 
 
 def test_only_true_and_one_are_random_choices(tmp_path: Path) -> None:
@@ -378,8 +379,8 @@ def test_later_rows_of_csv_are_not_cut_to_the_type_of_the_first(
     tmp_path: Path, first: str, later: str, reward: str, wanted: float
 ) -> None:
     path = csv_of(tmp_path, "x", first, later)
-    users = pa.Table.from_batches(list(read_histories([path], LogMapping(), reward, last=1)))
-    latest = max(users.to_pylist(), key=lambda user: int(user["timestamps"][0]))
+    users = list_users(read_histories([path], LogMapping(), reward, last=1))
+    latest = max(users, key=lambda user: int(user["timestamps"][0]))
     assert latest["rewards"] == [wanted]
 
 
@@ -388,8 +389,8 @@ def test_a_later_row_of_csv_with_a_leading_zero_is_text_in_expressions(tmp_path:
     path = csv_of(tmp_path, "visitor", "7", "007")
     for written, rows in (("7", 24_999), ("007", 1)):
         mapping = LogMapping(where=f"visitor = '{written}'")
-        users = pa.Table.from_batches(list(read_histories([path], mapping, "1", last=25_000)))
-        assert sum(map(len, users["item_ids"].to_pylist())) == rows
+        batches = read_histories([path], mapping, "1", last=25_000)
+        assert sum(len(batch.item_ids) for batch in batches) == rows
 
 
 def test_the_line_is_named_where_an_identifier_is_also_in_an_expression(tmp_path: Path) -> None:

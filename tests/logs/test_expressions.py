@@ -20,9 +20,11 @@ from ucfrec import UCF, EpisodeStore
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
-from ucfrec.logs import FeatureTable, LogMapping, PrepareOptions, prepare, read_histories, validate
 from ucfrec.logs.engine import bind, engine
 from ucfrec.logs.expressions import COPYING, FUNCTIONS, TYPES, NotScalarError, columns_of
+from ucfrec.logs.histories import read_histories
+from ucfrec.logs.mapping import FeatureTable, LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_datasets import kuairand, kuairec, obd

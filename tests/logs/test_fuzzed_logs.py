@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
+from tests.support.logs import list_users
 from tests.support.pandas_reader import Rows, rows_of
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import read_histories
@@ -141,12 +142,9 @@ def check(given: list[Part], folder: Path) -> None:
         assert not (plain and settled(given)), refusal
         return
     found: Rows = {}
-    for batch in batches:
-        for user in batch.to_pylist():
-            steps = zip(
-                user["timestamps"], map(str, user["item_ids"]), user["rewards"], strict=True
-            )
-            found[str(user["user_id"])] = sorted(steps)
+    for user in list_users(batches):
+        steps = zip(user["timestamps"], map(str, user["item_ids"]), user["rewards"], strict=True)
+        found[str(user["user_id"])] = sorted(steps)
     assert found == expected
 
 

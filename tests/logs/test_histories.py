@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
+from tests.support.logs import list_users
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
@@ -48,9 +49,8 @@ def test_files_and_frames_have_the_same_histories(
     given = LogMapping(), "reward * 2", 7
     batches = list(read_histories([tmp_path / "log.parquet"], *given, session_by=session_by))
     assert len(batches) > 1 or block > 600
-    found = pa.Table.from_batches(batches).to_pylist()
-    by_sql = frame_histories(log, *given, session_by=session_by)
-    expected = pa.Table.from_batches(by_sql).to_pylist()
+    found = list_users(batches)
+    expected = list_users(frame_histories(log, *given, session_by=session_by))
     for ours, theirs in zip(found, expected, strict=True):
         # Numbers stand for the sessions.
         for history in (ours, theirs):
@@ -102,4 +102,4 @@ def test_columns_of_types_that_are_not_read_are_left_out_with_a_note() -> None:
         frame = plain_log(reward=np.array([0.5, 1], np.float16), **{name: column})
         with pytest.warns(InputNote, match=f"column {name} is left out: it is of type"):
             (batch,) = frame_histories(frame, LogMapping(), "reward", 7)
-        assert batch["rewards"].to_pylist() == [[0.5], [1.0]]
+        assert batch.rewards.tolist() == [0.5, 1.0]

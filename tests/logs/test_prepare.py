@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from safetensors import SafetensorError
 
 from tests.support.equal_times import tie_key
-from tests.support.logs import START, write
+from tests.support.logs import START, list_users, write
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.writer import StoreWriter
@@ -305,8 +305,8 @@ def test_a_store_like_another_has_its_numbers(tmp_path: Path) -> None:
 def test_histories_are_the_latest_clean_rows(tmp_path: Path) -> None:
     log = make_log()
     path = write(log, tmp_path / "log.parquet")
-    batches = list(read_histories([path], LogMapping(), "reward * 1", last=5))
-    found = pa.Table.from_batches(batches).to_pandas().set_index("user_id")
+    users = list_users(read_histories([path], LogMapping(), "reward * 1", last=5))
+    found = pd.DataFrame(users).set_index("user_id")
     assert list(found.index) == sorted(log["user_id"].unique())
     for user, rows in expected_sessions(log, 30).groupby("user_id"):
         assert list(found["item_ids"][user]) == list(rows["item_id"])[-5:]

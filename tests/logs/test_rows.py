@@ -10,13 +10,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.support.equal_times import tie_key
-from tests.support.logs import START, faulty_log
+from tests.support.logs import START, faulty_log, list_users
 from ucfrec import schema
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputNote
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.engine import engine
-from ucfrec.logs.histories import frame_histories, read_histories
+from ucfrec.logs.histories import Histories, frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import validate
 from ucfrec.logs.rows import DUPLICATES, choose_rows, sort_rows
@@ -129,9 +129,9 @@ def days(users: int, days: int, a_day: int, items: int = 200) -> pd.DataFrame:
     return log
 
 
-def items_of(batches: list[pa.RecordBatch]) -> dict[str, list[str]]:
-    histories = pa.Table.from_batches(batches).to_pylist()
-    return {str(each["user_id"]): list(map(str, each["item_ids"])) for each in histories}
+def items_of(batches: list[Histories]) -> dict[str, list[str]]:
+    users = list_users(batches)
+    return {str(each["user_id"]): list(map(str, each["item_ids"])) for each in users}
 
 
 @pytest.mark.parametrize("text", [(), ("user_id",), ("item_id",), ("user_id", "item_id")])

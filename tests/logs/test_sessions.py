@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ucfrec.logs import LogMapping, PrepareOptions, validate
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, validate
 
 START = 1_700_000_000_000
 

@@ -84,7 +84,7 @@ def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     given = LogMapping(partitions=True)
     assert validate(log_files([tmp_path]), given)["users"] == log["user_id"].nunique()
     (batch,) = read_histories([tmp_path], given, "reward", 1000)
-    assert batch.column("user_id").to_pylist() == sorted(log["user_id"].unique())
+    assert batch.users.tolist() == sorted(log["user_id"].unique())
 
 
 def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_words_in_folders_make_words_of_them_all(tmp_path: Path) -> None:
     for name in ("7", "007", "a%20b"):
         write(log, tmp_path / f"user_id={name}" / "part.parquet")
     (batch,) = read_histories([tmp_path], LogMapping(partitions=True), "reward", 1000)
-    assert batch.column("user_id").to_pylist() == ["007", "7", "a b"]
+    assert batch.users.tolist() == ["007", "7", "a b"]
 
 
 def test_numbers_in_folders_stay_numbers_beside_a_folder_without_a_value(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_numbers_in_folders_stay_numbers_beside_a_folder_without_a_value(tmp_pat
         write(random_log(), tmp_path / f"weight={name}" / "part.parquet")
     given = LogMapping(partitions=True)
     (batch,) = read_histories([tmp_path], given, "coalesce(weight, 7)", 1000)
-    assert {*batch.column("rewards").flatten().to_pylist()} == {7}
+    assert {*batch.rewards.tolist()} == {7}
 
 
 # Parts

@@ -107,7 +107,7 @@ def test_iso_times_are_read_with_and_without_zone(
         path = write(log, tmp_path / f"log{suffix}")
         (batch,) = read_histories([path], LogMapping(), "reward", 10)
     ms = round(pd.Timestamp(expected, tz="UTC").timestamp() * 1000)
-    assert batch.column("timestamps").to_pylist() == [[ms] * 3]
+    assert batch.timestamps.tolist() == [ms] * 3
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

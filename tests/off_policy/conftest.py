@@ -10,7 +10,8 @@ import pytest
 
 from tests.recommending.test_recommend import SETTINGS, random_log
 from ucfrec import UCF, EpisodeStore
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.off_policy.score import LoggedSessions, read_logged_sessions
 from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -18,7 +18,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.record import CARD
-from ucfrec.logs import LogMapping
+from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.evaluate import EstimateOptions, collect_steps, evaluate_off_policy
 from ucfrec.off_policy.models import make_inputs
 from ucfrec.off_policy.score import (

@@ -108,7 +108,7 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
     with torch.no_grad():
         plain = head.predict(policy.features(normalized)[:, -1])
         last = torch.arange(1, len(plain) + 1) * K - 1
-        term = Exposed.before(normalized, 3).select(last)
+        term = Exposed.before(normalized, 3, last)
         added = head.exposure.added_to(torch.zeros(len(last), ITEMS), term)
         torch.testing.assert_close(policy.act(windows), plain + added)
         own = windows.actions.clone()

@@ -131,21 +131,6 @@ def test_the_last_features_are_the_last_row_of_all(name: str, sizes: dict[str, i
 
 
 @both_heads
-@pytest.mark.parametrize("name", [*HISTORY, "bc"])
-@pytest.mark.parametrize("t", [2, 5])
-def test_neither_the_action_nor_the_future_moves_its_prediction(
-    name: str, sizes: dict[str, int], t: int
-) -> None:
-    policy, windows = build(name, sizes), random_windows(sizes)
-    changed = changed_at(windows, (slice(None), slice(t, None)), ("actions", "rewards"))
-    changed = changed_at(changed, (slice(None), slice(t + 1, None)), ("states", "returns_to_go"))
-    before, after = predictions(policy, windows), predictions(policy, changed)
-    early = windows.mask & (torch.arange(K) <= t)
-    torch.testing.assert_close(before[early], after[early])
-    assert not torch.allclose(before[:, t + 1 :], after[:, t + 1 :])
-
-
-@both_heads
 @sequence
 @pytest.mark.parametrize("field", ["states", "actions", "returns_to_go"])
 def test_the_past_moves_a_prediction(name: str, sizes: dict[str, int], field: str) -> None:
@@ -280,29 +265,6 @@ def test_parameters_are_the_official_ones_less_the_unused(
 def test_lsdt_refuses_a_width_that_does_not_split() -> None:
     with pytest.raises(InputError, match=r"policy\.dim is 48; .* 16 kernel_groups"):
         LSDTPolicy(LSDTConfig(dim=48), VECTORS)
-
-
-@pytest.mark.parametrize("name", ["dt", "dc", "lsdt"])
-@pytest.mark.parametrize(("field", "first"), [("actions", 11), ("states", 10)])
-def test_a_change_at_step_ten_shows_where_the_official_code_shows_it(
-    name: str, field: str, first: int
-) -> None:
-    torch.manual_seed(0)
-    policy_type = policy_class(name)
-    policy = policy_type(policy_type.Config(), VECTORS).eval()
-    windows = Windows(
-        states=torch.randn(1, 20, S),
-        actions=torch.rand(1, 20, A),
-        rewards=torch.zeros(1, 20),
-        returns_to_go=torch.rand(1, 20),
-        timesteps=torch.arange(20).unsqueeze(0),
-        mask=torch.ones(1, 20, dtype=torch.bool),
-    )
-    values = getattr(windows, field).clone()
-    values[:, 10] += 1.0
-    changed = predictions(policy, replace(windows, **{field: values}))
-    moved = (changed != predictions(policy, windows)).any(-1)[0].nonzero()
-    assert int(moved[0]) == first
 
 
 # The last step of a few windows, by stacked streams.

@@ -21,7 +21,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.commands.cli import main
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError, InputNote
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.recommending import histories
 from ucfrec.recommending import recommend as module
 from ucfrec.recommending.histories import histories_of_files

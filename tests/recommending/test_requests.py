@@ -69,6 +69,19 @@ def test_other_text_is_no_time(given: str) -> None:
         ('"user_id": null', "user_id: .*integer or .*string, not null$"),
         ('"user_id": 1.5', "user_id: .*, not 1.5$"),
         ('"user_id": true', "user_id: .*, not true$"),
+        ("", "user_id: field required"),
+        ('"user_id": 1, "kk": 3', "kk: extra inputs are not permitted"),
+        ('"user_id": 1, "k": 6', r"6 items \(k\): the limit is 5"),
+        ('"user_id": 1, "candidates": [1, 2, 3]', "3 candidates: the limit is 2"),
+        (
+            '"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12, "reward": %s}]'
+            % ("9" * 400),
+            "history.0.reward",
+        ),
+        (
+            '"user_id": 1, "history": [' + ", ".join(['{"item_id": 1, "timestamp": 7}'] * 4) + "]",
+            "4 rows of history: the limit is 3",
+        ),
         (f'"user_id": {2**63}', f"user_id: .*, not {2**63}$"),
         ('"user_id": [1], "int": 0', "user_id: .*; 1 more fault$"),
         ('"user_id": null, "k": 0, "x": 0', "user_id: .*, not null; 2 more faults$"),
@@ -85,9 +98,16 @@ def test_other_text_is_no_time(given: str) -> None:
         ),
     ],
 )
-def test_a_value_of_no_type_that_its_place_takes_is_one_fault(entries: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"^{message}"):
-        parse(Request, f"{{{entries}}}".encode(), Limits())
+def test_a_value_that_its_place_does_not_take_is_one_fault(entries: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}") as caught:
+        parse(Request, f"{{{entries}}}".encode(), Limits(k=5, history=3, candidates=2))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b'{"user_id": "\xff"}', b"[1]"])
+def test_what_is_no_json_object_is_no_request(text: bytes) -> None:
+    with pytest.raises(InputError, match=r"the request( is not JSON|: input should be an object)"):
+        parse(Request, text, Limits())
 
 
 def test_integers_that_javascript_would_round_are_text() -> None:

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -199,23 +198,6 @@ def test_what_is_no_host_is_refused(
 ) -> None:
     assert main(["serve", str(trained.folder), "--port", "0", "--allowed-hosts", hosts]) == 2
     assert "is not a host" in capsys.readouterr().err
-
-
-def test_requests_of_many_clients_are_answered(address: str) -> None:
-    answers: list[int] = []
-
-    def ask() -> None:
-        with httpx.Client(base_url=address, timeout=60) as client:
-            for user in range(10):
-                answer = client.post("/recommendations", json={"user_id": user, "k": 4})
-                answers.append(len(answer.json()["items"]))
-
-    clients = [threading.Thread(target=ask) for _ in range(8)]
-    for each in clients:
-        each.start()
-    for each in clients:
-        each.join()
-    assert answers == [4] * 80
 
 
 def test_a_damaged_run_and_a_taken_port_are_refused(

@@ -10,7 +10,8 @@ import pytest
 from tests.recommending.test_recommend import SETTINGS, random_log
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.commands.cli import main
-from ucfrec.logs import LogMapping, PrepareOptions, prepare
+from ucfrec.logs.mapping import LogMapping
+from ucfrec.logs.prepare import PrepareOptions, prepare
 
 RULES = {
     "drawn": ["--k", "6", "--temperature", "1.5", "--seed", "3"],

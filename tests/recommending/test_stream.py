@@ -85,29 +85,14 @@ def test_the_answer_of_a_line_has_its_number(trained: TrainedPolicy, blank: byte
     assert "the line is blank" in answers[3]["error"]
 
 
-BAD = {
-    "no JSON": (b"{", "the request is not JSON"),
-    "not UTF-8": (b'{"user_id": "\xff"}', "the request is not JSON"),
-    "no object": (b"[1]", "the request: input should be an object"),
-    "a misspelt entry": (b'{"user_id": 1, "kk": 3}', "kk: extra inputs are not permitted"),
-    "too many items": (b'{"user_id": 1, "k": 1001}', "1,001 items (k): the limit is 1,000"),
-    "no float": (
-        b'{"user_id": 1, "history": [{"item_id": 1, "timestamp": 1.7e12, "reward": %s}]}'
-        % (b"9" * 400),
-        "history.0.reward",
-    ),
-    "deep": (b'{"user_id": ' + b"[" * 100_000 + b"}", "the request is not JSON"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_a_bad_line_has_one_error_and_the_stream_goes_on(trained: TrainedPolicy, case: str) -> None:
-    line, message = BAD[case]
-    wrong, right = streamed(trained, line + b"\n" + lines([{"user_id": 1}]))
-    assert message in wrong["error"]
-    assert "\n" not in wrong["error"]
-    assert wrong["line"] == 1
-    assert len(right["items"]) == 10
+def test_a_bad_line_has_one_error_and_the_stream_goes_on(trained: TrainedPolicy) -> None:
+    deep = b'{"user_id": ' + b"[" * 100_000 + b"}"
+    for line in (b"{", b'{"user_id": "\xff"}', deep):
+        wrong, right = streamed(trained, line + b"\n" + lines([{"user_id": 1}]))
+        assert "the request is not JSON" in wrong["error"]
+        assert "\n" not in wrong["error"]
+        assert wrong["line"] == 1
+        assert len(right["items"]) == 10
 
 
 @pytest.mark.parametrize("size", [1, 7, 10**6])

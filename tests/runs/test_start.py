@@ -1,4 +1,4 @@
-"""What is said of a policy that predicts choices no better than popularity does."""
+"""How a run begins: warm or alone, with other processes, and what is said if nothing is learned."""
 
 import os
 import subprocess
@@ -126,7 +126,7 @@ def test_warm_settings_are_a_share_of_the_whole() -> None:
 
 
 ROOT = Path(__file__).parents[2]
-SETTINGS = [
+TOGETHER = [
     "train.steps=12", "train.validate_every=4", "train.batch_size=9", "train.warmup_steps=2",
     "train.learning_rate=0.01", "policy.dim=8", "policy.context=3", "policy.dropout=0.0",
     "policy.advantage_weights=true", "augment.copies=1", "crm.epochs=1", "crm.hidden=8",
@@ -152,7 +152,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def train(store: Path, run: Path, *settings: str) -> None:
     if not distributed.leads():
         distributed.wait()
-    train_run(EpisodeStore.open(store), run, resolve_config("ucf", None, [*SETTINGS, *settings]))
+    train_run(EpisodeStore.open(store), run, resolve_config("ucf", None, [*TOGETHER, *settings]))
 
 
 def same(found: Path, expected: Path) -> None:
@@ -200,7 +200,7 @@ def started(store: Path, run: Path, *more: str) -> "subprocess.CompletedProcess[
 
 @pytest.mark.slow
 def test_torchrun_is_the_same_command(store: Path, tmp_path: Path) -> None:
-    options = [word for setting in SETTINGS for word in ("--set", setting)]
+    options = [word for setting in TOGETHER for word in ("--set", setting)]
     ended = started(store, tmp_path / "two", *options)
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.count("model card:") == 1

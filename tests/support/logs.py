@@ -1,5 +1,6 @@
 """Logs as files, and the stores made of them."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from ucfrec.episodes.store import EpisodeStore
+from ucfrec.logs.histories import Histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 
@@ -68,3 +70,19 @@ def store_of(
     given = mapping or LogMapping(), folder / "store", PrepareOptions(**options)
     prepare([folder / "log.parquet"], *given)
     return EpisodeStore.open(folder / "store")
+
+
+def list_users(batches: Iterable[Histories]) -> list[dict[str, Any]]:
+    """Each user of histories, with lists of their rows and the items that they have seen."""
+    users = []
+    for batch in batches:
+        for number, user in enumerate(batch.users.tolist()):
+            rows, seen = batch.owner == number, batch.seen_owner == number
+            names = ("item_ids", "rewards", "timestamps", "session_ids")
+            columns = {name: getattr(batch, name) for name in names}
+            lists = {name: v[rows].tolist() for name, v in columns.items() if v is not None}
+            lists["seen"] = batch.seen_ids[seen].tolist()
+            if batch.observations is not None:
+                lists["observation"] = batch.observations[number].tolist()
+            users.append({"user_id": user, **lists})
+    return users

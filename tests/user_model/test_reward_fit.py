@@ -14,7 +14,7 @@ from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
-from ucfrec.user_model.reward import LAGS, MEMORY
+from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
 from ucfrec.user_model.reward_effects import Effects, fit_effects
 from ucfrec.user_model.reward_fit import (
     fit_item_reward_model,
@@ -80,11 +80,13 @@ def views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     return store.split("train"), store.split("validation")
 
 
+def fit(folder: Path, planted: Log, rewards: Float64Array) -> tuple[ItemRewardModel, Any]:
+    return fit_item_reward_model(*views(store_of(planted, rewards)), folder, seed=0)
+
+
 def test_planted_item_effects_are_recovered_and_calibrated(tmp_path: Path) -> None:
     planted = log(0, users=400)
-    model, report = fit_item_reward_model(
-        *views(store_of(planted, clicks(planted))), tmp_path, seed=0
-    )
+    model, report = fit(tmp_path, planted, clicks(planted))
     assert np.corrcoef(model.item.numpy(), planted.of_item)[0, 1] > 0.95
     slope = np.polyfit(planted.of_item, model.item.numpy(), 1)[0]
     assert 0.8 < slope < 1.2
@@ -98,9 +100,7 @@ def test_planted_item_effects_are_recovered_and_calibrated(tmp_path: Path) -> No
 
 def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
     planted = log(1, boredom=3.0, users=300)
-    model, report = fit_item_reward_model(
-        *views(store_of(planted, clicks(planted))), tmp_path, seed=0
-    )
+    model, report = fit(tmp_path, planted, clicks(planted))
     assert "exposure" in report.kept
     assert model.exposure[1, 0] < -1
     assert model.exposure[1, 1:].abs().max() < 0.5
@@ -218,7 +218,7 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
 def test_what_does_not_predict_is_left_out(tmp_path: Path) -> None:
     planted = log(5)
     rewards = (np.random.default_rng(1).random(len(planted.items)) < 0.3).astype(np.float64)
-    model, report = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path, seed=0)
+    model, report = fit(tmp_path, planted, rewards)
     assert len(report.kept) <= 2
     assert report.loss > report.base_loss - 0.01
     for tried in report.effects:
@@ -230,7 +230,7 @@ def test_what_does_not_predict_is_left_out(tmp_path: Path) -> None:
 def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> None:
     planted = log(6, boredom=1.0)
     rewards = clicks(planted)
-    model, _ = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path, seed=0)
+    model, _ = fit(tmp_path, planted, rewards)
     step = 7
     later = np.arange(len(planted.items)) % LENGTH >= step
     changed = planted._replace(items=np.where(later, (planted.items + 11) % ITEMS, planted.items))
@@ -246,20 +246,18 @@ def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> No
 def test_test_rows_have_no_effect_and_statistics_come_from_training_rows(tmp_path: Path) -> None:
     planted = log(7)
     rewards = clicks(planted)
-    first, _ = fit_item_reward_model(*views(store_of(planted, rewards)), tmp_path / "a", seed=0)
+    first, _ = fit(tmp_path / "a", planted, rewards)
     other = rewards.copy()
     other[-LENGTH:] = 1 - other[-LENGTH:]
     items = planted.items.copy()
     items[-LENGTH:] = 0
-    same, _ = fit_item_reward_model(
-        *views(store_of(planted._replace(items=items), other)), tmp_path / "b", seed=0
-    )
+    same, _ = fit(tmp_path / "b", planted._replace(items=items), other)
     for name, value in first.state_dict().items():
         assert torch.equal(value, same.state_dict()[name]), name
     held_out = slice(int(USERS * 0.75) * LENGTH + LENGTH, None)
     other = rewards.copy()
     other[held_out] = 1 - other[held_out]
-    chosen, _ = fit_item_reward_model(*views(store_of(planted, other)), tmp_path / "c", seed=0)
+    chosen, _ = fit(tmp_path / "c", planted, other)
     statistics = ("state_mean", "state_std", "reward_mean", "reward_std", "vectors")
     for name in statistics:
         assert torch.equal(first.get_buffer(name), chosen.get_buffer(name)), name

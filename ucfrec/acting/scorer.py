@@ -142,7 +142,7 @@ class Scorer:
                 "reward model of items; train it with --set rule.choose=true, or set the reward "
                 "weight to 0"
             )
-        if rule.looks_ahead and self.session_end is None:
+        if self.session_end is None and rule.looks_ahead:
             raise InputError(
                 f"the rule has lookahead {rule.lookahead:g}, but the run has no model of session "
                 "ends; train it on a log with sessions, or set the lookahead to 0"

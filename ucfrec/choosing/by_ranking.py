@@ -102,21 +102,13 @@ class LoggedEvidence:
         view = view.select(np.sort(order[: last + 1]))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
-        self._propensities: Float64Array | None = None
+        self.propensities: Float64Array | None = None
+        """(M,) if all steps have one."""
         if schema.PROPENSITY in view.record.columns:
             propensities = self._logged.read(schema.PROPENSITY).astype(np.float64)
-            self._propensities = propensities if (propensities > 0).all() else None
+            self.propensities = propensities if (propensities > 0).all() else None
         self._users = np.unique(self._logged.owners, return_inverse=True)[1]
-
-    @property
-    def has_propensities(self) -> bool:
-        """Whether all steps have one."""
-        return self._propensities is not None
-
-    @property
-    def users(self) -> int:
-        """The number of users."""
-        return int(self._users.max(initial=-1)) + 1
+        self.n_users = int(self._users.max(initial=-1)) + 1
 
     def evaluate(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
         """The evidence of each rule."""
@@ -135,9 +127,9 @@ class LoggedEvidence:
         liked, view = self._logged.liked, self._logged.view
         rate = float(hits[liked].mean()) if liked.any() else 0.0
         likelihood = float(np.exp(logs.mean()))
-        if self._propensities is None:
+        if self.propensities is None:
             return Evidence(rate, likelihood)
-        sums = np.bincount(self._logged.episodes, logs - np.log(self._propensities))
+        sums = np.bincount(self._logged.episodes, logs - np.log(self.propensities))
         weights = np.exp(np.minimum(sums, 100.0))
         above = np.bincount(self._users, weights * view.returns.astype(np.float64))
         below = np.bincount(self._users, weights).astype(np.float64)
@@ -213,11 +205,9 @@ class _Candidate:
 
     rule: DecisionRule
     users: IntArray
-    """(M,) whose rows they are."""
     rates: Float64Array
     """(M,) mean rate, in the period, of the items shown."""
     liked: BoolArray
-    """(M,)."""
     hits: BoolArray
     """(M,) whether the row's item is among those shown."""
     ahead: Float64Array

@@ -73,9 +73,7 @@ class Outcomes:
     """What happened in n simulated sessions of one rule."""
 
     returns: Float64Array
-    """(n,), in reward units."""
     lengths: IntArray
-    """(n,), steps."""
     items: IntArray
     """(M,), all that were shown."""
 
@@ -161,7 +159,7 @@ class RuleSearch:
         self._many, self._few = (
             LoggedEvidence(problem.scorer, problem.validation, most, seed) for most in _LOGGED_STEPS
         )
-        self.least_users = float(self._config.evidence if self._many.has_propensities else 0)
+        self.least_users = 0.0 if self._many.propensities is None else float(self._config.evidence)
         """Effective users that a rule must leave; 0 without propensities."""
         self._sessions: dict[DecisionRule, Outcomes] = {}
 
@@ -175,7 +173,7 @@ class RuleSearch:
         sessions = self._roll_out(rules, self._store, first, self.problem.seed)
         self._sessions |= sessions
         candidates = [self._summarise(rule, outcomes) for rule, outcomes in sessions.items()]
-        if 0 < self.least_users < self._many.users:
+        if 0 < self.least_users < self._many.n_users:
             candidates = self._add_evidence(candidates)
         return candidates if first == n else self._simulate_rest(candidates, n - first)
 
@@ -280,7 +278,6 @@ class RuleSearch:
         return self.is_supported(candidate) and enough
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates; all that the log supports if it can evaluate none."""
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
         return allowed or [candidate for candidate in candidates if self.is_supported(candidate)]
 
@@ -310,7 +307,6 @@ class RuleSearch:
         ]
 
     def _find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The rule that the choice starts from, if it is a candidate."""
         return [candidate for candidate in candidates if candidate.rule == self.problem.start]
 
     def _error(self, first: SimulatedRule, second: SimulatedRule) -> float:
@@ -352,7 +348,7 @@ class RuleSearch:
         returns = [values for values in returns if len(values) == n]
 
         def agrees(rows: Any) -> bool:
-            top = max((values[rows] for values in returns), key=_mean)
+            top = max((values[rows] for values in returns), key=np.sum)
             if len(top) < _FEWEST:
                 return True
             mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
@@ -371,7 +367,7 @@ class RuleSearch:
                 half.append(self._roll_half(rule, number, part=1))
                 for number, half in enumerate(halves)
             ]
-        values = _mean(halves[0].returns), _mean(halves[1].returns)
+        values = float(halves[0].returns.mean()), float(halves[1].returns.mean())
         value = sum(values) / 2
         first, second = (_standard_error(half.returns) for half in halves)
         error = max(math.hypot(first, second) / 2, abs(values[0] - values[1]) / 2)
@@ -464,7 +460,6 @@ def _describe_choice(users: UserModel) -> str:
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
-    """All candidates of the configuration that the best of the earlier ones leads to."""
     problem, config = search.problem, search.problem.config
     candidates = search.simulate([*_list_unweighted(problem)])
     first = search.best(candidates).rule
@@ -522,7 +517,6 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
 
 
 def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
-    """Rules of the policy alone, the highest temperature first."""
     config, targets, policy = problem.config, problem.targets, problem.scorer.policy
     for temperature in sorted(config.temperatures, reverse=True):
         for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
@@ -533,7 +527,6 @@ def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
 
 
 def _vary(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
-    """The rule with every combination of other values of its fields."""
     for combination in product(*values.values()):
         variant = replace(rule, **dict(zip(values, combination, strict=True)))
         if variant != rule:
@@ -599,10 +592,5 @@ def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:
     )
 
 
-def _mean(values: Float64Array) -> float:
-    return float(values.mean()) if len(values) else 0.0
-
-
 def _standard_error(values: Float64Array) -> float:
-    """Of the mean."""
     return float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0

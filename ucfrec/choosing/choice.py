@@ -102,7 +102,6 @@ class Evidence:
     value: float | None = None
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None
-    """Its standard error over users."""
 
     @property
     def interval(self) -> tuple[float, float] | None:
@@ -120,7 +119,6 @@ class SimulatedRule:
     value: float
     """Mean return of a session, in reward units."""
     error: float
-    """Its standard error over the sessions."""
     length: float
     """Mean number of steps of a session."""
     support: float
@@ -164,7 +162,6 @@ class RankedRule:
     gain: float
     """Difference of `hits` from that of the most liked training items."""
     gain_error: float
-    """Its standard error over rows."""
 
 
 @dataclass(frozen=True)

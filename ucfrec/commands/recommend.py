@@ -23,7 +23,7 @@ from ucfrec.processes import progress
 
 if TYPE_CHECKING:
     from ucfrec.arrays import Array
-    from ucfrec.recommending.histories import Histories
+    from ucfrec.logs.histories import Histories
     from ucfrec.runs.trained_policy import TrainedPolicy
 
 
@@ -58,7 +58,6 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
                 "name LOGS after the run and the file to write with --out; or give --stream"
             )
         from ucfrec.files.parquet import write_frames
-        from ucfrec.recommending.exposures import exposures_written
         from ucfrec.recommending.histories import histories_of_files
         from ucfrec.recommending.recommend import recommend
         from ucfrec.runs.trained_policy import TrainedPolicy
@@ -112,6 +111,8 @@ class Recommend(AnswerOptions, SparkOption, LogOptions, RunArgument):
             if self.exposures is None:
                 rows = write_frames(self.out, frames)
             else:
+                from ucfrec.recommending.exposures import exposures_written
+
                 with exposures_written(self.exposures, trained, rule.hash, frames) as written:
                     rows = write_frames(self.out, written)
         print(f"{origin(self.out)}: {rows:,} rows")

@@ -180,8 +180,7 @@ def augment_episodes(
     """Fit reward model and generator, and make copies (lines 1 to 3 of Algorithm 1) of the episodes
     of `train`; those of `validation` stop the fit early. Training resumes from `folder`."""
     limit = max(crm_config.max_transitions, csg_config.max_transitions)
-    item_rewards: ItemRewardModel | None = None
-    mean: EffectsMean | None = None
+    item_rewards = mean = None
     if crm_config.mean == "effects" and train.has_items:
         item_rewards, _ = fit_item_reward_model(train, validation, folder / "item-reward", seed)
         mean = EffectsMean(item_rewards)
@@ -488,12 +487,9 @@ class ActionGenerator:
     def propose(
         self, episodes: IntArray, steps: IntArray, count: int, seed: int
     ) -> tuple[AugmentedEpisodes, ActionReport]:
-        """Propose `count` other actions at each of the given steps, and copy what passes.
+        """Propose `count` other actions at each of M steps of episodes (M,), and copy what passes.
 
         Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
-
-        Args:
-            episodes: (M,) positions in the view; `steps` are steps of them.
         """
         # In float64, so that a later check confirms what passes.
         exact = copy.deepcopy(self.crm).double()
@@ -534,11 +530,8 @@ class ActionGenerator:
         count: int,
         rng: np.random.Generator,
     ) -> dict[str, Any]:
-        """Draw other actions at each of the given steps, and predict their rewards.
-
-        Of each of N actions: `episode`, `step`, `action`, its `reward`, the `logged` reward, and
-        whether the reward model has `reproduced` that.
-        """
+        """Draw N other actions: `episode`, `step`, `action`, its predicted `reward`, the `logged`
+        reward, and whether the reward model has `reproduced` that."""
         factual = read_transitions(self.view, episodes, steps, self.item_rewards)
         factual = factual.to(self.crm.device)
         s, a, r = (values.double() for values in (factual.states, factual.actions, factual.rewards))

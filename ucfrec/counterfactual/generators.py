@@ -26,8 +26,6 @@ from ucfrec.settings import (
 )
 
 _TINY = 1e-12
-
-
 Length = Annotated[float, Field(ge=0, le=1e6)]
 
 
@@ -64,21 +62,16 @@ class CSGConfig:
     def __post_init__(self) -> None:
         """Check that the band is in order."""
         low, high = self.band
-        require(
-            low <= high,
-            f"csg.band is [{low:g}, {high:g}]; the first length must not exceed the second",
-            "csg.band",
-        )
+        fault = f"csg.band is [{low:g}, {high:g}]; the first length must not exceed the second"
+        require(low <= high, fault, "csg.band")
 
 
 @dataclass(frozen=True)
 class StateClusters:
-    """C clusters of normalised states, found by k-means."""
+    """C clusters of normalised states by k-means: centres (C, S), covariances (C, S, S)."""
 
     centres: Tensor
-    """(C, S)."""
     covariances: Tensor
-    """(C, S, S) covariance of the states of each cluster."""
 
     @classmethod
     def of(cls, states: Tensor, most: int, seed: int) -> "StateClusters":
@@ -191,9 +184,8 @@ class TangentGenerator:
         reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
         steepest = _products(self._clusters.covariances, gradient, rows)
         move = _products(self._roots, noise, rows)
-        move = _scale(
-            move - steepest * _ratio((gradient * move).sum(1), gradient, steepest), length
-        )
+        move = move - steepest * _ratio((gradient * move).sum(1), gradient, steepest)
+        move = _scale(move, length)
         for _ in range(self._config.corrections):
             current, gradient = self._reward(states, actions, z, move)
             steepest = _products(self._clusters.covariances, gradient, rows)

@@ -97,12 +97,8 @@ class CRMConfig:
 
     def __post_init__(self) -> None:
         """Check the fields against each other."""
-        require(
-            self.mean_first or self.mean == "network",
-            f"crm.mean is {self.mean!r}, which needs crm.mean_first=true",
-            "crm.mean",
-            "crm.mean_first",
-        )
+        fault = f"crm.mean is {self.mean!r}, which needs crm.mean_first=true"
+        require(self.mean_first or self.mean == "network", fault, "crm.mean", "crm.mean_first")
 
 
 class Posterior(NamedTuple):
@@ -224,7 +220,7 @@ class CausalRewardModel(nn.Module):
         return self.normalise_rewards(rewards) - self.predict_expected(states, actions)
 
     def _disturbance(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """What z adds to the expected reward, in standard deviations of the reward, (...)."""
+        """What z adds to the expected reward, in its standard deviations, (...)."""
         disturbance: Tensor = self.decoder(torch.cat([inputs, z], dim=-1)).squeeze(-1)
         if isinstance(self.expected, EffectsMean):
             # With z at its prior mean, the model predicts exactly E[r | s, a].
@@ -288,23 +284,18 @@ def read_transitions(
     """Single steps of a view with the actions (M, A) that the reward model is fitted to.
 
     Args:
-        item_rewards: what `EffectsMean` is made of; actions are then (M, D + 1): the vectors of
-            the items, then what of their scores does not depend on the state.
+        item_rewards: what `EffectsMean` is made of, which then reads the actions (M, D + 1).
         actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
     """
     transitions = view.transitions(episodes, steps)
-    chosen = None if actions is None else torch.from_numpy(actions)
     if item_rewards is None:
-        if chosen is None:
+        if actions is None:
             return transitions
-        return replace(transitions, actions=view.action_vectors(chosen))
+        return replace(transitions, actions=view.action_vectors(torch.from_numpy(actions)))
     rows = RewardRows.at(view, episodes, steps, item_rewards.reach)
-    items = rows.items if chosen is None else chosen
+    items = rows.items if actions is None else torch.from_numpy(actions)
     fixed = item_rewards.score_without_state(rows.history, rows.users, items)
     return replace(transitions, actions=torch.cat([item_rewards.vectors[items], fixed[:, None]], 1))
-
-
-# The fit.
 
 
 @dataclass(frozen=True)
@@ -532,15 +523,11 @@ def fit_warning(r2_without_z: float) -> str:
 def _warning(report: CRMReport) -> str:
     alone = f"state and action alone predict {report.r2_without_z:.1%} of the reward's variance"
     if report.active_dimensions == 0:
-        return (
-            f"latent collapse: none of {report.latent_dim} latent dimensions is used, so nothing "
-            f"is abduced; {alone}"
-        )
+        unused = f"none of {report.latent_dim} latent dimensions is used"
+        return f"latent collapse: {unused}, so nothing is abduced; {alone}"
     if report.z_share < 0.01:
-        return (
-            f"latent near collapse: z accounts for only {report.z_share:.2%} of the reward's "
-            f"variance, so abduction hardly matters; {alone}"
-        )
+        share = f"z accounts for only {report.z_share:.2%} of the reward's variance"
+        return f"latent near collapse: {share}, so abduction hardly matters; {alone}"
     if report.z_leak > max(_LEAK, 4 / report.validation_transitions**0.5):
         return (
             f"latent leak: z correlates by {report.z_leak:.2f} with what state and action predict, "
@@ -566,9 +553,8 @@ def _sample(transitions: Transitions, limit: int, rng: np.random.Generator) -> T
 
 def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
     """(episodes, steps) of a view: all, or `limit` drawn with replacement if there are more."""
-    if view.n_steps <= limit:
-        return view.all_steps()
-    return view.draw_steps(np.random.default_rng(seed), limit)
+    few = view.n_steps <= limit
+    return view.all_steps() if few else view.draw_steps(np.random.default_rng(seed), limit)
 
 
 def sample_transitions(

@@ -15,6 +15,7 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES
+from ucfrec.episodes.record import LONG
 from ucfrec.episodes.returns import ReturnToGo, returns_to_go
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ITEM_STATES", "EpisodeStore"]
 
-LONG: Final = 100
-"""Times the median from which on a session is hardly a person's."""
 LONGEST_HISTORY: Final = 1000
 """Most recent rows of a user that are read; older ones only count as seen."""
 _STATISTICS_STEPS = 100_000

@@ -154,11 +154,8 @@ class Columns:
     def replace(
         self, name: str, column: StepColumn, size: tuple[int, ...], return_to_go: ReturnToGo | None
     ) -> "Columns":
-        """A copy with another step column of the given size; files stay as they are.
-
-        Args:
-            return_to_go: what the returns-to-go count; None for what they counted before.
-        """
+        """A copy with another step column of the given size; files stay as they are. None for
+        returns-to-go that count what they counted before."""
         sizes = dict(self.record.columns)
         if name in sizes:
             sizes[name] = list(size)
@@ -461,20 +458,12 @@ class EpisodeView:
             yield episodes, np.arange(begin, end) - starts
 
     def column(self, name: str) -> Array:
-        """The values of a step column at `all_steps`, (n_steps,) or (n_steps, size).
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """The values of a step column at `all_steps`, (n_steps,) or (n_steps, size)."""
         parts = [part for (part,) in self.column_batches(name)]
         return np.concatenate(parts) if parts else self.step_values(name, *self.all_steps())
 
     def column_batches(self, *names: str) -> Iterator[tuple[Array, ...]]:
-        """Step columns at `all_steps`, some steps at a time.
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """Step columns at `all_steps`, some steps at a time."""
         if not self.n_steps:
             return
         ends = (self._columns.starts + self._columns.lengths)[self.episode_ids]

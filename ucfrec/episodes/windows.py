@@ -54,15 +54,8 @@ class Windows:
         rewards: Tensor,
         returns_to_go: Tensor | None = None,
     ) -> "Windows":
-        """Windows of the given steps; what they have at padding becomes 0.
-
-        Args:
-            numbers: (B, K) int64 number of each step in its episode; below 0 at padding.
-            states: (B, K, S).
-            actions: (B, K, A) vectors or (B, K) items.
-            rewards: (B, K).
-            returns_to_go: (B, K); None for zeros, where a decision sets them.
-        """
+        """Windows of steps with `numbers` (B, K) int64 in their episodes, below 0 at padding, where
+        all becomes 0. Without returns-to-go, a decision sets them."""
         mask = numbers >= 0
         padding = ~mask
 
@@ -172,14 +165,18 @@ class Exposed:
     """(M,) returns-to-go in units of the policy's return scale."""
 
     @classmethod
-    def before(cls, windows: Windows, lags: int) -> "Exposed":
-        """For every step of B windows of K steps, (B·K, lags) earlier steps of the same window.
+    def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
+        """For every step of B windows of K steps, or those in a mask (B, K), `lags` earlier steps
+        of the same window.
 
         Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
         """
         items = windows.actions.masked_fill(~windows.mask, -1)
-        returns = windows.returns_to_go.flatten()
-        return cls(_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0), returns)
+        parts = [_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0)]
+        parts.append(windows.returns_to_go.flatten())
+        if steps is not None:
+            parts = [part[steps.flatten()] for part in parts]
+        return cls(*parts)
 
     @classmethod
     def before_last(cls, windows: Windows, lags: int) -> "Exposed":
@@ -191,10 +188,6 @@ class Exposed:
             nn.functional.pad(recent.rewards, (0, missing)),
             windows.returns_to_go[:, -1],
         )
-
-    def select(self, rows: Tensor) -> "Exposed":
-        """The steps with the given indices, or where a bool mask of the M steps is true."""
-        return Exposed(self.items[rows], self.rewards[rows], self.returns[rows])
 
 
 def _earlier(values: Tensor, lags: int, padding: int) -> Tensor:
@@ -243,15 +236,12 @@ class Sessions:
         length: int,
         observations: Tensor | None = None,
     ) -> "Sessions":
-        """The sessions with the given N rows.
+        """The sessions with N rows.
 
         Args:
             owner: (N,) session of each row, 0 to B − 1; sorted.
-            items: (N,) items shown, in order.
-            rewards: (N,) their rewards.
-            users: (B,) see above.
+            items, rewards: (N,) what was shown, in order.
             length: L, items of a session that are kept.
-            observations: (B, K, O) see above.
         """
         counts = np.bincount(owner, minlength=len(users))
         # Places from the end: the latest row is the last column.

@@ -36,12 +36,8 @@ class StoreWriter:
     """
 
     def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
-        """
-        Args:
-            shard_steps: a shard ends with the first episode that brings it to this many steps.
-        """
-        self._folder = folder
-        self._shard_steps = shard_steps
+        """A shard ends with the first episode that brings it to `shard_steps` steps."""
+        self._folder, self._shard_steps = folder, shard_steps
         self._hashes: dict[str, Any] = {}
         self._shapes: dict[str, list[int]] = {}
         self._files: dict[str, _NpyFile] = {}
@@ -52,10 +48,7 @@ class StoreWriter:
         self._shards = first_shard
 
     def append(
-        self,
-        steps: Mapping[str, Array],
-        first: BoolArray,
-        episodes: Mapping[str, Array],
+        self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
     ) -> None:
         """Append M steps.
 

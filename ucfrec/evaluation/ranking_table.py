@@ -34,6 +34,8 @@ from ucfrec.evaluation.ranking import (
     rank_steps,
 )
 from ucfrec.policies.baselines import (
+    BoostedConfig,
+    BoostedPolicy,
     ItemKNNConfig,
     ItemKNNPolicy,
     RecentClicksPolicy,
@@ -41,7 +43,6 @@ from ucfrec.policies.baselines import (
     count_decayed,
     shrink_rates,
 )
-from ucfrec.policies.boosted import BoostedConfig, BoostedPolicy
 from ucfrec.processes import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.start import policy_sizes

@@ -15,7 +15,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
-from ucfrec.recommending.histories import Histories
+from ucfrec.logs.histories import Histories
 from ucfrec.recommending.recommend import RANK, recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -19,8 +19,8 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.errors import InputError
 from ucfrec.exploring.explain import PARTS, explain, read_pasted
 from ucfrec.files.record import CARD
+from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
-from ucfrec.recommending.histories import Histories
 from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
 from ucfrec.reporting.page import template, write_report

@@ -66,15 +66,22 @@ def local_paths(options: argparse.Namespace) -> Iterator[argparse.Namespace]:
     """
     values = vars(options)
     lists = [value if isinstance(value, list) else [value] for value in values.values()]
-    uris = [argument for arguments in lists for argument in arguments if _is_remote(argument)]
+    uris = [uri for arguments in lists for uri in arguments if isinstance(uri, Input | Output)]
     if not uris:
         yield options
         return
     with scratch_folder(Path(gettempdir()), "remote") as scratch:
         try:
-            places = {
-                uri: _make_place(uri, scratch / str(n)) for n, uri in enumerate(dict.fromkeys(uris))
-            }
+            places: dict[str, Path] = {}
+            for number, address in enumerate(dict.fromkeys(uris)):
+                folder = scratch / str(number)
+                folder.mkdir()
+                with _errors_of(address):
+                    is_input = isinstance(address, Input)
+                    relative = _fetch(address, folder) if is_input else _require_new(address)
+                # Of a glob, every file has its own address.
+                _origins[str(folder)] = address.rstrip("/").removesuffix(relative).rstrip("/")
+                places[address] = folder / relative
             yield argparse.Namespace(**{name: _local(v, places) for name, v in values.items()})
             for uri, place in places.items():
                 if isinstance(uri, Output) and place.exists():
@@ -85,24 +92,10 @@ def local_paths(options: argparse.Namespace) -> Iterator[argparse.Namespace]:
             _origins.clear()
 
 
-def _make_place(uri: str, folder: Path) -> Path:
-    """Where the copy of an input is, and that of an output will be."""
-    folder.mkdir()
-    with _errors_of(uri):
-        relative = _fetch(uri, folder) if isinstance(uri, Input) else _require_new(uri)
-    # Of a glob, every file has its own address.
-    _origins[str(folder)] = uri.rstrip("/").removesuffix(relative).rstrip("/")
-    return folder / relative
-
-
-def _is_remote(value: object) -> bool:
-    return isinstance(value, Input | Output)
-
-
 def _local(value: Any, places: Mapping[str, Path]) -> Any:
     if isinstance(value, list):
         return [_local(argument, places) for argument in value]
-    return places[value] if _is_remote(value) else value
+    return places[value] if isinstance(value, Input | Output) else value
 
 
 def origin(text: str | Path) -> str:

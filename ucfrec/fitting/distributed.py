@@ -149,19 +149,13 @@ def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:
     distributed.all_gather(sizes, torch.tensor([len(rows)], device=rows.device))
     counts = [int(size) for size in sizes]
     # Messages have to be of one size, that of the largest.
-    all_rows, all_values = (
-        torch.cat(
-            [part[:n] for part, n in zip(_gathered(gradient, max(counts)), counts, strict=True)]
-        )
-        for gradient in (rows, values)
+    joined = []
+    for part in (rows, values):
+        padded = part.new_zeros(max(counts), *part.shape[1:])
+        padded[: len(part)] = part
+        parts = [torch.empty_like(padded) for _ in range(processes())]
+        distributed.all_gather(parts, padded)
+        joined.append(torch.cat([part[:n] for part, n in zip(parts, counts, strict=True)]))
+    return torch.sparse_coo_tensor(
+        joined[0].unsqueeze(0), joined[1], gradient.shape, check_invariants=False
     )
-    shape = gradient.shape
-    return torch.sparse_coo_tensor(all_rows.unsqueeze(0), all_values, shape, check_invariants=False)
-
-
-def _gathered(part: Tensor, length: int) -> list[Tensor]:
-    padded = part.new_zeros(length, *part.shape[1:])
-    padded[: len(part)] = part
-    parts = [torch.empty_like(padded) for _ in range(processes())]
-    distributed.all_gather(parts, padded)
-    return parts

@@ -5,7 +5,6 @@ files, memory and disk is explained here. Of a later log, `settle_mapping` choos
 columns that a run remembers of its training log and the plain ones.
 """
 
-import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -226,6 +225,8 @@ def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping
 
 
 def _missing(table: Table, what: str, name: str) -> InputError:
+    import difflib
+
     folded = {column.casefold(): column for column in table.columns}
     near = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
     hint = ", ".join(folded[column] for column in near)

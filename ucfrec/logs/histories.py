@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 from tempfile import gettempdir
@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 
 from ucfrec import schema
-from ucfrec.arrays import Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import scratch_folder
-from ucfrec.logs.engine import engine, explain_errors, settle_mapping, to_arrow
+from ucfrec.logs.engine import engine, explain_errors, settle_mapping
 from ucfrec.logs.mapping import LogMapping, log_files
 from ucfrec.logs.rows import ITEM, SESSION, USER, SortedRows, sort_rows
 from ucfrec.logs.summary import note_dropped, require_rows
@@ -25,6 +25,7 @@ from ucfrec.logs.typed import LogTables, open_log, open_log_tables
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ucfrec.episodes.item_table import IdLookup
 
 HISTORIES: Final = "histories"
 """Name of a data frame in messages and in the engine."""
@@ -36,6 +37,105 @@ _UNREAD: Final = (
     pa.types.is_union,
 )
 """Types of Arrow that the engine or Parquet lacks."""
+
+
+@dataclass(frozen=True)
+class Histories:
+    """Histories of U users: N rows, sorted by user and then by time."""
+
+    users: Array
+    """(U,) identifiers."""
+    owner: IntArray
+    """(N,) user index of each row, 0 to U − 1; sorted."""
+    item_ids: Array
+    """(N,) identifiers in the logs."""
+    rewards: Float32Array
+    """(N,) in reward units."""
+    timestamps: IntArray
+    """(N,) milliseconds."""
+    session_ids: Array | None
+    """(N,); None if sessions are not split by them."""
+    seen_owner: IntArray
+    """(M,) user index of each entry of `seen_ids`; sorted."""
+    seen_ids: Array
+    """(M,) identifiers of all items that a user has seen, also before the N rows."""
+    observations: Float32Array | None
+    """(U, O) last logged observation; None if the logs have none."""
+
+    @classmethod
+    def joined(cls, parts: Sequence["Histories"]) -> "Histories":
+        """The users of all parts, one part after the other; all have sessions, or none."""
+        if len(parts) == 1:
+            return parts[0]
+        firsts = np.cumsum([0, *(len(part.users) for part in parts[:-1])])
+        columns: dict[str, Array | None] = {}
+        for column in fields(cls):
+            values = [getattr(part, column.name) for part in parts]
+            if column.name in ("owner", "seen_owner"):
+                values = [owners + first for owners, first in zip(values, firsts, strict=True)]
+            columns[column.name] = None if values[0] is None else np.concatenate(values)
+        return Histories(**columns)  # type: ignore[arg-type]
+
+    def with_numbers(self, ids: "IdLookup", filter_seen: bool) -> "Histories":
+        """The same with the numbers of the items in `ids`, −1 for unknown ones, and without
+        `filter_seen` for all that were seen."""
+        seen = ids.numbers(self.seen_ids) if filter_seen else np.full(len(self.seen_ids), -1)
+        return replace(self, item_ids=ids.numbers(self.item_ids), seen_ids=seen)
+
+    def latest_session(self, gap_ms: float | None, new: BoolArray | None = None) -> "Histories":
+        """The same users with only the rows of each user's latest session.
+
+        With `session_ids`, these are the rows with the session id of the user's last row. Without,
+        the session begins after the last pause of more than `gap_ms` milliseconds, or with the
+        user's first row if `gap_ms` is None. That of users who begin a `new` one (U,) has no rows.
+        """
+        if new is not None and new.any():
+            return self.with_rows(~new[self.owner]).latest_session(gap_ms)
+        row = np.arange(len(self.owner))
+        latest = np.zeros(len(self.users), dtype=np.int64)
+        if self.session_ids is not None:
+            # Of repeated indices, the last assignment remains: each user's last row.
+            latest[self.owner] = row
+            return self.with_rows(self.session_ids == self.session_ids[latest[self.owner]])
+        if gap_ms is None:
+            return self
+        begins = np.zeros(len(self.owner), dtype=np.int64)
+        begins[1:] = (np.diff(self.owner) > 0) | (np.diff(self.timestamps) > gap_ms)
+        np.maximum.at(latest, self.owner, row * begins)
+        return self.with_rows(row >= latest[self.owner])
+
+    def of_users(self, numbers: IntArray) -> "Histories":
+        """The users with the given numbers (M,), in that order."""
+        owner, rows = _find_rows(self.owner, numbers)
+        seen_owner, seen = _find_rows(self.seen_owner, numbers)
+        return replace(
+            self.with_rows(rows),
+            users=self.users[numbers],
+            owner=owner,
+            seen_owner=seen_owner,
+            seen_ids=self.seen_ids[seen],
+            observations=None if self.observations is None else self.observations[numbers],
+        )
+
+    def with_rows(self, rows: BoolArray | IntArray) -> "Histories":
+        """The same users with only some rows: their numbers, or (N,) true for them."""
+        return replace(
+            self,
+            owner=self.owner[rows],
+            item_ids=self.item_ids[rows],
+            rewards=self.rewards[rows],
+            timestamps=self.timestamps[rows],
+            session_ids=None if self.session_ids is None else self.session_ids[rows],
+        )
+
+
+def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
+    """Of the rows of the users `numbers` (M,), user by user: the place of the user among the M, and
+    the index in `owner`, which is sorted."""
+    starts, ends = (np.searchsorted(owner, numbers, side=side) for side in ("left", "right"))
+    lengths = ends - starts
+    place = np.repeat(np.arange(len(numbers)), lengths)
+    return place, np.arange(len(place)) + (ends - np.cumsum(lengths))[place]
 
 
 @dataclass(frozen=True)
@@ -59,19 +159,16 @@ def read_histories(
     memory_limit: str = "2GB",
     session_by: str = "user",
     duplicates: str = "highest",
-) -> Iterator[pa.RecordBatch]:
+) -> Iterator[Histories]:
     """Read the history of each user of a log, cleaned as `prepare` cleans it, with a warning.
 
     Args:
         last: most rows of each user, the most recent ones.
         memory_limit: as of `PrepareOptions`, and so is `duplicates`.
-        session_by: with "session_id", batches have the column `session_ids`.
+        session_by: with "session_id", batches have `session_ids`, equal where the session is.
 
     Yields:
-        Batches of users in sorted order: `user_id`; `item_ids`, `rewards` (float32), `timestamps`
-        (ms) and perhaps `session_ids`, equal where the session is, lists of at most `last` with the
-        most recent last; `seen`, all item ids of the user, sorted; and, if the log has it, the most
-        recent `observation`.
+        Batches of users in sorted order.
 
     Raises:
         InputError: the input cannot be used.
@@ -92,7 +189,7 @@ def frame_histories(
     last: int,
     session_by: str = "user",
     duplicates: str = "highest",
-) -> Iterator[pa.RecordBatch]:
+) -> Iterator[Histories]:
     """`read_histories` of a log in memory, without using the disk; InputError as of `log_table`,
     too."""
     columns = log_table(frame, HISTORIES)
@@ -127,45 +224,40 @@ def log_table(frame: "pd.DataFrame", name: str) -> pa.Table:
         )
     columns = {}
     for column in frame.columns:
-        try:
-            columns[str(column)] = _convert_column(frame[column])
-        except _UnusableError as error:
-            if column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
-                raise InputError(f"{name}: {column} {error}") from None
-            warn_user(f"{name}: column {column} is left out: it {error}")
+        array = _convert_column(frame[column])
+        if not isinstance(array, str):
+            columns[str(column)] = array
+        elif column in (schema.USER_ID, schema.ITEM_ID, schema.TIMESTAMP):
+            raise InputError(f"{name}: {column} {array}")
+        else:
+            warn_user(f"{name}: column {column} is left out: it {array}")
     return pa.table(columns)
 
 
-class _UnusableError(Exception):
-    """A column cannot be read; the message says why, and what to do."""
-
-
-def _convert_column(values: "pd.Series[Any]") -> pa.Array:
-    """A column of a data frame, or _UnusableError."""
+def _convert_column(values: "pd.Series[Any]") -> pa.Array | str:
+    """A column of a data frame, or why it cannot be read and what to do."""
     import pandas as pd
 
     if isinstance(values.dtype, pd.PeriodDtype):
-        raise _UnusableError("holds periods; convert them with .dt.to_timestamp()")
+        return "holds periods; convert them with .dt.to_timestamp()"
     try:
         array = pa.Array.from_pandas(values)
     except OverflowError:
-        raise _UnusableError(
-            "holds whole numbers of more than 64 bits; convert them with .astype(str)"
-        ) from None
+        return "holds whole numbers of more than 64 bits; convert them with .astype(str)"
     except (TypeError, ValueError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
-        raise _UnusableError(f"holds values of several types ({reason}); make them one") from None
+        return f"holds values of several types ({reason}); make them one"
     if pa.types.is_duration(array.type):
-        raise _UnusableError("holds durations; convert them with .dt.total_seconds()")
+        return "holds durations; convert them with .dt.total_seconds()"
     dates = values.dtype == object and pa.types.is_date(array.type)
     if dates and any(isinstance(value, datetime) for value in values):
         # Arrow would cut off the time of day.
-        raise _UnusableError("holds dates and times; convert them with pandas.to_datetime")
+        return "holds dates and times; convert them with pandas.to_datetime"
     if pa.types.is_float16(array.type):
         return array.cast(pa.float32())
     for kind in _list_types(array.type):
         if any(is_kind(kind) for is_kind in _UNREAD) or kind == pa.struct([]):
-            raise _UnusableError(f"is of type {kind}, which is not read; convert it")
+            return f"is of type {kind}, which is not read; convert it"
     return array
 
 
@@ -180,7 +272,7 @@ def _list_types(kind: pa.DataType) -> Iterator[pa.DataType]:
 
 def _read_users(
     tables: LogTables, last: int, duplicates: str, folder: Path | None
-) -> Iterator[pa.RecordBatch]:
+) -> Iterator[Histories]:
     """The users of a log, some thousand rows at a time; `folder` for scratch, None for memory."""
     log = open_log(tables, folder or Path(HISTORIES))
     log.require_items()
@@ -189,49 +281,39 @@ def _read_users(
         require_rows(log, rows.count, rows.dropped)
         note_dropped(log.name, rows.dropped, rows.read)
         query = f"SELECT {schema.ITEM_ID} FROM item_codes ORDER BY code"
-        items = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+        items = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
         for batch in rows.file.read():
             yield _gather_histories(rows, batch, items, last)
 
 
 def _gather_histories(
-    sorted_rows: SortedRows, rows: dict[str, Array], items: pa.Array, last: int
-) -> pa.RecordBatch:
+    sorted_rows: SortedRows, rows: dict[str, Array], items: Array, last: int
+) -> Histories:
     """The users of rows, which are all theirs."""
     log, codes = sorted_rows.log, rows[USER]
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
     ends = np.append(first[1:], len(codes))
-    recent = np.repeat(ends, ends - first) - np.arange(len(codes)) <= last
-    offsets = np.append(0, np.cumsum(recent)[ends - 1])
+    owner = np.repeat(np.arange(len(first)), ends - first)
+    recent = ends[owner] - np.arange(len(codes)) <= last
     query = (
         f"SELECT {schema.USER_ID} FROM user_codes WHERE code BETWEEN {codes[0]} AND {codes[-1]} "
         "ORDER BY code"
     )
-    users = log.connection.sql(query).to_arrow_table().column(0).combine_chunks()
+    users = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
     # Codes of items are in the order of their ids.
-    owner = np.repeat(np.arange(len(first)), ends - first)
-    seen = np.unique(owner * len(items) + rows[ITEM])
-    bounds = np.searchsorted(seen, np.arange(len(first) + 1) * len(items))
-    columns = {
-        schema.USER_ID: users.take(to_arrow(codes[first].astype(np.int64) - codes[0])),
-        "item_ids": _make_lists(offsets, items.take(to_arrow(rows[ITEM][recent]))),
-        "rewards": _make_lists(offsets, _make_floats(rows[schema.REWARD][recent])),
-        "timestamps": _make_lists(offsets, to_arrow(rows[schema.TIMESTAMP][recent])),
-        "seen": _make_lists(bounds, items.take(to_arrow(seen % len(items)))),
-    }
-    if log.session_by == schema.SESSION_ID:
-        columns["session_ids"] = _make_lists(offsets, to_arrow(rows[SESSION][recent]))
+    seen_owner, seen = np.divmod(np.unique(owner * len(items) + rows[ITEM]), len(items))
+    sessions = rows[SESSION][recent] if log.session_by == schema.SESSION_ID else None
+    observations = None
     if sorted_rows.observations is not None:
-        observations = sorted_rows.observations.of_rows(rows["row"][ends - 1])
-        bounds = np.arange(len(first) + 1) * observations.shape[1]
-        columns[schema.OBSERVATION] = _make_lists(bounds, _make_floats(observations.ravel()))
-    return pa.record_batch(columns)
-
-
-def _make_lists(offsets: IntArray, values: pa.Array) -> pa.ListArray:
-    return pa.ListArray.from_arrays(to_arrow(offsets).cast(pa.int32()), values)
-
-
-def _make_floats(values: Array) -> pa.Array:
-    buffer = pa.py_buffer(np.ascontiguousarray(values, dtype=np.float32))
-    return pa.Array.from_buffers(pa.float32(), len(values), [None, buffer])
+        observations = sorted_rows.observations.of_rows(rows["row"][ends - 1]).astype(np.float32)
+    return Histories(
+        users=users[codes[first].astype(np.int64) - codes[0]],
+        owner=owner[recent],
+        item_ids=items[rows[ITEM][recent]],
+        rewards=rows[schema.REWARD][recent].astype(np.float32),
+        timestamps=rows[schema.TIMESTAMP][recent].astype(np.int64),
+        session_ids=sessions,
+        seen_owner=seen_owner,
+        seen_ids=items[seen],
+        observations=observations,
+    )

@@ -133,7 +133,12 @@ def join_feedback(
                 "QUALIFY row_number() OVER (PARTITION BY f.row ORDER BY e.row DESC) = 1"
             )
             _write(connection, columns, further, out)
-            joined = _count(connection, columns)
+            ((shown, written, rows, matched, with_feedback),) = connection.sql(
+                "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
+                "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
+            ).fetchall()
+            counts = shown, written - shown, with_feedback, matched, rows - matched
+            joined = Joined(*counts, columns)
             if not joined.matched:
                 warn_user(_why_unmatched(connection, joined))
             return joined
@@ -363,14 +368,6 @@ def _write(
         with pq.ParquetWriter(scratch, batches.schema) as writer:
             for batch in batches:
                 writer.write_batch(batch)
-
-
-def _count(connection: duckdb.DuckDBPyConnection, columns: tuple[str, ...]) -> Joined:
-    ((exposures, written, rows, matched, with_feedback),) = connection.sql(
-        "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
-        "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
-    ).fetchall()
-    return Joined(exposures, written - exposures, with_feedback, matched, rows - matched, columns)
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:

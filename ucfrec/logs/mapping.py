@@ -2,8 +2,6 @@
 
 import glob
 import hashlib
-import tarfile
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -45,9 +43,6 @@ class FeatureTable:
     The type of a column decides how it is encoded: numbers are standardised, dates count as days,
     text and booleans are categories, lists of text or integers are tags, lists of floats are
     vectors. A cast turns a number into a category: `music_type::VARCHAR`.
-
-    Raises:
-        InputError: `files` or `columns` is one name instead of several.
     """
 
     files: tuple[str | Path, ...]
@@ -70,10 +65,7 @@ class LogMapping:
     """Which columns of the files are the log columns, the reward and the features.
 
     Example: `LogMapping({"item_id": "video_id", "timestamp": "time_s * 1000"}, reward="is_click")`.
-
-    Raises:
-        InputError: `columns` names no log column, `session_by` is none of `SESSIONS`, or features
-            are no `FeatureTable`.
+    Raises InputError if a value is none.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -218,19 +210,13 @@ def read_mapping(path: Path) -> LogMapping:
     Paths of feature files are relative to its folder::
 
         reward = "is_click"
-        session_by = "gap"
-
-        [columns]
-        user_id = "uid"
-        timestamp = "seconds * 1000"
-
+        columns = { user_id = "uid", timestamp = "seconds * 1000" }
         [[item_features]]
         files = ["items.csv"]
         key = "iid"
         columns = ["ln(1 + price)", "string_split(tags, '|')"]
 
-    Raises:
-        InputError: the file is missing, is not TOML, or has an unknown field.
+    Raises InputError if the file is missing, is not TOML, or has an unknown field.
     """
     values, origin = read_toml(path), str(path)
     _require_keys(origin, values, LogMapping)
@@ -363,6 +349,9 @@ def find_release(datasets: Mapping[str, Dataset], name: str) -> str:
 
 def _unpack(name: str, release: Release, folder: Path) -> Path:
     """The folder with the files of a release."""
+    import tarfile  # with zipfile, only for this
+    import zipfile
+
     target = folder / name
     if target.is_dir():
         return target

@@ -38,11 +38,7 @@ from ucfrec.settings import Count, Width, require, settings_table
 
 @settings_table("")
 class PrepareOptions:
-    """How `prepare` turns logs into episodes.
-
-    Raises:
-        InputError: a value is out of range.
-    """
+    """How `prepare` turns logs into episodes."""
 
     reward: InstanceOf[str] | None = None
     """Scalar SQL expression over the files' columns; None for that of the mapping, else the column
@@ -96,14 +92,8 @@ class PrepareOptions:
 
 
 def parse_split(text: str) -> tuple[float, ...]:
-    """Read a split: "0.8,0.1,0.1", or two times "2022-04-28,2022-04-29T12:00" (UTC by default).
-
-    Returns:
-        Three shares, or two times in ms, as in `PrepareOptions.split`.
-
-    Raises:
-        InputError: `text` is neither.
-    """
+    """Read `PrepareOptions.split`: "0.8,0.1,0.1", or two times "2022-04-28,2022-04-29T12:00" (UTC
+    by default). Raises InputError if it is neither."""
     parts = text.split(",")
     try:
         if len(parts) == 3:
@@ -189,10 +179,7 @@ def prepare(
 def validate(
     paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
-    """Check the logs as `prepare` does, without writing a store.
-
-    Returns:
-        The report that `prepare` would return.
+    """Check the logs as `prepare` does, without writing a store; returns its report.
 
     Raises:
         InputError: the input cannot be used.

@@ -11,7 +11,7 @@ import numpy as np
 
 from ucfrec import schema
 from ucfrec.arrays import Array, IntArray
-from ucfrec.episodes.store import LONG
+from ucfrec.episodes.record import LONG
 from ucfrec.errors import InputError, one_line, warn_user
 from ucfrec.files.remote import origin
 from ucfrec.logs.engine import bind

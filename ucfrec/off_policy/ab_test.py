@@ -101,13 +101,9 @@ def always_valid(difference: float, variance: float, expected: float) -> tuple[f
 
     The mixture sequential probability ratio test for normal estimates, inverted (Johari, Koomen,
     Pekelis & Walsh, Always valid inference, Operations Research 2022): the difference is mixed over
-    N(0, expected²). With an estimated variance it holds asymptotically (Waudby-Smith, Arbour,
-    Sinha, Kennedy & Ramdas, Annals of Statistics 2024).
-
-    Args:
-        variance: of the estimate so far, above 0.
-        expected: standard deviation τ of the mixture, fixed beforehand: near the differences that
-            matter, the interval is shortest.
+    N(0, expected²), fixed beforehand; near the differences that matter, the interval is shortest.
+    With an estimated variance, above 0, it holds asymptotically (Waudby-Smith, Arbour, Sinha,
+    Kennedy & Ramdas, Annals of Statistics 2024).
     """
     mixed = variance + expected**2
     inside = math.log(mixed / variance) - 2 * math.log(1 - LEVEL)
@@ -123,6 +119,7 @@ def compare_arms(
     memory_limit: str = "2GB",
 ) -> Comparison:
     """Compare two arms in logs of `ucfrec join`. Users are drawn into arms, so they are clusters.
+    Rows without a value are left out, with an `InputNote`.
 
     Args:
         arms: names of the first arm and the other; None for the two that there are, the one with
@@ -225,16 +222,13 @@ def _sum_by_user(files: Sequence[Path], column: str, memory_limit: str) -> dict[
             for table in tables
         )
         with explain_errors(connection, tables, folder):
-            connection.execute(
-                "CREATE TABLE groups AS SELECT who, arm, coalesce(sum(value), 0) AS value, "
+            groups: dict[str, Any] = connection.execute(
+                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM ("
+                "SELECT who, arm, coalesce(sum(value), 0) AS value, "
                 "count(value) AS shown, count(*) AS rows, "
                 f"count(*) FILTER (abs(value) > {_LARGEST}) AS beyond, "
                 "count(arm) OVER (PARTITION BY who) AS arms, "
                 "coalesce(arm = max(arm) OVER (PARTITION BY who), false) AS last "
-                f"FROM ({rows}) GROUP BY who, arm"
-            )
-            groups: dict[str, Any] = connection.sql(
-                "SELECT * REPLACE (who IS NOT NULL AS who, coalesce(arm, '') AS arm) FROM groups "
-                "ORDER BY groups.arm, groups.who"
+                f"FROM ({rows}) GROUP BY who, arm) AS groups ORDER BY groups.arm, groups.who"
             ).fetchnumpy()
     return groups | {schema.ARM: np.asarray(groups[schema.ARM], dtype=str)}

@@ -260,9 +260,9 @@ class StepSums:
         totals, rewarded = np.zeros((2, max(len(self.totals), len(other.totals))))
         for sums in (self, other):
             # Sessions that have ended keep the weight of their last step, and have no reward.
-            lacking = 0, len(totals) - len(sums.totals)
-            totals += np.pad(sums.totals, lacking, "edge")
-            rewarded += np.pad(sums.rewarded, lacking)
+            padding = 0, len(totals) - len(sums.totals)
+            totals += np.pad(sums.totals, padding, "edge")
+            rewarded += np.pad(sums.rewarded, padding)
         return StepSums(self.sessions + other.sessions, totals, rewarded)
 
 

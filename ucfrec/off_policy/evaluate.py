@@ -364,11 +364,11 @@ def _doubt_logs(evidence: Evidence, logged: LoggedSessions, pages: bool) -> None
         )
     if without_reward := dropped.get("reward_not_finite", 0):
         rows = logged.store.n_steps + without_reward
-        text = f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
-        if without_reward > MOST_LEFT_OUT * rows:
-            evidence.forbidden.append(f"{text}, and may differ from the rest")
-        else:
-            evidence.remarks.append(text)
+        much = without_reward > MOST_LEFT_OUT * rows
+        (evidence.forbidden if much else evidence.remarks).append(
+            f"{without_reward:,} of {rows:,} rows have no finite reward: they are left out"
+            + ", and may differ from the rest" * much
+        )
     if pages and (repeated := dropped.get("duplicate", 0)):
         evidence.remarks.append(
             f"{repeated:,} rows repeat the user, item and time of another and are left out: if a "

@@ -490,19 +490,18 @@ def _add_up(
     last: BoolArray,
     update: Callable[[int], object],
 ) -> _Sums:
-    begin, sums = 0, None
-    held: Float32Array | None = None
+    begin, sums, held = 0, None, np.empty((0, 0), dtype=np.float32)
     for features, at_policy in chunks():
         rows, width = features.shape
         if sums is None:
             count = int(folds.max()) + 1
             gram, follows = np.zeros((2, count, width, width))
             sums = _Sums(gram, follows, np.zeros((count, width)), np.bincount(folds))
+            held = features[:0]
         end = begin + rows
         # The last step of the chunk before is followed by the first of this one.
-        earlier = features[:-1] if held is None else np.vstack([held, features[:-1]])
-        later = at_policy[1:] if held is None else at_policy
-        start = begin if held is None else begin - 1
+        earlier, start = np.vstack([held, features[:-1]]), begin - len(held)
+        later = at_policy[1 - len(held) :]
         for fold in range(len(sums.rows)):
             inside = folds[begin:end] == fold
             part = features[inside]

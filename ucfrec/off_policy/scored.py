@@ -23,7 +23,6 @@ from ucfrec.errors import InputError, one_line
 from ucfrec.files.atomic import atomic_file, atomic_folder
 from ucfrec.files.parquet import part_name, require_regular, write_frames
 from ucfrec.logs.mapping import LogMapping
-from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.off_policy.estimators import StepSums, normalise_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, Evidence, OffPolicyReport, make_report
 from ucfrec.off_policy.logged_steps import LoggedSteps
@@ -246,6 +245,8 @@ def score_with_spark(
         InputError: the policy's actions are vectors, the logs cannot be used, or Spark is missing
             or fails.
     """
+    from ucfrec.logs.spark import UserLog, map_users
+
     require_items(trained)
     columns, options = training_options(trained, mapping)
     assert options.reward is not None

@@ -125,12 +125,8 @@ class SequencePolicy(nn.Module, ABC):
         cls, train: EpisodeStore, config: PolicyConfig, folder: Path, seed: int
     ) -> EpisodeStore:
         """The episodes to train on, derived from the training episodes; by default the share
-        `best_share` of them with the highest returns.
-
-        Args:
-            train: the training episodes.
-            folder: keeps intermediate results, so that a resumed run reuses them.
-        """
+        `best_share` of them with the highest returns. The folder keeps intermediate results of a
+        resumed run."""
         if config.best_share == 1:
             return train
         count = int(np.ceil(config.best_share * train.n_episodes))
@@ -143,12 +139,8 @@ class SequencePolicy(nn.Module, ABC):
     def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
-        """What fits the policy without the training loop; None if gradients have to.
-
-        Args:
-            train: the training episodes, without augmented episodes.
-            validation: held-out episodes; None in a refit, which keeps what was `chosen` on them.
-        """
+        """What fits the policy without the training loop; None if gradients have to. Validation
+        episodes are None in a refit, which keeps what was `chosen` on them."""
         return None
 
     @abstractmethod
@@ -171,28 +163,22 @@ class SequencePolicy(nn.Module, ABC):
     def normalize(self, windows: Windows) -> Windows:
         """Standardised states, and returns-to-go divided by `return_scale`.
 
-        Returns-to-go are first raised to the lowest value in the training data: after a session has
-        reached its target return, they would otherwise leave the range of the training data.
+        These are first raised to the lowest of the training data, whose range they would otherwise
+        leave after a session has reached its target return.
         """
         states = standardise(windows.states, self.state_mean, self.state_std)
         returns_to_go = windows.returns_to_go.clamp(min=self.lowest_return_to_go)
         return replace(windows, states=states, returns_to_go=returns_to_go / self.return_scale)
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean action loss over all steps of the windows, and scalars to log (Algorithm 6).
-
-        In nats for items; for vectors, the squared error relative to the action's range.
-        """
+        """Mean action loss over all steps of the windows, and scalars to log (Algorithm 6): nats
+        for items; for vectors, the squared error relative to the action's range."""
         normalized = self.normalize(windows)
         return self.imitation(self.features(normalized), normalized)
 
     def imitation(self, features: Tensor, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Action loss over all steps, plus the loss of the state values if there are any.
-
-        Args:
-            features: (B, K, d) of the windows.
-            windows: normalised.
-        """
+        """Action loss over all steps of normalised windows with features (B, K, d), plus the loss
+        of the state values if there are any."""
         padded = some_padding(windows.mask)
         exposed = self.exposed(windows, padded)
 
@@ -229,11 +215,8 @@ class SequencePolicy(nn.Module, ABC):
         return self.head.predict(features, exposed), features  # type: ignore[arg-type]
 
     def max_return(self, windows: Windows) -> Tensor:
-        """The largest return-to-go to expect at the last step, (B,) in reward units.
-
-        Raises:
-            InputError: the policy was trained without `policy.max_return`.
-        """
+        """The largest return-to-go to expect at the last step, (B,) in reward units; an InputError
+        if the policy was trained without `policy.max_return`."""
         if self.values is None:
             raise InputError(
                 "the policy does not know its largest return; train it with "
@@ -248,8 +231,7 @@ class SequencePolicy(nn.Module, ABC):
         without `policy.exposure`."""
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
             return None
-        exposed = Exposed.before(windows, self.head.exposure.lags)
-        return exposed if steps is None else exposed.select(steps.flatten())
+        return Exposed.before(windows, self.head.exposure.lags, steps)
 
     def _exposed_last(self, windows: Windows) -> Exposed | None:
         if not isinstance(self.head, ItemHead) or self.head.exposure is None:
@@ -263,11 +245,7 @@ def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
 
 def require_items(name: str, sizes: Mapping[str, int]) -> None:
-    """Check that actions are items.
-
-    Raises:
-        InputError: they are vectors.
-    """
+    """Refuse a store whose actions are vectors."""
     if not sizes["items"]:
         raise InputError(
             f"{name} recommends items; this store's actions are vectors; use another policy"
@@ -275,11 +253,7 @@ def require_items(name: str, sizes: Mapping[str, int]) -> None:
 
 
 def require_heads(config: PolicyConfig, heads: int) -> None:
-    """Check that the number of attention heads divides the model's width.
-
-    Raises:
-        SettingError: it does not.
-    """
+    """Refuse a number of attention heads that does not divide the model's width."""
     require(
         config.dim % heads == 0,
         f"policy.heads is {heads}; it must divide policy.dim, which is {config.dim}",
@@ -289,10 +263,7 @@ def require_heads(config: PolicyConfig, heads: int) -> None:
 
 
 def some_padding(mask: Tensor) -> Tensor | None:
-    """The mask (B, K) of steps that are no padding; None on a CPU if there is no padding at all.
-
-    A graph that is exported holds for every padding.
-    """
+    """The mask (B, K) of steps that are no padding; None on a CPU, but for exports, if all are."""
     on_cpu = mask.device.type == "cpu" and not torch.compiler.is_compiling()
     return None if on_cpu and bool(mask.all()) else mask
 
@@ -319,15 +290,8 @@ def init_linear(module: nn.Module) -> None:
 
 
 def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
-    """Outputs (B, K, d) of a network for left-padded inputs, whatever the padding before a session.
-
-    The network runs with the padding moved behind the steps.
-
-    Args:
-        network: with `batch_first=True`.
-        inputs: (B, K, c).
-        mask: (B, K) bool, false at padding.
-    """
+    """Outputs (B, K, d) of a network with `batch_first` for left-padded inputs (B, K, c), whatever
+    the padding before a session: it runs behind the steps. The mask (B, K) is false at padding."""
     length = mask.shape[1]
     padding = (~mask).sum(1, keepdim=True)
     places = torch.arange(length, device=mask.device)

@@ -51,9 +51,7 @@ class DTConfig(PolicyConfig):
 
 class DTPolicy(SequencePolicy):
     """GPT-2 blocks without positional embedding over R_0, s_0, a_0, R_1, …; s_t predicts a_t.
-
-    The weights are those of the official code without its unused prediction heads and word table.
-    """
+    Weights are those of the official code without its unused prediction heads and word table."""
 
     Config = DTConfig
     config: DTConfig
@@ -148,12 +146,8 @@ def pass_rows(blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, visible: Tensor, dropout: float) -> Tensor:
-    """Scaled dot-product attention (B, H, L, c) of query, key and value of this shape.
-
-    Args:
-        visible: (B, 1, L, L) bool, true where a row may attend to a column; somewhere in each row.
-        dropout: share of the attention weights that is dropped, as by `Dropout`.
-    """
+    """Scaled dot-product attention (B, H, L, c) of query, key and value of this shape, where a mask
+    (B, 1, L, L), true somewhere in each row, is true; drops weights as `Dropout`."""
     if dropout == 0 or query.device.type != "cpu":
         return F.scaled_dot_product_attention(query, key, value, visible, dropout)
     scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
@@ -289,12 +283,8 @@ class DT4RecPolicy(DTPolicy):
     def contrastive_loss(
         self, windows: Windows, encoded: tuple[Tensor, Tensor], features: Tensor
     ) -> Tensor:
-        """InfoNCE (nats) of the logged return against those of other windows, mean over all steps.
-
-        Args:
-            windows: B normalised windows, with their `features` (B, K, d).
-            encoded: their tokens s_t and a_t, (B, K, d) each, which returns do not change.
-        """
+        """InfoNCE (nats) of the logged return against those of other windows, mean over all steps
+        of normalised windows with `features` (B, K, d) and `encoded` tokens s_t and a_t."""
         config, mask = self.config, windows.mask
         actions = self.head.embed(windows.actions)[mask]
         scores = [F.cosine_similarity(features[mask], actions, dim=-1)]

@@ -39,10 +39,8 @@ _TARGET_RATE = 0.01
 
 
 class ConservativeQ(nn.Module):
-    """Q(s, a) of states and action vectors (embeddings, for items), and its target network.
-
-    Values are in units of the largest absolute training return, without discount.
-    """
+    """Q(s, a) of states and action vectors (embeddings, for items), and its target network; in
+    units of the largest absolute training return, without discount."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -103,10 +101,7 @@ class ConservativeQ(nn.Module):
         return (values.softmax(-1) * values).sum(-1)
 
     def loss(self, batch: Transitions) -> tuple[Tensor, dict[str, Tensor]]:
-        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD², and scalars to log.
-
-        Also moves the target network.
-        """
+        """α (logsumexp_a Q(s, a) − Q(s, a_data)) + ½ TD², and scalars; moves the target network."""
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
                 slow.lerp_(fast, _TARGET_RATE)
@@ -124,14 +119,11 @@ class ConservativeQ(nn.Module):
 def relabel(
     store: EpisodeStore, steps: int, weight: float, folder: Path, seed: int
 ) -> EpisodeStore:
-    """The store with returns-to-go raised by CQL's state values (EDT4Rec).
+    """The store, without augmented episodes, with returns-to-go raised by CQL's state values
+    (EDT4Rec).
 
-    Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)).
-
-    Args:
-        store: training episodes without augmented episodes.
-        steps: updates of the Q function, which the folder keeps; training resumes from it.
-        weight: α of the conservative term.
+    Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)). The folder keeps the Q
+    function, trained for `steps` updates with the weight α of the conservative term.
     """
     torch.manual_seed(seed)
     network = ConservativeQ(store, weight)
@@ -165,18 +157,11 @@ def optimistic_returns(
     values: Float64Array,
     lengths: IntArray,
 ) -> Float32Array:
-    """R_t = r_t + max(R_{t+1}, V_{t+1}) within each episode, R = V = 0 after its end.
+    """R_t = r_t + max(R_{t+1}, V_{t+1}) (N,) within each episode, R = V = 0 after its end, from
+    rewards (N,) and values (N,) before each step of episodes of some lengths (E,).
 
     With C_t the sum of rewards before t, R_t + C_t is the maximum of V_k + C_k over k > t (V = 0
     after the last step): a running maximum from the end, computed for all episodes at once.
-
-    Args:
-        rewards: (N,) of all episodes, concatenated.
-        values: (N,) V of the state before each step, in reward units.
-        lengths: (E,) steps per episode.
-
-    Returns:
-        (N,) returns-to-go, in reward units.
     """
     ends = np.cumsum(lengths)
     owner = np.repeat(np.arange(len(lengths)), lengths)
@@ -303,11 +288,8 @@ class GaussianHead(VectorHead):
 
 
 def _consistent(windows: Windows) -> Windows:
-    """The windows with returns-to-go that decrease by each step's reward to the last step's value.
-
-    Relabelled returns-to-go of adjacent steps need not differ by the reward between them; those
-    used in acting always do.
-    """
+    """The windows with returns-to-go that decrease by each step's reward to the last step's value,
+    as in acting; relabelled ones of adjacent steps need not."""
     rewards = windows.rewards[:, :-1].flip(1).cumsum(1).flip(1)  # r_t + … + r_{last − 1}
     last = windows.returns_to_go[:, -1:]
     returns = torch.cat([last + rewards, last], dim=1).masked_fill(~windows.mask, 0.0)

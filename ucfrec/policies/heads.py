@@ -29,9 +29,8 @@ class Candidates:
     items: Tensor
     """(L,) int64, ascending, each once."""
     log_weights: Tensor
-    """(L,) log of an item's draws over their expected number.
-
-    Σ exp(log_weight + x) over the candidates has the expectation Σ exp(x) over all items."""
+    """(L,) log of draws over their expected number: Σ exp(log_weight + x) expects Σ exp(x) of
+    all."""
 
 
 class Proposal:
@@ -164,22 +163,16 @@ class ItemHead(nn.Module):
         return super().train(mode)
 
     def embed(self, items: Tensor) -> Tensor:
-        """Vectors (..., d) of int64 items (...); in evaluation mode without gradients, those kept.
-
-        A graph that is exported computes those of its items.
-        """
+        """Vectors (..., d) of int64 items (...); in evaluation mode without gradients, those kept,
+        but for exported graphs."""
         if self.training or torch.is_grad_enabled() or torch.compiler.is_compiling():
             self._kept = None
             return self.vectors(items)
         return F.embedding(items, self.all_vectors())
 
     def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
-        """Logits over all items (..., n_items) from features (..., d).
-
-        Args:
-            features: (M, d) with `exposed`.
-            exposed: what was shown before the M steps; needed with an exposure term.
-        """
+        """Logits over all items (..., n_items) from features (..., d), or (M, d) with what was
+        shown before the M steps, which an exposure term needs."""
         return self._logits(features, self.all_vectors(), self.bias, None, exposed)
 
     def predict_items(
@@ -272,11 +265,8 @@ Head = VectorHead | ItemHead
 
 
 def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 0) -> Head:
-    """The head for a store's actions: items if `sizes["items"]` is above 0, otherwise vectors.
-
-    Args:
-        lags: earlier steps that an exposure term of items reads; 0 for no such term.
-    """
+    """The head for a store's actions, items if `sizes["items"]` is above 0, with an exposure term
+    of `lags` earlier steps unless these are 0."""
     if not sizes["items"]:
         return VectorHead(dim, sizes["action"])
     exposure = None
@@ -328,11 +318,8 @@ def _take_steps(values: Tensor, steps: Tensor) -> Tensor:
 
 
 def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
-    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation.
-
-    From values (M, 2) of `ValueHead` and returns-to-go (M,); without gradient, with mean 1 over the
-    steps of all processes.
-    """
+    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation, from
+    values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over all processes."""
     advantage = (returns - values[:, 0]).detach()
     deviation = joint_moments(advantage)[1]
     weights = (advantage / deviation.clamp(min=1e-6)).clamp(_CLIP[0], _CLIP[1]).exp()

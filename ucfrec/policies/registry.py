@@ -35,7 +35,7 @@ BUILT_IN: Final = {
     "recent-clicks": "baselines:RecentClicksPolicy",
     "recent-rate": "baselines:RecentRatePolicy",
     "bpr": "baselines:BPRPolicy",
-    "boosted": "boosted:BoostedPolicy",
+    "boosted": "baselines:BoostedPolicy",
     "item-knn": "baselines:ItemKNNPolicy",
     "crm-greedy": "crm_greedy:CRMGreedyPolicy",
 }
@@ -79,11 +79,7 @@ def policy_class(name: str) -> "type[SequencePolicy]":
 
 
 def policy_package(name: str) -> str:
-    """Name of the distribution that the policy `name` is installed from; empty if it is built in.
-
-    Raises:
-        InputError: no policy has this name, or several that differ.
-    """
+    """Name of the distribution that the policy `name` is installed from; empty if built in."""
     return "" if name in BUILT_IN else plugin_package("policies", name)
 
 

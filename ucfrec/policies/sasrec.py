@@ -27,11 +27,8 @@ class SASRecConfig(DTConfig):
 
 
 class SASRecPolicy(SequencePolicy):
-    """Causal self-attention over a_0, …, a_{t−1}; states, rewards and returns are not used.
-
-    Positions are steps of the episode. The loss is the action head's softmax over all items, or a
-    sampled one; the paper's loss contrasts the item with a single random item.
-    """
+    """Causal self-attention over a_0, …, a_{t−1}; states, rewards and returns are not used. The
+    loss is the action head's softmax; the paper's contrasts the item with a single random item."""
 
     Config = SASRecConfig
     config: SASRecConfig

@@ -172,12 +172,9 @@ class UCFPolicy(SequencePolicy):
 
 
 class UCFPaperPolicy(UCFPolicy):
-    """UCF as read in the paper, without what later measurements added.
-
-    Augmented states, λ 0.1, a plain CVAE as reward model at Table 4's rate and passes, the paper's
-    generator, the return of the whole rest, and the most probable action at the largest training
-    return.
-    """
+    """UCF as read in the paper, without what later measurements added: augmented states, λ 0.1, a
+    plain CVAE as reward model at Table 4's rate and passes, the paper's generator, the return of
+    the whole rest, and the most probable action at the largest training return."""
 
     Config = UCFPaperConfig
     augmented = True
@@ -204,15 +201,9 @@ class SupervisedAttention(nn.Module):
         self.dropout = Dropout(config.dropout)
 
     def forward(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d), R_0, s_0, a_0, R_1, …
-
-        Args:
-            visible: (B, Q, 3K) bool, true where a state may attend to a token; somewhere in a row.
-
-        Returns:
-            Output (B, Q, d), without dropout of its own, and probabilities (B, H, Q, 3K) before
-            dropout, which sum to one in each row.
-        """
+        """Attend from `states` (B, Q, d) to `tokens` (B, 3K, d), R_0, s_0, a_0, R_1, …, that are
+        `visible` (B, Q, 3K), at least one in a row: output (B, Q, d) without dropout of its own,
+        and probabilities (B, H, Q, 3K) before dropout."""
         width = states.shape[-1] // self.heads
         # Heads are slices, which matrix products read where they lie; heads as a dimension of the
         # tensors would be copied before and after every product.
@@ -230,8 +221,7 @@ class SupervisedAttention(nn.Module):
 class Dropout(nn.Dropout):
     """Sets a share p of the values to 0 and divides the others by 1 − p.
 
-    On a CPU, p is rounded to a multiple of 2⁻¹⁶: four values share one 64-bit draw, which takes a
-    fifth of the time of one draw each.
+    On a CPU, four values share one 64-bit draw, which takes a fifth of the time of one draw each.
     """
 
     def forward(self, input: Tensor) -> Tensor:
@@ -264,10 +254,8 @@ def draw_mask(shape: torch.Size, p: float) -> Tensor:
 
 
 class TokenEmbedding(nn.Module):
-    """Tokens of returns-to-go, states and actions (Appendix G.3).
-
-    One linear layer per modality, a shared learned timestep embedding, LayerNorm.
-    """
+    """Tokens of returns-to-go, states and actions (Appendix G.3): one linear layer per modality, a
+    shared learned timestep embedding, LayerNorm."""
 
     def __init__(self, config: PolicyConfig, state_size: int) -> None:
         super().__init__()
@@ -312,11 +300,7 @@ class CausalDepthwise(nn.Conv1d):
         super().__init__(dim, dim, kernel_size=3, groups=dim)
 
     def forward(self, input: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Map (B, K, d) to (B, K, d).
-
-        Args:
-            mask: (B, K) bool, false at steps that count as zeros; None if all count.
-        """
+        """Map (B, K, d) to (B, K, d); steps where the mask (B, K) is false count as zeros."""
         steps = input if mask is None else input.masked_fill(~mask.unsqueeze(-1), 0.0)
         taps = self.weight[:, 0].T.contiguous()  # strided factors take three times as long
         return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
@@ -375,10 +359,8 @@ class _ConvBlock(nn.Module):
 
 
 def visible_tokens(valid: Tensor) -> Tensor:
-    """Causal attention mask (B, 1, L, L), true where row i may attend to column j.
-
-    A token attends to itself and to earlier tokens that are `valid` (B, L), i.e. not padding.
-    """
+    """Causal attention mask (B, 1, L, L), true where row i may attend to column j: to itself and to
+    earlier tokens that are `valid` (B, L), i.e. not padding."""
     length = valid.shape[1]
     earlier = torch.ones(length, length, dtype=torch.bool, device=valid.device).tril()
     diagonal = torch.eye(length, dtype=torch.bool, device=valid.device)
@@ -386,17 +368,12 @@ def visible_tokens(valid: Tensor) -> Tensor:
 
 
 def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:
-    """Target attention q of the row that predicts a_t, over tokens (R_0, s_0, a_0, R_1, …).
+    """Target attention q (B, K, 3K) of the row that predicts a_t, over tokens (R_0, s_0, a_0, R_1,
+    …).
 
     Its parents are Ĝ_t and s_t with weight 1, s_{t−k} with weight decay^k for 1 ≤ k ≤ window, and
-    a_{t−1} with weight `previous_action` (Table 7). Padded parents are dropped and the rest is
-    normalised to sum to one.
-
-    Args:
-        mask: (B, K) bool, false at padding.
-
-    Returns:
-        (B, K, 3K); rows of padded steps are zero.
+    a_{t−1} with weight `previous_action` (Table 7). Padded parents, where the mask (B, K) is false,
+    are dropped, and the rest sums to one; rows of padded steps are zero.
     """
     batch, length = mask.shape
     back = torch.arange(length).unsqueeze(1) - torch.arange(length)  # (K, K) t − j
@@ -424,10 +401,8 @@ def _visible(mask: Tensor) -> Tensor:
 
 
 class StackedStreams:
-    """`UCFPolicy.last_features` of a trained policy, equal up to rounding.
-
-    The weights of the three streams are stacked once, so that every operation serves all of them.
-    """
+    """`UCFPolicy.last_features` of a trained policy, equal up to rounding: the weights of the three
+    streams are stacked once, so that every operation serves all of them."""
 
     def __init__(self, policy: UCFPolicy) -> None:
         """The policy is in evaluation mode; its weights must not change afterwards."""

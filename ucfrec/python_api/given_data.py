@@ -18,13 +18,13 @@ from ucfrec.episodes.record import StoreRecord
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import scratch_folder
-from ucfrec.logs.histories import log_table
+from ucfrec.logs.histories import Histories, log_table
 from ucfrec.logs.mapping import Dataset, LogFiles, LogMapping, read_mapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare
 from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
-from ucfrec.recommending.histories import Histories, histories_of_frame, select_users
+from ucfrec.recommending.histories import histories_of_frame, select_users
 from ucfrec.runs.trained_policy import TrainedPolicy, later_logs
 from ucfrec.settings import require_ids, shown
 

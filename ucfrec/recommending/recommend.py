@@ -17,8 +17,8 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.windows import Sessions
 from ucfrec.errors import InputError
+from ucfrec.logs.histories import Histories
 from ucfrec.logs.rows import mix_bits
-from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, require_whole
 

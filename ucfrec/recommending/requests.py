@@ -34,10 +34,9 @@ from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.errors import InputError
 from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
-from ucfrec.logs.histories import FrameTable
+from ucfrec.logs.histories import FrameTable, Histories
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.logs.tables import is_number
-from ucfrec.recommending.histories import Histories
 from ucfrec.runs.trained_policy import TrainedPolicy, reward_of
 from ucfrec.settings import settings_table
 

@@ -15,7 +15,7 @@ import xxhash
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import IntArray
 from ucfrec.errors import InputError
-from ucfrec.recommending.histories import Histories
+from ucfrec.logs.histories import Histories
 from ucfrec.recommending.recommend import Chooser, candidate_numbers, name_some
 from ucfrec.recommending.requests import HistoryReader, Limits, Request, id_array
 from ucfrec.runs.promoted import POINTER, promoted

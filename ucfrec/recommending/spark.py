@@ -12,11 +12,11 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.episodes.store import LONGEST_HISTORY
 from ucfrec.files.atomic import atomic_folder
 from ucfrec.files.parquet import part_name, write_frames
-from ucfrec.logs.histories import read_histories
+from ucfrec.logs.histories import Histories, read_histories
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
-from ucfrec.recommending.histories import Histories, session_by
+from ucfrec.recommending.histories import session_by
 from ucfrec.recommending.recommend import recommend
 from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy, columns_used, reward_of
 from ucfrec.settings import require_whole
@@ -101,7 +101,7 @@ class _RecommendPart:
             session_by(trained),
             trained.record.data.duplicates,
         )
-        frames = self.recommend(trained, map(Histories.from_batch, histories))
+        frames = self.recommend(trained, histories)
         with ExitStack() as stack:
             if self.exposures is not None:
                 arguments = self.exposures / name, trained, self.rule, frames

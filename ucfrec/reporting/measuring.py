@@ -1,23 +1,21 @@
 """What `rank`, `ope` and `evaluate` do, as commands and as methods of `Recommender`: measure, and
-add each result to the model card of its run."""
+add each result to the model card of its run. Each imports only what it needs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
-from ucfrec.evaluation.ranking import Later, LikedExpression
-from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
-from ucfrec.evaluation.simulator import Environment
-from ucfrec.logs.expressions import Expression
-from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport, evaluate_off_policy
-from ucfrec.off_policy.score import LoggedSessions, seen_too_often, share_seen
-from ucfrec.off_policy.scored import evaluate_scored
 from ucfrec.processes import shorten_paths
 from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking
 from ucfrec.results.rows import Evaluation, Ranking
 from ucfrec.runs.trained_policy import TrainedPolicy
+
+if TYPE_CHECKING:
+    from ucfrec.evaluation.simulator import Environment
+    from ucfrec.off_policy.evaluate import EstimateOptions, OffPolicyReport
+    from ucfrec.off_policy.score import LoggedSessions
 
 Candidate = tuple[TrainedPolicy, DecisionRule]
 """A policy with the decision rule that is measured."""
@@ -27,7 +25,7 @@ TEST_SPLIT = "the test split"
 
 def rank_policies(
     candidates: Sequence[Candidate],
-    logged: LoggedSessions,
+    logged: "LoggedSessions",
     logs: str,
     *,
     k: int,
@@ -47,6 +45,11 @@ def rank_policies(
     Raises:
         InputError: `liked` cannot be used.
     """
+    from ucfrec.evaluation.ranking import Later, LikedExpression
+    from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
+    from ucfrec.logs.expressions import Expression
+    from ucfrec.off_policy.score import seen_too_often, share_seen
+
     trained, later = candidates[0][0], Later(logged.store, logged.rows, filter_seen)
     condition = None
     if liked is not None:
@@ -75,13 +78,13 @@ def rank_policies(
 
 def estimate_return(
     candidate: Candidate,
-    logged: LoggedSessions | Sequence[Path],
+    logged: "LoggedSessions | Sequence[Path]",
     logs: Sequence[str],
     *,
-    options: EstimateOptions,
+    options: "EstimateOptions",
     seed: int,
     checkpoint: str,
-) -> OffPolicyReport:
+) -> "OffPolicyReport":
     """Estimate the return of a session from logs, or from the files that `score` made of them.
 
     Args:
@@ -92,6 +95,10 @@ def estimate_return(
     Raises:
         InputError: the logs cannot be used.
     """
+    from ucfrec.off_policy.evaluate import evaluate_off_policy
+    from ucfrec.off_policy.score import LoggedSessions
+    from ucfrec.off_policy.scored import evaluate_scored
+
     trained, rule = candidate
     if isinstance(logged, LoggedSessions):
         report = evaluate_off_policy(trained, logged, rule=rule, seed=seed, options=options)
@@ -107,7 +114,7 @@ def estimate_return(
 
 
 def evaluate_in(
-    environment: Environment,
+    environment: "Environment",
     candidates: Mapping[Path, Candidate],
     behaviors: Sequence[str],
     *,
@@ -126,6 +133,8 @@ def evaluate_in(
     Raises:
         InputError: a policy does not fit the environment, or it has no such behavior.
     """
+    from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
+
     rows = []
     for run, (trained, rule) in candidates.items():
         row = evaluate_policy(environment, trained, trained.name, episodes, seed, rule)

@@ -28,7 +28,7 @@ Curves = Mapping[str, Mapping[int, float]]
 POINTS: Final = 200
 """Most points of a drawn curve."""
 REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}
-"""Key to display name of the reference losses of `ucfrec.runs.start.reference_losses`."""
+"""Key to display name of the reference losses of `ucfrec.runs.record.RunRecord`."""
 _TITLES: Final = {
     "validation_loss": "Validation loss (action, held-out steps)",
     "action_loss": "Training loss of the action (one batch)",

@@ -138,28 +138,30 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
         raise InputError(f"{source}: {error}" if source else str(error)) from None
 
 
-def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> "Iterator[_Setting]":
+def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_Setting]:
     if isinstance(overrides, Mapping):
-        return _from_mapping(overrides, "settings")
-    return _from_texts(overrides)
-
-
-def _from_texts(texts: Sequence[str]) -> Iterator[_Setting]:
-    if isinstance(texts, str) or not isinstance(texts, Iterable):
-        raise InputError(f"settings is {shown(texts)}; give a list of texts, or a mapping")
-    for text in require_list("settings", texts, "texts table.field=value", str):
+        yield from _from_mapping(overrides, "settings")
+        return
+    if isinstance(overrides, str) or not isinstance(overrides, Iterable):
+        raise InputError(f"settings is {shown(overrides)}; give a list of texts, or a mapping")
+    for text in require_list("settings", overrides, "texts table.field=value", str):
         name, separator, value = text.partition("=")
         table, dot, key = name.strip().partition(".")
         source = f"--set {text}"
         if not separator or not dot:
             raise InputError(f"{source}: write table.field=value, as in train.steps=200")
-        yield _Setting(_table(table, source), key, _toml_value(value), source)
+        _require_table(table, source)
+        try:
+            parsed = tomllib.loads(f"value = {value}")["value"]
+        except (ValueError, RecursionError):
+            parsed = value.strip()
+        yield _Setting(table, key, parsed, source)
 
 
 def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
     for name, value in values.items():
         table, dot, key = str(name).partition(".")
-        _table(table, source)
+        _require_table(table, source)
         if dot:
             yield _Setting(table, key, value, source)
         elif isinstance(value, Mapping):
@@ -170,14 +172,6 @@ def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
             )
 
 
-def _table(name: str, source: str) -> str:
+def _require_table(name: str, source: str) -> None:
     if name not in TABLES:
         raise InputError(f"{source}: no table is called {name!r}; {nearest(name, TABLES)}")
-    return name
-
-
-def _toml_value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        return text.strip()

@@ -11,7 +11,7 @@ from pydantic import Field
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import claim
 from ucfrec.files.record import Record, Text
-from ucfrec.runs.record import RunRecord, read_record, verified
+from ucfrec.runs.record import RunRecord, verified
 from ucfrec.runs.trained_policy import TrainedPolicy
 
 POINTER: Final = "promoted.json"
@@ -70,7 +70,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
         )
     run = run.resolve()
     verified(run)
-    folder, record = run.parent, read_record(run)
+    folder = run.parent
     with claim(folder / POINTER, wait=True):
         before = promoted(folder)
         if before is None:
@@ -78,7 +78,7 @@ def promote(run: Path, force: bool = False) -> Promoted:
         fingerprint = TrainedPolicy.load(run).fingerprint
         again = before.current == run.name
         if not force and not (again and before.fingerprint in ("", fingerprint)):
-            _require_verdict(run, record, before.run(folder))
+            _require_verdict(run, before.run(folder))
         previous = before.previous if again else (*before.previous, before.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
         return _current(run, previous).write(folder)
@@ -104,9 +104,9 @@ def _current(run: Path, previous: tuple[str, ...]) -> Promoted:
     return Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
 
 
-def _require_verdict(run: Path, record: RunRecord, current: Path) -> None:
+def _require_verdict(run: Path, current: Path) -> None:
     remedy = "compare them, and add --force to promote it all the same"
-    update = record.update
+    update = RunRecord.read(run).update
     if update is None or update.verdict is None:
         raise InputError(f"{run} has no verdict against the current run {current.name}; {remedy}")
     if update.run != TrainedPolicy.load(current, split=True).fingerprint:

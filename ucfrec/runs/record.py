@@ -74,9 +74,7 @@ def _named(value: object) -> object:
 
 
 def _config(value: object) -> Config:
-    if isinstance(value, Config):
-        return value
-    return config_from_dict(value)
+    return value if isinstance(value, Config) else config_from_dict(value)
 
 
 class TrainingRecord(Record):
@@ -226,7 +224,9 @@ class RunRecord(TrainingRecord):
     """Of the training sessions' returns, by share."""
     mean_return: Number
     reference_losses: dict[str, Number] | None = None
-    """See `ucfrec.runs.start.reference_losses`; None if actions are vectors."""
+    """Mean negative log-likelihood (nats) of the logged items over all validation steps: `uniform`
+    if all are equally probable, `popularity` if their probability is their share of the training
+    steps, with one added to every count. None if actions are vectors."""
     dropped_observations: tuple[Count, ...] = ()
     """Columns of the logged observation that the policy does not see, ascending."""
     screening: Screening | None = None
@@ -250,9 +250,14 @@ class RunRecord(TrainingRecord):
         name = config.get("policy_name") if isinstance(config, Mapping) else None
         if isinstance(name, str) and name not in BUILT_IN:
             if name not in policy_names():
+                package, numbers = value.get("policy_package"), value.get("versions")
+                source = "an unknown package"
+                if isinstance(package, str):
+                    number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
+                    source = f"package {package} {number}".rstrip()
                 raise InputError(
-                    f"{path}: trained with policy {name!r} (of {_package(value)}), which is not "
-                    "installed: install it"
+                    f"{path}: trained with policy {name!r} (of {source}), which is not installed: "
+                    "install it"
                 )
             policy_class(name)
         return super().of(value, path)
@@ -273,14 +278,11 @@ class RunRecord(TrainingRecord):
     @property
     def summary(self) -> str:
         """One line: the method and the size of its training data."""
-        facts = [
-            repr(self.name),
-            f"trained on {self.train_steps:,} steps",
-            f"{self.train_episodes:,} episodes",
-        ]
-        if self.sizes["items"]:
-            facts.append(f"{self.sizes['items']:,} items")
-        return ", ".join([*facts, f"reward={self.reward}"])
+        items = f"{self.sizes['items']:,} items, " if self.sizes["items"] else ""
+        return (
+            f"{self.name!r}, trained on {self.train_steps:,} steps, {self.train_episodes:,} "
+            f"episodes, {items}reward={self.reward}"
+        )
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -338,20 +340,11 @@ class RunRecord(TrainingRecord):
         if warning := self.learned_nothing(logged):
             lines.append(f"warning       {warning}")
         if self.rule is not None and self.reward_model is not None:
-            lines.append(_describe_rule(self.rule, self.reward_model, self.mean_return))
+            lines += _describe_rule(self.rule, self.reward_model, self.mean_return)
         if self.screening is not None:
             flagged = ", ".join(map(str, self.screening.flagged)) or "none"
             lines.append(f"screening     observation columns without effect: {flagged}")
         return "\n".join(lines)
-
-
-def _package(value: Mapping[str, Any]) -> str:
-    """The package of the policy of a run's record that is not checked yet, for messages."""
-    package, numbers = value.get("policy_package"), value.get("versions")
-    if not isinstance(package, str):
-        return "an unknown package"
-    number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
-    return f"package {package} {number}".rstrip()
 
 
 def read_record(run: Path) -> RunRecord:
@@ -481,40 +474,34 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
     return [*lines, *(f"warning       {warning}" for warning in report.warnings)]
 
 
-def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> str:
-    estimate, candidates = choice.estimate, choice.tried
-    if estimate is None:
-        how = (
-            f"It ranked best of {candidates} rules in the validation period.\n"
-            f"              Selected by the {choice.chosen_by}{choice.warning}"
-        )
-    else:
-        how = (
-            f"Of {candidates} ways to turn the policy into recommendations, tried on simulated "
-            "users, it has the best return\n"
-            "              (or one level with it) that the log supports: "
-            f"{estimate.value:.4g} ± {estimate.error:.2g} per session, estimated; logged sessions "
-            f"have {logged:.4g}.\n"
-            f"{_describe_estimate(estimate, choice.halves_agree)}"
-            f"{choice.warning.replace('; WARNING', '              WARNING')}"
-        ).rstrip()
-    return (
+def _describe_rule(choice: RuleRecord, model: ItemRewardReport, logged: float) -> list[str]:
+    """Lines on the user model, the rule, and how far its estimated return can be trusted."""
+    indent = " " * 14
+    lines = [
         f"user model    held-out loss {model.loss:.4f}, "
-        f"{model.item_loss - model.loss:.4f} below that of item effects alone\n"
-        f"decision rule {choice.rule}\n"
-        f"              {how}"
-    )
-
-
-def _describe_estimate(estimate: ValueEstimate, agree: tuple[bool, bool] | None) -> str:
-    """How far the estimated return can be trusted, lines of text."""
-    sentences = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
-    if agree is not None:
-        would = {2: "both choose this rule", 1: "one chooses this rule", 0: "both choose another"}
-        sentences.append(would[sum(agree)])
+        f"{model.item_loss - model.loss:.4f} below that of item effects alone",
+        f"decision rule {choice.rule}",
+    ]
+    if (estimate := choice.estimate) is None:
+        return [
+            *lines,
+            f"{indent}It ranked best of {choice.tried} rules in the validation period.",
+            f"{indent}Selected by the {choice.chosen_by}{choice.warning}",
+        ]
+    doubts = [f"Halves of the users: {estimate.halves[0]:.4g} and {estimate.halves[1]:.4g}"]
+    if choice.halves_agree is not None:
+        would = ("both choose another", "one chooses this rule", "both choose this rule")
+        doubts.append(would[sum(choice.halves_agree)])
     if estimate.optimism is not None:
         off, error = estimate.optimism
-        sentences.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
-    lines = [f"{'; '.join(sentences)}."]
-    lines += [f"WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts]
-    return "".join(f"              {line}\n" for line in lines)
+        doubts.append(f"on held-out rows the user model is off by {off:+.1%} ± {error:.1%}")
+    lines += [
+        f"{indent}Of {choice.tried} ways to turn the policy into recommendations, tried on "
+        "simulated users, it has the best return",
+        f"{indent}(or one level with it) that the log supports: {estimate.value:.4g} ± "
+        f"{estimate.error:.2g} per session, estimated; logged sessions have {logged:.4g}.",
+        f"{indent}{'; '.join(doubts)}.",
+        *(f"{indent}WARNING: it cannot be trusted: {doubt}." for doubt in estimate.doubts),
+    ]
+    lines[-1] += choice.warning.replace("; WARNING", f"\n{indent}WARNING")
+    return lines

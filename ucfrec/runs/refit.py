@@ -1,7 +1,7 @@
 """Go on learning from all rows, once everything has been chosen."""
 
-import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,13 +9,12 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
 from ucfrec.processes import config_hash
-from ucfrec.runs.config import Config
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import drop_columns
 from ucfrec.runs.trained_policy import INPUTS, REWARD_MODEL, RULE, TrainedPolicy
-from ucfrec.user_model.model import SESSIONS
 from ucfrec.user_model.reward_fit import refit_item_reward_model
+from ucfrec.user_model.session_end import SESSIONS
 
 SHARE: Final = 0.25
 """Steps of a refit, as a share of those that the best weights took."""
@@ -53,7 +52,12 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     if out == first / REFIT:
         about |= place_of(store.path, first)
     store = drop_columns(store, trained.dropped)
-    record = train_run(store, out, _settings(trained), about, refit_of=first)
+    config = trained.record.config
+    steps = max(1, round(SHARE * trained.record.finished.best_step))
+    warmup = min(config.train.warmup_steps, steps // 10)
+    train = replace(config.train, steps=steps, warmup_steps=warmup, cosine=True, patience=0)
+    config = replace(config, train=train, rule=replace(config.rule, choose=False))
+    record = train_run(store, out, config, about, refit_of=first)
     if not distributed.leads():
         return record
     record = record.reopen(out, INPUTS)
@@ -94,18 +98,3 @@ def _identity(trained: TrainedPolicy) -> dict[str, Any]:
         "rule": trained.rule.as_dict(),
         "weights": trained.fingerprint,
     }
-
-
-def _settings(trained: TrainedPolicy) -> Config:
-    """The settings of a run for a few more steps, and no new choice."""
-    config, best = trained.record.config, trained.record.finished.best_step
-    steps = max(1, round(SHARE * best))
-    train = dataclasses.replace(
-        config.train,
-        steps=steps,
-        warmup_steps=min(config.train.warmup_steps, steps // 10),
-        cosine=True,
-        patience=0,
-    )
-    rule = dataclasses.replace(config.rule, choose=False)
-    return dataclasses.replace(config, train=train, rule=rule)

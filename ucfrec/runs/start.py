@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.arrays import Float32Array, IntArray
+from ucfrec.arrays import IntArray
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model import INITIAL
 from ucfrec.episodes.returns import ReturnToGo
@@ -118,6 +118,10 @@ def begin(
 ) -> None:
     """Write the folder of a run with its record and all that training does not change.
 
+    Targets are chosen from the sorted returns-to-go of sessions, or of steps if they are set again
+    at every step, without sessions as long as only those of bots. Of more than a million, evenly
+    spaced order statistics are kept, the lowest and highest too.
+
     Args:
         store: the whole store.
         validation: held-out episodes.
@@ -147,7 +151,12 @@ def begin(
         "wall_time_s": 0.0,
         **about,
     }
-    returns = _target_returns(train, returns_to_go)
+    people = train.without_long_sessions() if train.has_items else train
+    returns = people.returns
+    if not returns_to_go.per_session:
+        returns = people.with_return_to_go(returns_to_go).column(schema.RETURN_TO_GO)
+    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
+    returns = np.asarray(np.sort(returns)[places], dtype=np.float32)
     with atomic_folder(out) as scratch:
         save_tensors(scratch / RETURNS, {"returns": torch.from_numpy(returns)}, {})
         target = float(np.quantile(returns.astype(np.float64), config.rule.default_quantile))
@@ -159,48 +168,19 @@ def begin(
         if store.has_items:
             counts = TrainingCounts.of(train)
             counts.save(scratch / COUNTS)
-            entries["reference_losses"] = reference_losses(counts, validation)
+            items = torch.from_numpy(validation.column(schema.ITEM)).long()
+            # As the bias of `ItemHead` is initialised.
+            log_shares = torch.log((counts.shown + 1) / (counts.shown + 1).sum())
+            entries["reference_losses"] = {
+                "uniform": math.log(len(counts.shown)),
+                "popularity": -float(log_shares[items].double().mean()),
+            }
         RunRecord.of(entries, out / RUN).seal(scratch)
 
 
 def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
     """What the returns-to-go of a run on `store` count."""
     return config.policy.returns(store.record.source.session_by)
-
-
-def _target_returns(train: EpisodeStore, definition: ReturnToGo) -> Float32Array:
-    """Sorted returns-to-go of sessions, or of steps if targets are set again at every step.
-
-    Sessions as long as only those of bots are count for nothing. Of more than a million, evenly
-    spaced order statistics are kept, the lowest and highest too.
-    """
-    if train.has_items:
-        train = train.without_long_sessions()
-    returns = train.returns
-    if not definition.per_session:
-        returns = train.with_return_to_go(definition).column(schema.RETURN_TO_GO)
-    places = np.linspace(0, len(returns) - 1, min(len(returns), _MOST_RETURNS)).astype(np.int64)
-    return np.asarray(np.sort(returns)[places], dtype=np.float32)
-
-
-def reference_losses(counts: TrainingCounts, validation: EpisodeStore) -> dict[str, float]:
-    """Mean negative log-likelihood (nats) of the logged items over all validation steps.
-
-    Args:
-        validation: validation episodes, at least one.
-
-    Returns:
-        `uniform`: the loss if all items are equally probable. `popularity`: the loss if an item's
-        probability is its share of the training steps with one added to every count, which is how
-        the bias of `ItemHead` is initialised.
-    """
-    items = torch.from_numpy(validation.column(schema.ITEM)).long()
-    smoothed = counts.shown + 1
-    log_shares = torch.log(smoothed / smoothed.sum())
-    return {
-        "uniform": math.log(len(counts.shown)),
-        "popularity": -float(log_shares[items].double().mean()),
-    }
 
 
 def policy_sizes(store: EpisodeStore) -> dict[str, int]:
@@ -232,11 +212,9 @@ def _set_statistics(policy: SequencePolicy, base: EpisodeStore, config: Config) 
     mean, std = base.state_statistics
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
-    scale = config.policy.return_scale or float(np.abs(base.returns).max()) or 1.0
     returns_to_go = base.column(schema.RETURN_TO_GO)
-    if not returns_of(base, config).per_session and not config.policy.return_scale:
-        scale = float(np.abs(returns_to_go).max()) or 1.0
-    policy.return_scale.fill_(scale)
+    scaled_by = base.returns if returns_of(base, config).per_session else returns_to_go
+    policy.return_scale.fill_(config.policy.return_scale or float(np.abs(scaled_by).max()) or 1.0)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
         counts = torch.from_numpy(base.item_counts()).float()
@@ -358,7 +336,8 @@ def fit_policy(
 
     def mean_loss() -> float:
         """Mean action loss at a fixed sample of validation steps."""
-        losses = [policy.action_loss(batch.to(device)) for batch in windows]
+        on_device = windows if device.type == "cpu" else [batch.to(device) for batch in windows]
+        losses = [policy.action_loss(batch) for batch in on_device]
         mean = float(torch.stack(losses).mean()) if losses else 0.0
         return mean if alone else distributed.joint_means({"loss": mean}, len(losses))["loss"]
 
@@ -376,7 +355,8 @@ def fit_policy(
         if len(newest):
             of_recent, steps[::2] = recent.draw_steps(generator, len(steps[::2]))
             episodes[::2] = newest[of_recent]
-        return training.windows(episodes[rows], steps[rows], k).to(device)
+        windows = training.windows(episodes[rows], steps[rows], k)
+        return windows if device.type == "cpu" else windows.to(device)
 
     def loss(windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         lower = config.train.precision == "bfloat16"

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,16 +24,17 @@ from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.loop import load_trained
-from ucfrec.logs.expressions import Expression
-from ucfrec.logs.mapping import Dataset, LogMapping
 from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import config_hash, random_state_kept, versions
 from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
-from ucfrec.user_model.model import load_session_end
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
-from ucfrec.user_model.session_end import SessionEnd
+from ucfrec.user_model.session_end import SessionEnd, load_session_end
+
+if TYPE_CHECKING:
+    from ucfrec.logs.expressions import Expression
+    from ucfrec.logs.mapping import LogMapping
 
 AUGMENTATION = "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -111,16 +112,24 @@ class TrainedPolicy:
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
-        states, models = folder / ITEM_STATES, folder / REWARD_MODEL
-        reward_model = _reward_model(models / FITTED, record.sizes)
+        states, models, reward_model = folder / ITEM_STATES, folder / REWARD_MODEL, None
+        if (fitted := models / FITTED).exists():
+            build_model = partial(ItemRewardModel, record.sizes)
+            reward_model = load_module(fitted, build_model, load_tensors(fitted)[0]).eval()
+        with damage_explained(folder / RETURNS, REMEDY):
+            returns = load_tensors(folder / RETURNS)[0]["returns"]
+            if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
+                raise ValueError("returns are not a vector of numbers")
+            if not bool(torch.isfinite(returns).all()):
+                raise ValueError("returns are not finite")
         trained = cls(
             run,
             policy,
             record,
             ItemStates.load(states) if states.exists() else None,
-            _ids(folder / ITEMS, schema.ITEM_ID) if states.exists() else None,
-            _ids(folder / USERS, schema.USER_ID),
-            _returns(folder / RETURNS),
+            _read_ids(folder / ITEMS, schema.ITEM_ID) if states.exists() else None,
+            _read_ids(folder / USERS, schema.USER_ID),
+            np.asarray(returns.numpy()),
             read_rule(folder / RULE),
             reward_model,
             TrainingCounts.load(folder / COUNTS) if (folder / COUNTS).exists() else None,
@@ -130,11 +139,7 @@ class TrainedPolicy:
         return trained
 
     def _require_equal_sizes(self) -> None:
-        """Check that the files of the run are of one catalogue and of one size of states.
-
-        Raises:
-            InputError: a file has another size than the run's record states.
-        """
+        """Check that the files of the run are of one catalogue and of one size of states."""
         sizes, states, dropped = self.record.sizes, self.item_states, self.dropped
         most = self.record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
@@ -143,24 +148,21 @@ class TrainedPolicy:
                 f"{dropped!s:.60} as dropped; {REMEDY}"
             )
         state = self.record.observation_size + (0 if states is None else states.size)
-        sizes_found: dict[str, tuple[Any, Any]] = {}
-        if states is not None:
-            table = (sizes["items"], sizes["action"])
-            sizes_found[ITEM_STATES] = (
-                (table, sizes["state"]),
-                (tuple(states.embeddings.shape), state),
-            )
+        found: dict[str, tuple[Any, Any]] = {}
+        if states is None:
+            found[RUN] = (sizes["state"], state)
         else:
-            sizes_found[RUN] = (sizes["state"], state)
+            table = sizes["items"], sizes["action"], sizes["state"]
+            found[ITEM_STATES] = (table, (*states.embeddings.shape, state))
         # A store that was not made from logs has no tables of items and users.
         if self.item_ids is not None and (self.folder / ITEMS).exists():
-            sizes_found[ITEMS] = (sizes["items"], len(self.item_ids))
+            found[ITEMS] = (sizes["items"], len(self.item_ids))
         if states is not None and len(states.user_features) and (self.folder / USERS).exists():
-            sizes_found[USERS] = (len(states.user_features), len(self.user_ids))
+            found[USERS] = (len(states.user_features), len(self.user_ids))
         if self.counts is not None:
             shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
-            sizes_found[COUNTS] = (((sizes["items"],),) * 2, shapes)
-        for name, (stated, actual) in sizes_found.items():
+            found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+        for name, (stated, actual) in found.items():
             if stated != actual:
                 raise InputError(
                     f"{self.folder / name} does not fit the run: it has {actual}, the run "
@@ -211,11 +213,7 @@ class TrainedPolicy:
         return self.record.return_to_go
 
     def training_store(self) -> EpisodeStore | None:
-        """The store that the run was trained on; None where it is gone or changed.
-
-        Raises:
-            InputError: it is damaged.
-        """
+        """The store that the run was trained on; see `store_of`."""
         return store_of(self.folder, self.record)
 
     def require_store(self, remedy: str) -> EpisodeStore:
@@ -341,63 +339,53 @@ def _note_other_version(run: Path, record: RunRecord) -> None:
         )
 
 
-def _reward_model(path: Path, sizes: Mapping[str, int]) -> ItemRewardModel | None:
-    if not path.exists():
-        return None
-    return load_module(path, lambda: ItemRewardModel(sizes), load_tensors(path)[0]).eval()
-
-
-def _returns(path: Path) -> Float32Array:
-    with damage_explained(path, REMEDY):
-        returns = load_tensors(path)[0]["returns"]
-        if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
-            raise ValueError("returns are not a vector of numbers")
-        if not bool(torch.isfinite(returns).all()):
-            raise ValueError("returns are not finite")
-        return np.asarray(returns.numpy())
-
-
-def _ids(path: Path, column: str) -> Array:
+def _read_ids(path: Path, column: str) -> Array:
     if not path.exists():
         return np.empty(0, dtype=np.int64)
     return read_ids(path, column)
 
 
 def later_logs(
-    trained: TrainedPolicy, paths: Sequence[str | Path], given: LogMapping
-) -> tuple[tuple[Path, ...], LogMapping]:
+    trained: TrainedPolicy, paths: Sequence[str | Path], stated: "LogMapping"
+) -> "tuple[tuple[Path, ...], LogMapping]":
     """Log files of the dataset that a policy was trained on, whose columns may have plain names.
 
     Args:
         paths: files, folders and globs.
-        given: what the caller says of the columns.
+        stated: what the caller says of the columns.
 
     Raises:
         InputError: a path is missing, or holds no log of the dataset.
     """
+    from ucfrec.logs.mapping import Dataset, LogMapping  # training reads no logs
+
     source = trained.record.data
     # A record may also name a dataset that is not read by an adapter.
     has_adapter = source.dataset in plugin_names("datasets")
     dataset: Dataset = load_plugin("datasets", str(source.dataset) if has_adapter else "generic")
     remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
     try:
-        files, mapping = dataset.resolve(paths, given)
+        files, mapping = dataset.resolve(paths, stated)
     except InputError:
-        files, mapping = dataset.resolve(paths, given.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in mapping.columns.items() if name not in given.columns}
-    return files, replace(given, remembered=LogMapping(columns))
+        files, mapping = dataset.resolve(paths, stated.over(LogMapping(remembered.columns)))
+    columns = {name: text for name, text in mapping.columns.items() if name not in stated.columns}
+    return files, replace(stated, remembered=LogMapping(columns))
 
 
-def columns_used(trained: TrainedPolicy, mapping: LogMapping) -> LogMapping:
+def columns_used(trained: TrainedPolicy, mapping: "LogMapping") -> "LogMapping":
     """The mapping with what the run remembers of its training log."""
+    from ucfrec.logs.mapping import LogMapping
+
     mapping = mapping.over(LogMapping.of_source(trained.record.data, str(trained.folder / RUN)))
     if trained.record.observation_size:
         return mapping
     return LogMapping({schema.OBSERVATION: ""}).over(mapping)
 
 
-def reward_of(trained: TrainedPolicy) -> Expression:
+def reward_of(trained: TrainedPolicy) -> "Expression":
     """The run's reward, an SQL expression over the columns of its logs."""
+    from ucfrec.logs.expressions import Expression
+
     return Expression(trained.record.reward, str(trained.folder / RUN))
 
 

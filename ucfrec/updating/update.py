@@ -15,7 +15,7 @@ from ucfrec.files.atomic import lock_path
 from ucfrec.logs.append import AppendOptions, append_logs
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.processes import random_state_kept
-from ucfrec.runs.config import Config, config_from_dict
+from ucfrec.runs.config import config_from_dict
 from ucfrec.runs.record import RUN, STORE_SUFFIX, RunRecord, Update
 from ucfrec.runs.refit import refit_within
 from ucfrec.runs.run import train_run
@@ -97,7 +97,13 @@ def update_run(
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
     opened = drop_columns(EpisodeStore.open(grown), trained.dropped)
-    full = _initial_settings(trained.record)
+    full = trained.record.config  # as a training from scratch had it
+    if trained.record.update is not None:
+        full = config_from_dict(trained.record.update.settings_from_nothing)
+    elif (repeated := trained.record.refit_of) is not None:
+        # In place of the settings of the rule's choice, it has the rule.
+        settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
+        full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
     config = warm_settings(full, options.share)
     if options.seed is not None:
         config = replace(config, seed=options.seed)
@@ -133,15 +139,3 @@ def update_run(
     if options.refit:
         refit_within(EpisodeStore.open(grown), out)
     return record
-
-
-def _initial_settings(record: RunRecord) -> Config:
-    """The settings that a training from scratch had, of which the run is an update or refit."""
-    config: Config = record.config
-    if record.update is not None:
-        return config_from_dict(record.update.settings_from_nothing)
-    if record.refit_of is not None:
-        # In place of the settings of the rule's choice, it has the rule.
-        settings = {k: v for k, v in record.refit_of.items() if k not in ("rule", "weights")}
-        return replace(config_from_dict(settings), rule=replace(config.rule, choose=True))
-    return config

@@ -247,10 +247,8 @@ def measure_drift(
         reward_rows.observations,
     )
     scores = score_rows(model, reward_rows)[0]
-    predicted, observed = (
-        model.expect(scores).double().numpy(),
-        reward_rows.rewards.double().numpy(),
-    )
+    predicted = model.expect(scores).double().numpy()
+    observed = reward_rows.rewards.double().numpy()
     slope, _ = fit_line(scores, model.target(reward_rows.rewards), bool(model.binary))
     return measures | {
         "predicted": float(predicted.mean()),

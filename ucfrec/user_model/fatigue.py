@@ -30,7 +30,6 @@ class MainTags:
     """(n_items,) int64; −1 for items without tags."""
     reward_low: float
     reward_high: float
-    """Rewards that are scaled to 0 and 1."""
 
     @classmethod
     def of(cls, states: ItemStates) -> "MainTags":
@@ -95,9 +94,7 @@ class LoggedRuns:
     runs: Tensor
     """(M, N) of `MainTags.runs`; nothing of the step itself or of later ones."""
     liked: BoolArray
-    """(M,)."""
     sessions: IntArray
-    """(M,) number of the session."""
 
     @classmethod
     def of(cls, store: EpisodeStore, tags: MainTags, lags: int, most: int) -> "LoggedRuns":

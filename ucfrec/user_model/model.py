@@ -19,10 +19,14 @@ from ucfrec.user_model.fatigue import Fatigue, LoggedRuns, MainTags, fit_fatigue
 from ucfrec.user_model.reward import ItemRewardModel
 from ucfrec.user_model.reward_fit import TrainingUsers, fit_item_reward_model, fit_training_users
 from ucfrec.user_model.reward_report import ItemRewardReport, UserCalibration
-from ucfrec.user_model.session_end import LoggedEnds, SessionEnd, SessionEndReport, whole_sessions
+from ucfrec.user_model.session_end import (
+    SESSIONS,
+    LoggedEnds,
+    SessionEnd,
+    SessionEndReport,
+    whole_sessions,
+)
 
-SESSIONS: Final = "sessions.safetensors"
-"""File of session ends, fatigue and calibration in the model's folder."""
 _MOST_STEPS: Final = 100_000
 """Logged steps that session ends, fatigue and calibration are fitted to at most."""
 _GROUPS: Final = 32
@@ -48,7 +52,6 @@ class UserModel:
     session_end: SessionEnd
     session_end_report: SessionEndReport
     fatigue: Fatigue | None
-    """None if the log shows none."""
     main_tags: MainTags
     calibration_report: UserCalibration | None = None
     """How far the calibration can be trusted; None where validation users are new."""
@@ -140,23 +143,12 @@ class UserModel:
         return np.where(tired, low + self.fatigue.factor * (rewards - low), rewards)
 
 
-def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
-    """The model of session ends in the folder of a user model; None if there is none."""
-    path = folder / SESSIONS
-    if reward is None or not path.exists():
-        return None
-    tensors, _ = load_tensors(path)
-    with damage_explained(path, REMEDY):
-        return SessionEnd.of(reward.likeness, tensors)
-
-
 class LoggedRewards:
     """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
     expected reward. Paying the mean itself would be wrong where what follows, as the end of the
     session, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        """Read those of all steps of a store."""
         parts = [
             np.unique(rewards, return_counts=True)
             for (rewards,) in store.column_batches(schema.REWARD)
@@ -256,7 +248,6 @@ class UserSimulator:
         return rewards.astype(np.float32), going
 
     def _draw_uniform(self) -> Float64Array:
-        """(M,) from [0, 1)."""
         return self._rng.random(self._different)[self._numbers]
 
 

@@ -251,6 +251,7 @@ class ItemRewardModel(nn.Module):
         if "content" in effects:
             self.item.add_(sum_content(effects["content"]))
         self.tastes.weigh(effects.get("tastes", 0.0))
+        self.eval()
 
     def target(self, rewards: Tensor) -> Tensor:
         """What η predicts: whether rewards (...) are the higher one, or standardised rewards."""

@@ -58,7 +58,6 @@ class Design:
     """What the effects of M rows are computed from."""
 
     items: Tensor
-    """(M,) int64."""
     users: Tensor
     """(M,) int64; the last number is that of unknown users."""
     x: Tensor
@@ -73,7 +72,6 @@ class Design:
     vectors: Tensor
     """(n_items, D) centred embeddings of all items."""
     rows: Tensor
-    """(M, D) those of `items`."""
     tags: Tensor
     """(n_items, T) int64, padded with `n_tags`."""
     n_tags: int
@@ -391,7 +389,6 @@ class EffectSearch:
 
     @property
     def _spreads(self) -> dict[str, float]:
-        """Of the effects that are fitted."""
         return {
             name: _SPREADS[number]
             for name, number in self.kept.items()

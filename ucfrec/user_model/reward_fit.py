@@ -61,7 +61,6 @@ class TrainingUsersReport:
     effects: tuple[EffectTried, ...]
     """The effects that were tried, evaluated on these rows."""
     steps: int
-    """Logged steps that the effects are fitted to."""
     effective_steps: float
     """As many steps of equal weight count as much; `steps` without propensities."""
     weighted: bool
@@ -145,8 +144,9 @@ def fit_item_reward_model(
             bar.update()
     if len(search.design.items) < len(rows):
         search.fit_to(design)
+    model.set_effects(search.effects, search.design.sum_content)
     report = ItemRewardReport(
-        **measure_quality(_finish(model, search), rows, held_out, states),
+        **measure_quality(model, rows, held_out, states),
         effects=search.report(),
         new_users=search.new_users,
         base_loss=search.base_loss,
@@ -182,7 +182,8 @@ def refit_item_reward_model(
             search.set_tastes(tensors["tastes.root"])
         search.kept = dict(begin.spreads)
     search.fit_to(search.design)
-    save_fit(folder / FITTED, _finish(model, search), search.effects, report)
+    model.set_effects(search.effects, search.design.sum_content)
+    save_fit(folder / FITTED, model, search.effects, report)
     return model
 
 
@@ -224,7 +225,8 @@ def fit_training_users(
     search.fit_to(design)
     effects, is_weighted = search.report(), weights is not None
     report = TrainingUsersReport(line, effects, len(rows), design.count, is_weighted)
-    save_fit(file, _finish(model, search), search.effects, report)
+    model.set_effects(search.effects, search.design.sum_content)
+    save_fit(file, model, search.effects, report)
     return TrainingUsers(model, report)
 
 
@@ -267,7 +269,6 @@ def set_statistics(
 
 
 def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
-    """Load a fitted model; its report, or None if there is no file."""
     if not file.exists():
         return None
     tensors, metadata = load_tensors(file)
@@ -277,11 +278,5 @@ def _read_fit(file: Path, model: ItemRewardModel) -> dict[str, Any] | None:
 
 
 def _select_some(design: Design, seed: int) -> Design:
-    """At most `_WARM_ROWS` of the rows."""
     order = np.random.default_rng(seed).permutation(len(design.items))
     return design.select(torch.from_numpy(order < _WARM_ROWS))
-
-
-def _finish(model: ItemRewardModel, search: "EffectSearch") -> ItemRewardModel:
-    model.set_effects(search.effects, search.design.sum_content)
-    return model.eval()

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pydantic
 import torch
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import ConfigDict
 from torch import Tensor
 
 from ucfrec import schema
@@ -15,6 +15,7 @@ from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import ItemStates, least_liked
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
+from ucfrec.files.record import Undefinable
 from ucfrec.results.statistics import group_auc, ratio_with_error
 from ucfrec.user_model.reward import ItemRewardModel
 
@@ -29,10 +30,7 @@ _FEWEST: Final = 50
 """Rows of a half from which on a line is fitted to it."""
 SAVED: Final = ConfigDict(extra="forbid")
 """Of reports that are saved beside what they are of, and read again."""
-_OrNaN = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]
-"""Undefined in a log that shows too little, and then null in JSON."""
 Line = tuple[float, float]
-"""Slope and intercept of scores."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,6 @@ class RewardRows:
     """M logged steps: what was shown to whom, after what, and the reward."""
 
     items: Tensor
-    """(M,) int64."""
     users: Tensor
     """(M,) int64 numbers in the store; −1 if the store does not name its users."""
     history: Shown
@@ -69,18 +66,15 @@ class RewardRows:
             states[part] = view.windows(episodes[part], steps[part], 1).states[:, 0]
         earlier = steps[:, None] - np.arange(1, lags + 1)
         places = episodes[:, None], np.maximum(earlier, 0)
-        items = np.where(earlier >= 0, view.step_values(schema.ITEM, *places), -1)
-        rewards = np.where(earlier >= 0, view.step_values(schema.REWARD, *places), 0)
+        items = np.where(earlier < 0, -1, view.step_values(schema.ITEM, *places)).astype(np.int64)
+        rewards = np.where(earlier < 0, np.float32(0), view.step_values(schema.REWARD, *places))
         users = np.full(view.n_episodes, -1)
         if view.has_users:
             users = view.episode_values(schema.USER).astype(np.int64)
         return cls(
             torch.from_numpy(view.step_values(schema.ITEM, episodes, steps).astype(np.int64)),
             torch.from_numpy(users[episodes]),
-            Shown(
-                torch.from_numpy(items.astype(np.int64)),
-                torch.from_numpy(rewards.astype(np.float32)),
-            ),
+            Shown(torch.from_numpy(items), torch.from_numpy(rewards)),
             states,
             torch.from_numpy(view.step_values(schema.REWARD, episodes, steps)),
             view.observation_size,
@@ -123,13 +117,11 @@ class EffectTried:
     """One effect, with the spread that predicts held-out rewards best."""
 
     effect: str
-    """Its name, one of `EFFECTS`."""
     spread: float
     """Standard deviation, a priori, of what it adds to the linear predictor."""
     gain: float
     """Decrease of the held-out loss by the effect."""
     gain_error: float
-    """Standard error of `gain`."""
     kept: bool
     """Whether it is part of the model: the gain is above its standard error."""
 
@@ -141,9 +133,7 @@ class Calibration:
     predicted: tuple[float, ...]
     """Mean predicted reward of each bin, in reward units."""
     observed: tuple[float, ...]
-    """Mean reward of each bin."""
     count: tuple[int, ...]
-    """Rows of each bin."""
     error: float
     """Expected calibration error: mean over rows of |predicted − observed| of their bins."""
 
@@ -153,9 +143,7 @@ class ItemRewardReport:
     """Quality of the reward model of items, on held-out rows."""
 
     train_rows: int
-    """Number of rows fitted to."""
     validation_rows: int
-    """Number of held-out rows."""
     binary: bool
     """Whether rewards have two values: the loss is the log loss in nats, otherwise half the squared
     error of standardised rewards."""
@@ -166,22 +154,16 @@ class ItemRewardReport:
     item_loss: float
     """Held-out loss of item effects alone."""
     loss: float
-    """Held-out loss of the model."""
-    r2: _OrNaN
-    """R² of the expected reward on held-out rows."""
+    r2: Undefinable
     calibration: Calibration
-    """Predicted and observed rewards."""
-    gauc: _OrNaN
+    gauc: Undefinable
     """Probability that a liked step scores higher than another of the same user, by impressions;
     without what all items share at a step (user and state), which does not rank items."""
-    gauc_error: _OrNaN
-    """Standard error of `gauc`, over users."""
-    item_rate_gauc: _OrNaN
+    gauc_error: Undefinable
+    item_rate_gauc: Undefinable
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""
-    gauc_gain: _OrNaN
-    """`gauc` minus `item_rate_gauc`."""
-    gauc_gain_error: _OrNaN
-    """Standard error of `gauc_gain`, over users."""
+    gauc_gain: Undefinable
+    gauc_gain_error: Undefinable
     seconds: float
     """Processor time of the fit."""
     new_users: bool = False
@@ -271,7 +253,6 @@ class UserCalibration:
     """Slope and intercept that turn scores into rewards, from validation rows."""
 
     line: Line
-    """Of all rows."""
     halves: tuple[Line, Line]
     """Of the rows of either half of the users; `line` where they are too few."""
     optimism: float
@@ -279,7 +260,6 @@ class UserCalibration:
     optimism_error: float
     """Its standard error over users."""
     weighted: bool
-    """Whether rows are weighted by propensities."""
 
     @classmethod
     def fit(

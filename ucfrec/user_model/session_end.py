@@ -3,6 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,9 +17,13 @@ from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.exposure import Likeness
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Shown
-from ucfrec.user_model.reward import compare_to_history
+from ucfrec.errors import damage_explained
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors
+from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
 from ucfrec.user_model.reward_report import SAVED
 
+SESSIONS: Final = "sessions.safetensors"
+"""File of session ends, fatigue and calibration in the model's folder."""
 _PENALTY: Final = 1.0
 """L2 penalty of the logistic regression on standardised inputs."""
 _LAGS: Final = 10
@@ -55,7 +60,6 @@ class LoggedEnds:
     inputs: Tensor
     """(N, F) of `describe_steps`."""
     ended: BoolArray
-    """(N,)."""
     followed: BoolArray
     """(N,) whether another session of the same user follows; true where users are not named."""
 
@@ -81,7 +85,6 @@ class LoggedEnds:
         return cls(inputs, steps == store.lengths[episodes] - 1, followed[episodes])
 
     def select(self, rows: BoolArray) -> "LoggedEnds":
-        """Some of the steps."""
         inputs = self.inputs[torch.from_numpy(rows)]
         return LoggedEnds(inputs, self.ended[rows], self.followed[rows])
 
@@ -113,9 +116,7 @@ class SessionEndReport:
     """How well session ends are predicted."""
 
     rows: int
-    """Number of training steps fitted to."""
     validation_rows: int
-    """Number of held-out steps."""
     loss: Mapping[str, float]
     """Held-out log loss (nats) of each kind of model: `constant`, `logistic` and `boosted`."""
     gain: Mapping[str, tuple[float, float]]
@@ -183,7 +184,6 @@ class SessionEnd:
     def _fit_best(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
-        """The best kind, fitted to all of `logged`."""
         inputs, ended = logged.inputs, logged.ended
         kinds = {"constant": _logistic(inputs, ended, weights=False)}
         if _FEWEST <= ended.sum() <= len(ended) - _FEWEST:
@@ -201,7 +201,6 @@ class SessionEnd:
         return models[best], report
 
     def _losses(self, rows: LoggedEnds) -> Tensor:
-        """Log losses (N,) of logged steps."""
         odds = self._log_odds(rows.inputs)
         signed = torch.where(torch.from_numpy(rows.ended), -odds, odds)
         return F.softplus(signed.clamp(max=_HIGHEST))
@@ -243,6 +242,16 @@ class SessionEnd:
         return standard @ tensors["weights"] + tensors["bias"]
 
 
+def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
+    """The model of session ends in the folder of a user model; None if there is none."""
+    path = folder / SESSIONS
+    if reward is None or not path.exists():
+        return None
+    tensors, _ = load_tensors(path)
+    with damage_explained(path, REMEDY):
+        return SessionEnd.of(reward.likeness, tensors)
+
+
 def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[str, Tensor]:
     """Tensors of a logistic regression; without `weights`, of its bias alone."""
     from sklearn.linear_model import LogisticRegression
@@ -273,7 +282,6 @@ def _gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
 
 
 def _pad(items: Tensor) -> Tensor:
-    """The `_LAGS` latest of items (M, L)."""
     return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
 

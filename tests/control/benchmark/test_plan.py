@@ -13,6 +13,7 @@ from ucfrec.acting.decision import DecisionRule
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
+from ucfrec.results.rows import read_rows
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec_control.benchmark import plan
 from ucfrec_control.benchmark.budgets import ANTMAZE, BUDGETS, budget_of
@@ -193,8 +194,9 @@ def test_the_best_trajectories_are_cloned_and_evaluated(
     settings += ("train.validate_every=25", "policy.dim=16")
     budget = Budget("tiny", (MADE,), 2, Evaluation(2, 1000), settings)
     cells = list(score_cells(tmp_path, tmp_path / "runs", budget, MAIN))
-    found = run_grid(cells, SCORE_MEASUREMENT, tmp_path / "rows.jsonl", 1)
-    keys = [(row.training_seed, row.method, row.checkpoint) for row in found]
+    run_grid(cells, SCORE_MEASUREMENT, tmp_path / "rows.jsonl", 1)
+    measured = read_rows(tmp_path / "rows.jsonl")
+    keys = [(row.training_seed, row.method, row.checkpoint) for row in measured]
     assert keys == list(product(range(2), rows, ("last", "best")))
     seen = np.random.default_rng(0).normal(size=(20, 11)).astype(np.float32)
     chosen = {}

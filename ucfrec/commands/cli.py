@@ -213,10 +213,11 @@ def build_parser(program: Program, arguments: Sequence[str]) -> argparse.Argumen
         dest="command", required=True, metavar="COMMAND", parser_class=_CommandParser
     )
     called = next((word for word in arguments if word in program.commands), None)
+    helps = any(word.startswith(("-h", "--h")) for word in arguments)
     for name, summary in program.commands.items():
         command = commands.add_parser(name, description=summary, prog=f"{program.name} {name}")
         if name == called:
-            add_options(command, program.find_table(name))
+            add_options(command, program.find_table(name), helps)
     return parser
 
 

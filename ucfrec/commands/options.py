@@ -101,8 +101,10 @@ def settings_given(options: Table, table: type[Any], prefix: str = "") -> dict[s
     }
 
 
-def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
-    """Add the options of a command to its parser, with help and groups."""
+def add_options(
+    parser: argparse.ArgumentParser, table: type[Table], described: bool = True
+) -> None:
+    """Add the options of a command to its parser, in groups, with their help if it is shown."""
     groups: dict[Any, Any] = {"": parser}
     usage, hints = ["%(prog)s"], get_type_hints(table, include_extras=True)
     for field in fields(table):  # type: ignore[arg-type]
@@ -121,7 +123,7 @@ def add_options(parser: argparse.ArgumentParser, table: type[Table]) -> None:
         name = f"--{field.name.replace('_', '-')}"
         if ARGUMENT in marks:
             name, group = field.name, parser
-        text = _describe(owner, field, marks).replace("%", "%%")
+        text = _describe(owner, field, marks).replace("%", "%%") if described else None
         action = group.add_argument(name, help=text, **_read_words(kind, marks, field.default))
         word = str(action.metavar or field.name.upper())
         if ARGUMENT in marks:

@@ -86,8 +86,8 @@ COMPONENTS: Final[Mapping[str, Method]] = {
 """UCF without one of the shared components, or with another one, by their name in the table
 `shared`. `ucf-wo-policy` has policy weight 0 wherever it looks ahead."""
 SCREENED: Final[Mapping[str, Method]] = {
-    "ucf-screened": replace(METHODS["ucf"], screening="copies"),
-    "ucf-dropped": replace(METHODS["ucf"], screening="drop"),
+    "ucf-screened": replace(METHODS["ucf"], screening="copies", vectors=False),
+    "ucf-dropped": replace(METHODS["ucf"], screening="drop", vectors=False),
 }
 """UCF with augmentation that intervenes on the observation columns that screening flags, and UCF
 without these columns, by their name in the distractor table."""

@@ -18,7 +18,7 @@ from safetensors.numpy import load_file
 from ucfrec import EpisodeStore, Recommender
 from ucfrec.acting.rollout import rollout
 from ucfrec.commands.cli import UCFREC, build_parser, explanation, main
-from ucfrec.commands.settings import settings_text
+from ucfrec.commands.train import settings_text
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json

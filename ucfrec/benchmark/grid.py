@@ -37,8 +37,7 @@ class _Task:
     def measure(self) -> list[ResultRow]:
         """Measure the cell, append its rows and return them."""
         reset_peak_memory()
-        rows = self.how.measure(self.cell, self.key)
-        peak = peak_memory_mib()
+        rows, peak = self.how.measure(self.cell, self.key), peak_memory_mib()
         rows = [replace(row, peak_memory_mib=peak) for row in rows]
         append_rows(self.results, rows, self.config)
         return rows
@@ -93,9 +92,8 @@ def run_grid(
     earlier = read_rows(results)
     rows = {name: [row for row in earlier if t.key.covers(row)] for name, t in tasks.items()}
     missing = {name: task for name, task in tasks.items() if not rows[name]}
-    print(
-        f"{describe}: {len(tasks)} cells, {len(missing)} of them left to measure", file=sys.stderr
-    )
+    counts = f"{len(tasks)} cells, {len(missing)} of them left to measure"
+    print(f"{describe}: {counts}", file=sys.stderr)
     if missing:
         rows |= _measure_all(missing, workers, describe)
     return [row for group in rows.values() for row in group]
@@ -105,14 +103,10 @@ def _measure_all(
     tasks: Mapping[str, _Task], workers: int, describe: str
 ) -> dict[str, list[ResultRow]]:
     """The rows of each task; raises an error at the end if one of them failed."""
-
-    def sort_key(item: tuple[str, _Task]) -> int:
-        # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
-        seed = item[1].key.training_seed
-        return -1 if seed is None else seed
-
     errors, rows, workers = [], {}, min(workers, len(tasks))
-    ordered = dict(sorted(tasks.items(), key=sort_key))
+    # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
+    seeds = {name: task.key.training_seed for name, task in tasks.items()}
+    ordered = {n: tasks[n] for n in sorted(tasks, key=lambda n: (seeds[n] is not None, seeds[n]))}
     outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
     with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
         for name, outcome in outcomes:

@@ -55,11 +55,7 @@ def method_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
 
 def sweep_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str:
     """One line per environment and setting of UCF: return, validation loss and acceptance rate."""
-    columns = {
-        "R_cum": "R_cum",
-        "validation loss": "validation_loss",
-        "acceptance": "acceptance",
-    }
+    columns = {"R_cum": "R_cum", "validation loss": "validation_loss", "acceptance": "acceptance"}
     return _make_table(select_checkpoint(rows, checkpoint), "setting", columns)
 
 
@@ -70,13 +66,7 @@ def _make_table(
     more: Sequence[str] = (),
     describe: Callable[[Sequence[ResultRow]], list[str]] = lambda group: [],
 ) -> str:
-    """Mean and spread of metrics, one line per environment and method.
-
-    Args:
-        name: head of the column of methods.
-        columns: head of a column to its metric.
-        more: heads of the columns that `describe` makes of the rows of a line.
-    """
+    """Mean and spread of `columns`, {head: metric}, and `more` columns, which `describe` makes."""
     lines = []
     for (environment, method), group in grouped(rows, lambda r: (r.environment, r.method)).items():
         spread = [mean_and_sd(list_metric(group, metric)) for metric in columns.values()]
@@ -91,15 +81,14 @@ def distractor_table(rows: Sequence[ResultRow], checkpoint: str = "best") -> str
     return with the distractor off is below that of the policy trained without a distractor.
     """
 
-    def key(row: ResultRow) -> tuple[str, float, str]:
-        # Environments together, the largest target first; methods stay in their order.
-        return str(row.environment), -float(str(row.conditions["quantiles"])), row.method
-
-    groups = grouped(select_checkpoint(rows, checkpoint), key)
+    groups = grouped(
+        select_checkpoint(rows, checkpoint),
+        lambda r: (str(r.environment), -float(str(r.conditions["quantiles"])), r.method),
+    )
+    # Environments together, the largest target first; methods stay in their order.
+    ordered = sorted(groups.items(), key=lambda item: item[0][:2])
     lines = []
-    for (environment, quantile, method), group in sorted(
-        groups.items(), key=lambda item: item[0][:2]
-    ):
+    for (environment, quantile, method), group in ordered:
         by_rate = grouped(group, lambda row: row.conditions["distractor"])
         indexed = [_index_by_seeds(by_rate.get(rate, ())) for rate in DISTRACTOR_RATES]
         pairs = [pair for pair in indexed[0] if all(pair in values for values in indexed)]
@@ -185,13 +174,11 @@ def average_seeds(
         lines: as `ResultRow.as_line` returns them; a value may be missing or None.
         by: names of the columns to group by.
     """
-    averages = []
-    for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items():
-        average: dict[str, Any] = dict(zip(by, key, strict=True))
-        for name in values:
-            average[name] = mean_and_sd(line[name] for line in group if line.get(name) is not None)
-        averages.append(average)
-    return averages
+    return [
+        dict(zip(by, key, strict=True))
+        | {n: mean_and_sd(ln[n] for ln in group if ln.get(n) is not None) for n in values}
+        for key, group in grouped(lines, lambda line: tuple(line[name] for name in by)).items()
+    ]
 
 
 def difference_table(
@@ -227,10 +214,7 @@ def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, st
 
 def _index_by_seeds(rows: Sequence[ResultRow], metric: str | None = None) -> _BySeed:
     """A metric, or None for what a row is about, by the seeds of the log and of the training."""
-    return {
-        (row.log_seed, row.training_seed): row.value if metric is None else row.metrics[metric]
-        for row in rows
-    }
+    return {(r.log_seed, r.training_seed): r.metrics[metric or r.metric] for r in rows}
 
 
 def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
@@ -243,8 +227,8 @@ def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
 
 
 def _subtract(values: _BySeed, reference: _BySeed) -> _BySeed:
-    """By how much `values` exceed those of the same seeds in `reference`; a value that no log or
-    seed changes is compared with each."""
+    """By how much `values` exceed those of the same seeds in `reference`."""
+    # A value that no log or seed changes is compared with each.
     if values.keys() == {(None, None)}:
         values = dict.fromkeys(reference, *values.values())
     return {

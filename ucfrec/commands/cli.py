@@ -79,9 +79,10 @@ UCFREC = Program(
     {
         **dict.fromkeys(("report", "promote", "verify"), "runs"),
         **dict.fromkeys(("join", "compare"), "update"),
-        **dict.fromkeys(("tune", "screen"), "train"),
+        **dict.fromkeys(("settings", "tune", "screen"), "train"),
         **dict.fromkeys(("evaluate", "collect"), "simulate"),
-        **{"score": "ope", "explore": "serve", "export": "recommend", "datasets": "prepare"},
+        **dict.fromkeys(("rank", "score"), "ope"),
+        **{"explore": "serve", "export": "recommend", "datasets": "prepare"},
     },
 )
 

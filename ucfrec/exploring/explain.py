@@ -77,7 +77,10 @@ def explain(
         InputError: the rule does not fit the policy, or an item of the history is not known.
     """
     (frame,) = recommend(trained, [user], k, rule=rule, filter_seen=filter_seen)
-    sessions = _session(trained, user)
+    # The user's latest session, before the step that is decided.
+    numbered = user.with_numbers(trained.items, False)
+    latest = numbered.latest_session(trained.record.session_gap_ms)
+    sessions = sessions_of(trained, latest, trained.scorer().length)
     parts = _parts(trained.scorer(rule), sessions)
     numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
     cards = tuple(
@@ -120,13 +123,6 @@ def read_pasted(text: str) -> pd.DataFrame:
     times = now - 60_000 * np.arange(len(items), 0, -1)
     frame = pd.DataFrame({schema.USER_ID: "pasted", schema.ITEM_ID: items})
     return frame.assign(timestamp=times, session_id=0, reward=rewards)
-
-
-def _session(trained: TrainedPolicy, user: Histories) -> Sessions:
-    """The user's latest session, before the step that is decided."""
-    numbered = user.with_numbers(trained.items, False)
-    latest = numbered.latest_session(trained.record.session_gap_ms)
-    return sessions_of(trained, latest, trained.scorer().length)
 
 
 def _plain(rule: DecisionRule, **changes: Any) -> DecisionRule:

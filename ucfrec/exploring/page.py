@@ -89,15 +89,15 @@ class Explorer:
         Args:
             fields: of the form, by name; unknown ones are ignored.
         """
-        cards = [run.folder / CARD for run in self.runs]
-        texts = [
-            card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
-            for card in cards
-        ]
+        runs = []
+        for run in self.runs:
+            card = run.folder / CARD
+            text = card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
+            runs.append((run.folder.name, run, text))
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
             given=fields,
-            runs=[(r.folder.name, r, text) for r, text in zip(self.runs, texts, strict=True)],
+            runs=runs,
             sliders=self._sliders(fields),
             values=self.values,
             chart=self.values_chart,
@@ -179,8 +179,7 @@ class Explorer:
         if trained.reward_model is not None:
             weight = Slider("reward_weight", "Reward weight", 0, 32, 0.25, rule.reward_weight)
             sliders.insert(1, weight)
-        states = trained.item_states
-        if states is None or not bool((states.tags >= 0).any()):
+        if (states := trained.item_states) is None or not bool((states.tags >= 0).any()):
             sliders.pop()
         for n, slider in enumerate(sliders):
             text = fields.get(slider.name, "")
@@ -204,11 +203,7 @@ class Explorer:
 
 
 def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Histories:
-    """The history that is pasted, else that of the user in the store.
-
-    Raises:
-        InputError: the text cannot be used, or there is no such user or no store.
-    """
+    """The history that is pasted, else that of the user in the store."""
     run, text = trained.folder.name, fields.get("history", "").strip()
     if text:
         (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
@@ -249,10 +244,8 @@ def _read_number(
     fields: Mapping[str, str], name: str, default: float, low: float, high: float
 ) -> float:
     text = fields.get(name, "")
-    if not text.strip():
-        return default
     try:
-        value = float(text)
+        value = float(text) if text.strip() else default
     except ValueError:
         value = float("nan")
     if not low <= value <= high:

@@ -46,7 +46,7 @@ from ucfrec.reporting.measuring import TEST_SPLIT, estimate_return, evaluate_in,
 from ucfrec.reporting.model_card import write_card
 from ucfrec.reporting.page import write_report
 from ucfrec.results.rows import Evaluation, Ranking, ResultTable
-from ucfrec.runs.config import TABLES, Config, resolve_config, settings_given
+from ucfrec.runs.config import TABLES, resolve_config, settings_given
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import (
     check_arguments,
@@ -94,10 +94,7 @@ class Recommender:
     """
 
     def __init__(
-        self,
-        policy: str = "ucf",
-        settings: Mapping[str, Any] | Sequence[str] = (),
-        seed: int = 0,
+        self, policy: str = "ucf", settings: Mapping[str, Any] | Sequence[str] = (), seed: int = 0
     ) -> None:
         """
         Args:
@@ -194,14 +191,9 @@ class Recommender:
             on_step: called after every update with the step and `{"loss": …}`.
             on_validation: called after every validation with the step and all that is logged.
         """
-        options = {
-            "reward": reward,
-            "session_by": session_by,
-            "gap_minutes": gap_minutes,
-            "split": split,
-            "dataset": dataset,
-        }
-        options = {name: value for name, value in options.items() if value is not None}
+        names = ("reward", "session_by", "gap_minutes", "split", "dataset")
+        values = zip(names, (reward, session_by, gap_minutes, split, dataset), strict=True)
+        options = {name: value for name, value in values if value is not None}
         with ExitStack() as stack:
             # Whoever fits next removes what is left, should this process be killed.
             parent = Path(tempfile.gettempdir()) if out is None else Path(out).absolute().parent
@@ -531,23 +523,18 @@ class Recommender:
         policy._trained = TrainedPolicy.load(Path(run).absolute())
         policy.config = config = policy._trained.record.config
         policy.policy, policy.seed = config.policy_name, config.seed
-        policy.settings = _list_changes(config)
+        defaults = asdict(resolve_config(config.policy_name))
+        policy.settings = {
+            f"{table}.{name}": value
+            for table in TABLES
+            for name, value in asdict(getattr(config, table)).items()
+            if value != defaults[table][name]
+        }
         return policy
 
 
 UCF = Recommender
 """A `Recommender`, whose default policy is the Unified Causal Transformer (Algorithm 1)."""
-
-
-def _list_changes(config: Config) -> dict[str, Any]:
-    """The settings `table.field` of a configuration that are not the defaults of its policy."""
-    defaults = asdict(resolve_config(config.policy_name))
-    return {
-        f"{table}.{name}": value
-        for table in TABLES
-        for name, value in asdict(getattr(config, table)).items()
-        if value != defaults[table][name]
-    }
 
 
 def _name_logs(logs: Logs | None) -> str:

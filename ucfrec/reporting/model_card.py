@@ -33,10 +33,19 @@ def write_card(run: Path) -> Path:
     """
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
-    logged = read_metrics(run / "policy")
+    logged, fit = read_metrics(run / "policy"), record.policy
     parts = [
         f"# Model card: {record.name}",
-        _describe_run(record),
+        _tabulate(
+            {
+                "policy": record.name,
+                "configuration": config_hash(record.settings),
+                "seed": record.seed,
+                "training steps of the model": fit and fit.steps,
+                "best validation loss": fit and fit.best_validation,
+                "versions": ", ".join(f"{name} {n}" for name, n in record.versions.items()),
+            }
+        ),
         "## Training data",
         _describe_data(record, refitted),
         "## How it acts",
@@ -53,11 +62,7 @@ def write_card(run: Path) -> Path:
 
 
 def add_measurement(
-    run: Path,
-    how: str,
-    of: str,
-    values: Mapping[str, object],
-    remarks: Sequence[str] = (),
+    run: Path, how: str, of: str, values: Mapping[str, object], remarks: Sequence[str] = ()
 ) -> None:
     """Add what was measured of a run to its card; it replaces an older one of the same.
 
@@ -81,7 +86,7 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
     of = f"{row.environment}, {_format_rule(row)}, checkpoint {row.checkpoint}"
-    values = {**_select_values(row, names), "seed": row.evaluation_seed}
+    values = _select_values(row, names) | {"seed": row.evaluation_seed}
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
@@ -96,11 +101,8 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
     values = _select_values(row, names) | {"logged": rows[LOGGED].value}
-    remarks = (
-        str(report.verdict),
-        *(w for w in report.warnings if w not in report.verdict.reasons),
-    )
-    add_measurement(run, "ucfrec ope", of, values, remarks)
+    others = [text for text in report.warnings if text not in report.verdict.reasons]
+    add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *others])
 
 
 def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
@@ -137,19 +139,6 @@ def _read_measured(run: Path) -> list[dict[str, Any]]:
     return list(read_json(run / MEASURED)) if (run / MEASURED).exists() else []
 
 
-def _describe_run(record: RunRecord) -> str:
-    fit = record.policy
-    rows = {
-        "policy": record.name,
-        "configuration": config_hash(record.settings),
-        "seed": record.seed,
-        "training steps of the model": fit and fit.steps,
-        "best validation loss": fit and fit.best_validation,
-        "versions": ", ".join(f"{name} {number}" for name, number in record.versions.items()),
-    }
-    return _tabulate(rows)
-
-
 def _describe_data(record: RunRecord, refitted: bool) -> str:
     source = record.data
     window = _training_window(record, refitted)
@@ -173,9 +162,7 @@ def _describe_data(record: RunRecord, refitted: bool) -> str:
 def _training_window(record: RunRecord, refitted: bool) -> tuple[int, int] | None:
     """Times (ms) of the first training row, and from which on rows are no longer trained on."""
     times, splits = record.data.time_range_ms, record.data.split_times_ms
-    if times is None:
-        return None
-    if splits is None or refitted:
+    if times is None or splits is None or refitted:
         return times
     return times[0], min(splits[0], times[1])
 

@@ -38,6 +38,7 @@ from ucfrec.reporting.training import (
     tabulate_rows,
     tabulate_samples,
 )
+from ucfrec.results.statistics import grouped
 from ucfrec.runs.record import RUN, RunRecord, read_augmentation, read_candidates, read_record
 from ucfrec.runs.trained_policy import AUGMENTATION
 
@@ -90,9 +91,7 @@ def write_report(
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
-    by_data: dict[str, list[_Run]] = {}
-    for run in _read_runs(runs):
-        by_data.setdefault(run.record.fingerprint, []).append(run)
+    by_data = grouped(_read_runs(runs), lambda run: run.record.fingerprint)
     evidence = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
@@ -110,11 +109,7 @@ def write_report(
         with damage_explained(group[0].folder / RUN, _REMEDY):
             sections.append(_section(group, features))
     page = template("ucfrec.reporting", "report.html").render(
-        version=__version__,
-        warnings=warnings,
-        sections=sections,
-        points=POINTS,
-        **evaluated,
+        version=__version__, warnings=warnings, sections=sections, points=POINTS, **evaluated
     )
     with atomic_file(out) as scratch:
         # Folder names may have bytes that are not valid Unicode.
@@ -154,10 +149,8 @@ def _warnings(run: _Run) -> list[str]:
     report = run.augmentation
     warnings = [run.status] if run.record.policy is None else []
     if report is not None:
-        warnings += report.warnings
-        bound_is_useful = report.bound < report.reward_model.reward_std
-        if not (bound_is_useful and report.moves.edits):
-            warnings.append(report.verdict)
+        useful = report.moves.edits and report.bound < report.reward_model.reward_std
+        warnings += [*report.warnings, "" if useful else report.verdict]
     warnings.append(run.record.learned_nothing(run.logged))
     return [text for text in warnings if text]
 

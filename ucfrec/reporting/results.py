@@ -6,7 +6,7 @@ than a test of the difference at 5%.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -121,67 +121,50 @@ def draw_estimates(results: Results) -> list[tuple[Chart, Table, Sequence[str]]]
     pictures: list[tuple[Chart, Table, Sequence[str]]] = []
     for estimates in results.estimates:
         logged = [] if estimates.logged is None else [estimates.logged]
-        parts = [
-            _draw_rows(
-                [*logged, *estimates.rows],
-                "sessions",
-                ("mean return of a session", f"Mean return of a session: {estimates.name}"),
-                f"Estimates for {estimates.name}",
-            )
-        ]
+        parts = [_draw_rows([*logged, *estimates.rows], "sessions", estimates.name)]
         if estimates.steps:
-            title = f"Mean reward of a step with a propensity: {estimates.name}"
-            parts.append(
-                _draw_rows(
-                    estimates.steps,
-                    "steps",
-                    ("mean reward of a step", title),
-                    f"Estimates per step for {estimates.name}",
-                )
-            )
+            parts.append(_draw_rows(estimates.steps, "steps", estimates.name))
         # The warnings come once, below both.
         pictures += [(*part, ()) for part in parts[:-1]]
         pictures.append((*parts[-1], estimates.warnings))
     return pictures
 
 
-def _draw_rows(
-    rows: Sequence[ResultRow], unit: str, value: tuple[str, str], caption: str
-) -> tuple[Chart, Table]:
-    """Chart and table of estimates.
-
-    Args:
-        unit: "sessions" or "steps".
-        value: name of the value, as the head of its column and as the title of the chart.
-    """
+def _draw_rows(rows: Sequence[ResultRow], unit: str, policy: str) -> tuple[Chart, Table]:
+    """Chart and table of the estimates for a policy per `unit`, "sessions" or "steps"."""
     columns = {
         f"effective_{unit}": "effective sample",
         "largest_weight": "share of the largest weight",
-        **({"sessions": "sessions", "overlap": "overlap"} if unit == "sessions" else {}),
     }
+    if unit == "sessions":
+        columns |= {"sessions": "sessions", "overlap": "overlap"}
+        head, of, caption = "mean return of a session", "", "Estimates for"
+    else:
+        head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
     names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
     body = [
         (name, [format_interval(row), *(format_value(row.as_line().get(key)) for key in columns)])
         for name, row in zip(names, rows, strict=True)
     ]
-    head, title = value
-    chart = interval_chart(f"{title}, with 95% intervals", _list_intervals(names, rows))
-    return chart, Table(caption, "", [head, *columns.values()], body)
+    title = f"{head.capitalize()}{of}: {policy}, with 95% intervals"
+    chart = interval_chart(title, _list_intervals(names, rows))
+    return chart, Table(f"{caption} {policy}", "", [head, *columns.values()], body)
 
 
 def draw_forest(results: Results) -> Chart | None:
     """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
-    names, rows = [], []
-    for estimates in results.estimates:
-        if (row := find_quoted(estimates.rows)) is not None:
-            names.append(f"{estimates.name}: {row.method}")
-            rows.append(row)
-    if not rows:
-        return None
     intervals = [
-        replace(interval, reliable=row.details.get("reliable") is True)
-        for interval, row in zip(_list_intervals(names, rows), rows, strict=True)
+        Interval(
+            f"{estimates.name}: {row.method}",
+            row.value,
+            *row.interval,
+            reliable=row.details.get("reliable") is True,
+        )
+        for estimates in results.estimates
+        if (row := find_quoted(estimates.rows)) is not None and row.interval
     ]
+    if not intervals:
+        return None
     # The line is of one set of logs; several have a line each in their own charts.
     logged = {policy.logged.value for policy in results.estimates if policy.logged is not None}
     title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
@@ -198,10 +181,8 @@ def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Int
 
 def format_interval(row: ResultRow) -> str:
     """The value with its 95% interval, if it has one."""
-    if row.interval is None:
-        return f"{format_value(row.value)} [–]"
-    low, high = row.interval
-    return f"{format_value(row.value)} [{format_value(low)}, {format_value(high)}]"
+    ends = "–" if row.interval is None else ", ".join(map(format_value, row.interval))
+    return f"{format_value(row.value)} [{ends}]"
 
 
 def _name_rows(rows: Sequence[ResultRow]) -> list[str]:

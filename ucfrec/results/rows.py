@@ -15,14 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from annotated_types import Ge, Lt
-from pydantic import (
-    AfterValidator,
-    AllowInfNan,
-    ConfigDict,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import AfterValidator, AllowInfNan, ConfigDict, Strict, TypeAdapter, ValidationError
 
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import (
@@ -98,10 +91,9 @@ class RowKey:
 
     def covers(self, row: "ResultRow") -> bool:
         """Whether `row` is of this measurement; `row` may have more conditions."""
-        values = {name: getattr(self, name) for name in _KEY_FIELDS}
-        return all(getattr(row, name) == value for name, value in values.items()) and all(
-            name in row.conditions and row.conditions[name] == value
-            for name, value in self.conditions.items()
+        return (
+            all(getattr(row, name) == getattr(self, name) for name in _KEY_FIELDS)
+            and self.conditions.items() <= row.conditions.items()
         )
 
 
@@ -184,10 +176,8 @@ class ResultRow(RowKey):
         """The row as JSON values, without fields at their default."""
         written = {}
         for f in fields(self):
-            value = getattr(self, f.name)
-            factory = f.default_factory
-            default = f.default if factory is MISSING else factory()
-            if value != default:
+            value, factory = getattr(self, f.name), f.default_factory
+            if value != (f.default if factory is MISSING else factory()):
                 written[f.name] = list(value) if isinstance(value, tuple) else value
         return written
 
@@ -257,17 +247,14 @@ def read_lines(path: Path) -> list[tuple[int, object]]:
         InputError: a line is not JSON, or the file is not UTF-8 text.
     """
     values: list[tuple[int, object]] = []
-    if not path.exists():
-        return values
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = path.read_text(encoding="utf-8").split("\n") if path.exists() else []
     except UnicodeDecodeError:
         raise InputError(f"{path} is not UTF-8 text; name a file of result rows") from None
     for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
         try:
-            values.append((number, json.loads(line)))
+            if line.strip():
+                values.append((number, json.loads(line)))
         except (ValueError, RecursionError):
             raise InputError(
                 f"{path}, line {number} is not a result row; delete the line to measure it again"
@@ -315,17 +302,12 @@ def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
 
 def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """The last row of each measurement, regardless of data and configuration."""
+    same = {*_KEY_FIELDS, "environment", "checkpoint"} - {"policy", *_ORIGIN}
     last = {
-        (*(getattr(row, name) for name in _SAME), str(sorted(row.conditions.items()))): row
+        (*(getattr(row, name) for name in same), str(sorted(row.conditions.items()))): row
         for row in rows
     }
     return list(last.values())
-
-
-_SAME: Final = (
-    *("suite", "table", "task", "method", "environment", "checkpoint"),
-    *("training_seed", "log_seed", "evaluation_seed"),
-)
 
 
 @contextmanager
@@ -357,7 +339,8 @@ def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None
         os.fsync(file.fileno())
 
 
-_IDENTITY = ("suite", "table", "command", "commit", "config_hash", "data_fingerprint", "checkpoint")
+_ORIGIN: Final = ("config_hash", "data_fingerprint")
+_IDENTITY: Final = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint")
 """Fields that a frame leaves out; a file of the rows has them."""
 
 
@@ -386,8 +369,19 @@ class ResultTable:
         (`NAME_low`, `NAME_high`), then the conditions of the measurement."""
         import pandas as pd
 
-        frame = pd.DataFrame([_line(row) for row in self.rows])
-        return frame.dropna(axis="columns", how="all")
+        lines = []
+        for row in self.rows:
+            ends = {name: ends for name, ends in row.details.get("intervals", {}).items() if ends}
+            if row.interval is not None:
+                ends[row.metric] = row.interval
+            line: dict[str, Any] = {"method": row.method}
+            for name, value in row.metrics.items():
+                line[name] = value
+                if name in ends:
+                    line[f"{name}_low"], line[f"{name}_high"] = ends[name]
+            others = row.as_line().items()
+            lines.append(line | {n: v for n, v in others if n not in _IDENTITY and n not in line})
+        return pd.DataFrame(lines).dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
         """Draw one metric of every method with its 95% interval.
@@ -423,26 +417,12 @@ class ResultTable:
 
     def _table(self) -> "pd.DataFrame":
         frame = self.to_frame()
-        columns = self.shown or tuple(dict.fromkeys(n for row in self.rows for n in row.metrics))
+        columns = self.shown or dict.fromkeys(name for row in self.rows for name in row.metrics)
         return frame[["method", *(name for name in columns if name in frame)]]
 
     def _repr_html_(self) -> str:
         table = self._table().to_html(index=False, float_format="{:.4g}".format, na_rep="–")
         return str(table) + "".join(f"<p>{escape(text)}</p>" for text in self._said())
-
-
-def _line(row: ResultRow) -> dict[str, Any]:
-    """The cells of a row: the method, metrics with intervals, conditions, other fields."""
-    ends = {name: ends for name, ends in row.details.get("intervals", {}).items() if ends}
-    if row.interval is not None:
-        ends[row.metric] = row.interval
-    line: dict[str, Any] = {"method": row.method}
-    for name, value in row.metrics.items():
-        line[name] = value
-        if name in ends:
-            line[f"{name}_low"], line[f"{name}_high"] = ends[name]
-    fields = {name: v for name, v in row.as_line().items() if name not in _IDENTITY}
-    return {**line, **{name: value for name, value in fields.items() if name not in line}}
 
 
 @dataclass(frozen=True, repr=False)

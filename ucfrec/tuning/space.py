@@ -77,9 +77,7 @@ HISTORY: Final[Space] = {
 }
 """Of those that read what was shown before, too."""
 NEIGHBORS: Final[Space] = {"policy.neighbors": Dimension(low=10, high=500, log=True)}
-REWARD_WEIGHTS: Final[Space] = {
-    "rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0)),
-}
+REWARD_WEIGHTS: Final[Space] = {"rule.reward_weights": Dimension((0.0, 0.5, 1.0, 2.0, 4.0, 8.0))}
 
 
 def default_space(policy: str, by_value: bool) -> Space:

@@ -51,12 +51,10 @@ _COMPARED: Final = 4
 
 
 def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
-    """The metric of a finished run; higher is better.
+    """The metric of a finished run, one of `METRICS`; higher is better.
 
     Args:
-        trained: the run's policy.
         store: the store that it was trained on.
-        metric: one of `METRICS`.
         k: items recommended, of "ndcg".
 
     Raises:
@@ -144,8 +142,7 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
             _run_trials(plan, 0, shares[0], seed)
         elif shares:
             threads = max(1, torch.get_num_threads() // len(shares))
-            start = partial(torch.set_num_threads, threads)
-            with pool_of_processes(len(shares), start) as pool:
+            with pool_of_processes(len(shares), partial(torch.set_num_threads, threads)) as pool:
                 with block_ctrl_c():
                     processes = [
                         pool.submit(_run_trials, plan, worker, share, seed)
@@ -224,8 +221,7 @@ def _run_trials(plan: Plan, worker: int, count: int, seed: int) -> None:
     # A search that goes on must not draw the first points once more.
     sampler = optuna.samplers.TPESampler(seed=seed + 1000 * worker)
     study = optuna.load_study(storage=plan.storage, study_name=_NAME, sampler=sampler)
-    store = EpisodeStore.open(plan.store)
-    objective = partial(_objective, plan, store)
+    objective = partial(_objective, plan, EpisodeStore.open(plan.store))
     study.optimize(objective, n_trials=count, catch=(InputError,))
 
 
@@ -268,13 +264,11 @@ def _list_measured(study: "Study") -> "list[FrozenTrial]":
 
 
 def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
-    """Whether the loss of a trial is above the median of earlier ones of its policy at that step.
-
-    Losses of different policies are not of the same quantity.
-    """
+    """Whether its loss is above the median of earlier trials of its policy at that step."""
     trials = study.get_trials(deepcopy=False)
     curve = trials[number].intermediate_values
     step = max(curve)
+    # Losses of different policies are not of the same quantity.
     losses = [
         trial.intermediate_values[step]
         for trial in trials

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import pytest
 
 from ucfrec.commands.cli import main
-from ucfrec.commands.settings import settings_text
+from ucfrec.commands.train import settings_text
 from ucfrec.policies.registry import BUILT_IN
 from ucfrec.runs.config import TABLES, resolve_config
 

@@ -22,7 +22,7 @@ from ucfrec.benchmark.cells import Budget, Cell, Measurement, Method, Plan, Task
 from ucfrec.benchmark.grid import run_grid
 from ucfrec.benchmark.tables import average_seeds
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.processes import provenance
+from ucfrec.provenance import provenance
 from ucfrec.reporting.tables import format_rows
 from ucfrec.results.rows import ResultRow, RowKey
 from ucfrec.results.statistics import grouped, summary

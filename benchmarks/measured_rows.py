@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ucfrec.processes import provenance
+from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, append_rows
 
 

@@ -43,7 +43,8 @@ from ucfrec.off_policy.estimators import estimate
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.off_policy.models import fit_models
 from ucfrec.off_policy.verdict import conclude
-from ucfrec.processes import progress, provenance
+from ucfrec.processes import progress
+from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, append_rows
 
 SHOWN = ("logged", "IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR", "lift")

@@ -16,7 +16,7 @@ PACKAGES = {
     "ucfrec_control": ROOT / "control" / "ucfrec_control",
 }
 ORDER = (
-    {"arrays", "schema", "errors", "processes"},
+    {"arrays", "schema", "errors", "processes", "provenance"},
     {"files", "plugins", "settings"},
     {"results", "fitting"},
     {"episodes"},

@@ -27,13 +27,7 @@ from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.evaluate import evaluate_behavior, evaluate_policy
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.fitting.loop import LoopConfig, fit
-from ucfrec.processes import (
-    Interrupted,
-    command_line,
-    interruptions_raised,
-    random_state_kept,
-    shorten_paths,
-)
+from ucfrec.processes import Interrupted, interruptions_raised, random_state_kept
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.run import train_run
 from ucfrec.runs.start import new_policy
@@ -319,56 +313,6 @@ def test_the_numbers_of_a_run_do_not_depend_on_the_callers_state(
         train_run(store, tmp_path / str(seed), config)
         weights.append(TrainedPolicy.load(tmp_path / str(seed)).policy.state_dict())
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
-
-
-@pytest.mark.parametrize(
-    ("argument", "written"),
-    [
-        ("/home/me/data/log.parquet", "log.parquet"),
-        ("/home/me/data/", "data"),
-        ("--out=/home/me/runs", "--out=runs"),
-        ("/home/a=b/runs", "runs"),
-        ("~/runs", "runs"),
-        (r"C:\Users\me\runs", "runs"),
-        ("runs/benchmark", "runs/benchmark"),
-        ("train.learning_rate=1e-3", "train.learning_rate=1e-3"),
-        ("is_click / 2", "is_click / 2"),
-        ("--reward=is_click/2", "--reward=is_click/2"),
-        ("/", "/"),
-        ("", ""),
-    ],
-)
-def test_folders_of_a_machine_are_not_written_down(argument: str, written: str) -> None:
-    assert shorten_paths(argument) == written
-
-
-def test_a_command_is_its_name_and_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["/opt/bin/ucfrec", "train", "/home/me/store", "--seed", "3"])
-    assert command_line() == "ucfrec train store --seed 3"
-
-
-_PEAKS = """
-import numpy as np
-from ucfrec.processes import peak_memory_mib, reset_peak_memory
-reset_peak_memory()
-print(peak_memory_mib())
-large = np.ones(2**25)
-print(peak_memory_mib())
-del large
-reset_peak_memory()
-print(peak_memory_mib())
-"""
-
-
-def test_peak_memory_is_of_what_was_done_since() -> None:
-    """In a process of its own: a test session's heap has free pages to hide an array in."""
-    printed = subprocess.run(
-        [sys.executable, "-c", _PEAKS], capture_output=True, text=True, check=True
-    ).stdout
-    before, during, after = map(float, printed.split())
-    assert during - before > 0.9 * 256
-    if sys.platform == "linux":
-        assert after < during - 100
 
 
 JOB = """

@@ -1,4 +1,4 @@
-"""The process: how it ends, with its parent too; random state; provenance; progress on stderr."""
+"""The process: how it ends, with its parent too; random state; progress on stderr."""
 
 import io
 import mmap
@@ -7,11 +7,10 @@ import random
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
-from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
 
@@ -27,7 +26,6 @@ _AGAIN: Final = 0.1
 """Seconds after which an interruption that a library swallowed is raised again."""
 _BLAS: Final = 128 * 2**20
 """Bytes that OpenBLAS asks the operating system for at its first use, and some more."""
-_PACKAGES: Final = ("ucfrec", "torch", "numpy", "gymnasium")
 _LABEL: ContextVar[str] = ContextVar("label", default="")
 """Which of several jobs at the same time this is; empty for the only one."""
 _PHASE: ContextVar[str] = ContextVar("phase", default="")
@@ -208,89 +206,6 @@ def random_state_kept() -> Iterator[None]:
     finally:
         random.setstate(python_state)
         np.random.set_state(numpy_state)  # noqa: NPY002
-
-
-def versions(packages: Sequence[str] = ()) -> dict[str, str]:
-    """Installed versions of Python and of the packages that results depend on.
-
-    Args:
-        packages: further distributions to include if they are installed, e.g. of a simulator.
-    """
-    from importlib.metadata import PackageNotFoundError, version
-
-    installed = {"python": sys.version.split()[0]}
-    for name in (*_PACKAGES, *packages):
-        with suppress(PackageNotFoundError):
-            installed[name] = version(name)
-    return installed
-
-
-def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
-    """Command, commit and `versions` of this process, as every result row records them.
-
-    The commit is that of the checkout that ucfrec is imported from; None for an installed wheel.
-    """
-    import subprocess
-
-    root, commit = Path(__file__).resolve().parent.parent, None
-    if (root / ".git").exists():
-        command = ["git", "-C", str(root), "rev-parse", "HEAD"]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        commit = result.stdout.strip() or None
-    return {"command": command_line(), "commit": commit, "versions": versions(packages)}
-
-
-def command_line() -> str:
-    """The command of this process, with absolute paths shortened to their last component.
-
-    Result rows are published and must not reveal the folders of a machine.
-    """
-    return " ".join([Path(sys.argv[0]).name, *map(shorten_paths, sys.argv[1:])])
-
-
-def shorten_paths(argument: str) -> str:
-    """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
-    option, equals, value = "", "", argument
-    if not _is_absolute(argument):
-        option, equals, value = argument.rpartition("=")
-    name = PureWindowsPath(value).name
-    return f"{option}{equals}{name}" if name and _is_absolute(value) else argument
-
-
-def _is_absolute(path: str) -> bool:
-    """Whether `path` is absolute on POSIX or Windows, or relative to a home folder."""
-    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
-    return rooted or path.startswith("~")
-
-
-def config_hash(config: Mapping[str, Any]) -> str:
-    """The first 12 hexadecimal digits of the SHA-256 of a configuration as JSON, keys sorted."""
-    import hashlib
-    import json
-
-    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def reset_peak_memory() -> None:
-    """Make `peak_memory_mib` measure from now on; has no effect on systems other than Linux."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_memory_mib() -> float:
-    """Peak resident memory of this process since `reset_peak_memory`, in MiB.
-
-    On systems other than Linux: since the process began.
-    """
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    import resource  # not on Windows
-
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
 class Progress(Protocol):

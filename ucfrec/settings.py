@@ -40,12 +40,8 @@ from ucfrec.arrays import Array
 from ucfrec.errors import InputError
 
 Table = TypeVar("Table")
-_CONFIG: Final = ConfigDict(
-    # Strict: `true` and "1" are not accepted as numbers; an int is accepted as a float.
-    strict=True,
-    extra="forbid",
-    allow_inf_nan=False,
-)
+# Strict: `true` and "1" are not accepted as numbers; an int is accepted as a float.
+_CONFIG: Final = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 """A number of updates, rows or episodes, at least 1."""

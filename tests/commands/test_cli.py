@@ -25,7 +25,7 @@ from ucfrec.files.atomic import write_json
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.plugins import load_plugin
-from ucfrec.processes import provenance
+from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, ResultTable, read_results
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.screened import screen_store

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.support.result_rows import read_configurations, result_row
 from ucfrec.errors import InputError
-from ucfrec.processes import config_hash
+from ucfrec.provenance import config_hash
 from ucfrec.results.rows import (
     CONFIGURATIONS,
     Measured,

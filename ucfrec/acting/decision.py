@@ -12,7 +12,7 @@ from torch import Tensor
 from ucfrec.episodes.item_table import WINDOW
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
-from ucfrec.processes import config_hash
+from ucfrec.provenance import config_hash
 from ucfrec.settings import Share, Weight, settings_table
 
 _Return = Annotated[float, Field(ge=-1e12, le=1e12)]

@@ -9,7 +9,7 @@ from typing import Any
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Environment
-from ucfrec.processes import config_hash
+from ucfrec.provenance import config_hash
 from ucfrec.results.rows import ResultRow, RowKey, Scalar
 from ucfrec.runs.config import Config, resolve_config
 from ucfrec.runs.run import OWN, SharedStages

@@ -12,15 +12,8 @@ from typing import Any
 
 from ucfrec.benchmark.cells import Cell, Measurement, make_key
 from ucfrec.errors import InputError
-from ucfrec.processes import (
-    block_ctrl_c,
-    config_hash,
-    interruptions_raised,
-    peak_memory_mib,
-    pool_of_processes,
-    progress,
-    reset_peak_memory,
-)
+from ucfrec.processes import block_ctrl_c, interruptions_raised, pool_of_processes, progress
+from ucfrec.provenance import config_hash, peak_memory_mib, reset_peak_memory
 from ucfrec.results.rows import ResultRow, RowKey, append_rows, read_rows, remove_rows
 
 

@@ -293,7 +293,7 @@ class Rank(LogOptions, RuleOptions):
         """Print one row per policy."""
         from ucfrec.evaluation.ranking_table import require_one_catalogue
         from ucfrec.logs.summary import format_summary
-        from ucfrec.processes import shorten_paths
+        from ucfrec.provenance import shorten_paths
         from ucfrec.reporting.measuring import TEST_SPLIT, rank_policies
         from ucfrec.runs.trained_policy import TrainedPolicy
 

@@ -204,7 +204,7 @@ class Screen(Table):
 
         from ucfrec.episodes.store import EpisodeStore
         from ucfrec.files.atomic import write_json
-        from ucfrec.processes import provenance
+        from ucfrec.provenance import provenance
         from ucfrec.runs.screened import screen_store
 
         report = screen_store(EpisodeStore.open(self.store), self.seed)

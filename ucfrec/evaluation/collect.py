@@ -14,7 +14,8 @@ from ucfrec.arrays import Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Catalog, Environment, Simulator, environment_items
 from ucfrec.files.atomic import atomic_folder, write_json
-from ucfrec.processes import random_state_kept, versions
+from ucfrec.processes import random_state_kept
+from ucfrec.provenance import versions
 from ucfrec.schema import ACTION, ITEM_ID, OBSERVATION, PROPENSITY, SESSION_ID, TIMESTAMP, USER_ID
 
 EPOCH_MS: Final = 1_704_067_200_000

@@ -20,7 +20,8 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import COLUMNS, Catalog, Environment, environment_items
-from ucfrec.processes import config_hash, provenance, random_state_kept
+from ucfrec.processes import random_state_kept
+from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import bootstrap_interval
 from ucfrec.runs.trained_policy import TrainedPolicy

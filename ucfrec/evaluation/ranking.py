@@ -46,7 +46,6 @@ class LikedByRange:
         self._low, self._high = float(states.reward_low), float(states.reward_high)
 
     def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        """See `Liked`."""
         return liked_rewards(store, rewards)
 
     def __str__(self) -> str:
@@ -74,7 +73,6 @@ class LikedExpression:
         self._evaluate(np.zeros(1))  # so that an unusable expression is refused at once
 
     def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        """See `Liked`."""
         values, places = np.unique(rewards, return_inverse=True)
         # The shortest decimals: as float64, 0.7 of float32 would be less than 0.7.
         return self._evaluate(values.astype(str).astype(np.float64))[places]

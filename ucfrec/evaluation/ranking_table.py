@@ -43,7 +43,7 @@ from ucfrec.policies.baselines import (
     count_decayed,
     shrink_rates,
 )
-from ucfrec.processes import config_hash, provenance
+from ucfrec.provenance import config_hash, provenance
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.start import policy_sizes
 from ucfrec.runs.trained_policy import TrainedPolicy

@@ -42,7 +42,7 @@ from ucfrec.off_policy.verdict import (
     diagnose,
     list_cautions,
 )
-from ucfrec.processes import config_hash, provenance, shorten_paths
+from ucfrec.provenance import config_hash, provenance, shorten_paths
 from ucfrec.results.rows import ResultRow, ResultTable, Scalar
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require, settings_table

@@ -27,7 +27,7 @@ from ucfrec.logs.rows import DAY_MS
 from ucfrec.off_policy.evaluate import DEFAULTS, EstimateOptions, OffPolicyReport
 from ucfrec.off_policy.score import score
 from ucfrec.policies.registry import policy_class
-from ucfrec.processes import shorten_paths
+from ucfrec.provenance import shorten_paths
 from ucfrec.python_api.given_data import (
     Columns,
     Logs,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.processes import shorten_paths
+from ucfrec.provenance import shorten_paths
 from ucfrec.reporting.model_card import add_estimates, add_evaluation, add_ranking
 from ucfrec.results.rows import Evaluation, Ranking
 from ucfrec.runs.trained_policy import TrainedPolicy

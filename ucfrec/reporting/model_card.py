@@ -15,7 +15,7 @@ from ucfrec.files.atomic import atomic_file, claim, read_json, write_json
 from ucfrec.files.record import CARD, MEASURED
 from ucfrec.fitting.checkpoint import read_metrics
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.processes import config_hash, shorten_paths
+from ucfrec.provenance import config_hash, shorten_paths
 from ucfrec.reporting.tables import Table, format_value, markdown_table
 from ucfrec.results.rows import Ranking, ResultRow
 from ucfrec.runs.record import REFIT, RunRecord, read_record

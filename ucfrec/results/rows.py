@@ -26,7 +26,7 @@ from ucfrec.files.atomic import (
     remove_leftovers,
     write_json,
 )
-from ucfrec.processes import config_hash
+from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -59,11 +59,8 @@ def _whole(value: object) -> object:
 
 
 def _levels(quantiles: dict[str, float]) -> dict[str, float]:
-    for level in quantiles:
-        if not 0 <= float(level) <= 1:
-            raise ValueError(f"{level:.20} is not a share")
-    if not quantiles:
-        raise ValueError("there are none")
+    if not quantiles or not all(0 <= float(level) <= 1 for level in quantiles):
+        raise ValueError("there are none, or one is not of a share")
     return quantiles
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.fitting import distributed
-from ucfrec.processes import config_hash
+from ucfrec.provenance import config_hash
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, refit_of_run
 from ucfrec.runs.run import train_run
 from ucfrec.runs.screened import drop_columns

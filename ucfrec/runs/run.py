@@ -36,7 +36,8 @@ from ucfrec.fitting import distributed
 from ucfrec.fitting.loop import SILENT, Callbacks
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import note_ignored
-from ucfrec.processes import config_hash, phase, random_state_kept
+from ucfrec.processes import phase, random_state_kept
+from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import (
     CANDIDATES,

@@ -29,7 +29,8 @@ from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit, load_trained
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class, policy_package
-from ucfrec.processes import command_line, random_state_kept, versions
+from ucfrec.processes import random_state_kept
+from ucfrec.provenance import command_line, versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import REFIT, RUN, RunRecord, place_of, read_record, refit_of_run
 from ucfrec.runs.trained_policy import COUNTS, ITEMS, RETURNS, RULE, USERS, TrainedPolicy

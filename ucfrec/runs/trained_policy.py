@@ -27,7 +27,8 @@ from ucfrec.fitting.loop import load_trained
 from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
-from ucfrec.processes import config_hash, random_state_kept, versions
+from ucfrec.processes import random_state_kept
+from ucfrec.provenance import config_hash, versions
 from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd, load_session_end

@@ -22,7 +22,8 @@ from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank
 from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
-from ucfrec.processes import block_ctrl_c, config_hash, label_progress, pool_of_processes
+from ucfrec.processes import block_ctrl_c, label_progress, pool_of_processes
+from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import SharedStages, train_run

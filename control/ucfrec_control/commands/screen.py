@@ -7,7 +7,7 @@ from typing import Annotated
 from ucfrec.commands.options import ARGUMENT, SEED, Table
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import write_json
-from ucfrec.processes import provenance
+from ucfrec.provenance import provenance
 from ucfrec_control.data.trajectories import PACKAGES
 from ucfrec_control.training.screening import screen_store
 

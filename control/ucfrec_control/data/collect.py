@@ -17,7 +17,8 @@ from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import lock_path, read_json, remove_leftovers, write_json
-from ucfrec.processes import progress, provenance, random_state_kept
+from ucfrec.processes import progress, random_state_kept
+from ucfrec.provenance import provenance
 from ucfrec.settings import Count, require, settings_table
 from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
@@ -83,9 +84,10 @@ def collect(env_id: str, out: Path, seed: int, config: CollectConfig) -> list[di
     with _lock_incomplete(out):
         training = _train(env_id, out / "training", seed, config)
         medium, expert = _choose(training.evaluations, training.random_return, config.fraction)
+        replay = training.sac.replay(training.evaluations[medium]["steps"])
         parts = {
             "medium": _roll_out(training, medium, env_id, seed, config.size),
-            "medium-replay": _replay(training, medium, env_id),
+            "medium-replay": _trajectories(replay, replay["terminals"], replay["timeouts"], env_id),
             "expert": _roll_out(training, expert, env_id, seed, config.size),
         }
         parts["medium-expert"] = _join(parts["medium"], parts["expert"])
@@ -267,11 +269,6 @@ def _choose(
         )
     threshold = random_return + fraction * (returns[expert] - random_return)
     return int((returns >= threshold).argmax()), expert
-
-
-def _replay(training: _Training, medium: int, env_id: str) -> Trajectories:
-    replay = training.sac.replay(training.evaluations[medium]["steps"])
-    return _trajectories(replay, replay["terminals"], replay["timeouts"], env_id)
 
 
 def _trajectories(

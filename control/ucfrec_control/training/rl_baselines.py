@@ -23,7 +23,8 @@ from ucfrec.files.atomic import atomic_file, atomic_folder, lock_path, remove_le
 from ucfrec.files.record import Count as Steps
 from ucfrec.files.record import Entry
 from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
-from ucfrec.processes import command_line, progress, random_state_kept, versions
+from ucfrec.processes import progress, random_state_kept
+from ucfrec.provenance import command_line, versions
 from ucfrec.runs.record import RUN, RunRecord, TrainingRecord
 from ucfrec.settings import BatchSize, Count, settings_table
 from ucfrec_control.data.trajectories import PACKAGES

@@ -10,7 +10,7 @@ from typing import Any, Final
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.policies.registry import BUILT_IN, policy_names
-from ucfrec.processes import versions
+from ucfrec.provenance import versions
 from ucfrec.runs.config import Config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import OWN, SharedStages

@@ -23,7 +23,8 @@ from ucfrec.acting.rollout import Actor, Memoryless, Step, Uniform, rollout
 from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
-from ucfrec.processes import random_state_kept, versions
+from ucfrec.processes import random_state_kept
+from ucfrec.provenance import versions
 from ucfrec_simulators.behaviors import SessionMixture, truncated_normal
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,

@@ -1,0 +1,89 @@
+"""Provenance of a result: command, commit, package versions, hash of the settings, peak memory."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, Final
+
+_PACKAGES: Final = ("ucfrec", "torch", "numpy", "gymnasium")
+
+
+def versions(packages: Sequence[str] = ()) -> dict[str, str]:
+    """Installed versions of Python and of the packages that results depend on.
+
+    Args:
+        packages: further distributions to include if they are installed, e.g. of a simulator.
+    """
+    installed = {"python": sys.version.split()[0]}
+    for name in (*_PACKAGES, *packages):
+        with suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return installed
+
+
+def provenance(packages: Sequence[str] = ()) -> dict[str, Any]:
+    """Command, commit and `versions` of this process, as every result row records them.
+
+    The commit is that of the checkout that ucfrec is imported from; None for an installed wheel.
+    """
+    root, commit = Path(__file__).resolve().parent.parent, None
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        commit = result.stdout.strip() or None
+    return {"command": command_line(), "commit": commit, "versions": versions(packages)}
+
+
+def command_line() -> str:
+    """The command of this process, with absolute paths shortened to their last component.
+
+    Result rows are published and must not reveal the folders of a machine.
+    """
+    return " ".join([Path(sys.argv[0]).name, *map(shorten_paths, sys.argv[1:])])
+
+
+def shorten_paths(argument: str) -> str:
+    """Shorten an absolute path in a command's argument (also after `=`) to its last component."""
+    option, equals, value = "", "", argument
+    if not _is_absolute(argument):
+        option, equals, value = argument.rpartition("=")
+    name = PureWindowsPath(value).name
+    return f"{option}{equals}{name}" if name and _is_absolute(value) else argument
+
+
+def _is_absolute(path: str) -> bool:
+    """Whether `path` is absolute on POSIX or Windows, or relative to a home folder."""
+    rooted = PurePosixPath(path).is_absolute() or PureWindowsPath(path).is_absolute()
+    return rooted or path.startswith("~")
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """The first 12 hexadecimal digits of the SHA-256 of a configuration as JSON, keys sorted."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def reset_peak_memory() -> None:
+    """Make `peak_memory_mib` measure from now on; has no effect on systems other than Linux."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory_mib() -> float:
+    """Peak resident memory of this process since `reset_peak_memory`, in MiB.
+
+    On systems other than Linux: since the process began.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    import resource  # not on Windows
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

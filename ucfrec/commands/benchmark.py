@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, SEED, Group, Table
+from ucfrec.commands.options import ARGUMENT, SEED, Group, Table, settings_given
 from ucfrec.commands.shared_options import EnvironmentOptions
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.plugins import load_plugin
@@ -123,21 +123,10 @@ class Benchmark(EnvironmentOptions, GridOptions):
             with self.explain_rows():
                 print(show(suite, tables, self.read_rows(self.suite, tables)))
             return
-        request = BenchmarkRequest(
-            tables=tables,
-            results=self.rows_file,
-            environment=self.make_environment(self.env) if self.env else None,
-            tasks=self.task,
-            methods=self.method,
-            **{name: getattr(self, name) for name in _SAME},
-        )
+        settings = settings_given(self, BenchmarkRequest) | {"results": self.rows_file}
+        if self.env:
+            settings["environment"] = self.make_environment(self.env)
+        request = BenchmarkRequest(tables=tables, tasks=self.task, methods=self.method, **settings)
         with benchmarking(self.rows_file):
             print(measure(suite, request))
         print(f"\nrows: {self.rows_file}")
-
-
-_SAME = (
-    *("budget", "out", "workers", "log_seed", "logs", "evaluation_seed", "training_seeds"),
-    "again",
-)
-"""Options that are fields of `BenchmarkRequest`."""

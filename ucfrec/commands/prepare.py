@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table
+from ucfrec.commands.options import ARGUMENT, OUTPUT, Group, Table, settings_given
 from ucfrec.commands.shared_options import LogOptions, SparkOption
 from ucfrec.errors import InputError, InputNote
 from ucfrec.files.remote import origin
@@ -47,15 +47,14 @@ class Prepare(LogOptions, SparkOption):
             raise InputError(
                 f"--gap-minutes needs --session-by gap, not {by}; leave one of them out"
             )
-        options = {name: getattr(self, name) for name in _SAME} | {
-            "reward": self.reward and Expression(self.reward, "--reward"),
-            "dataset": self.dataset or "generic",
-            "spark_master": self.find_spark(),
-            "split": self.split and parse_split(self.split),
-        }
-        how = PrepareOptions(
-            **{name: value for name, value in options.items() if value is not None}
-        )
+        options = {"dataset": "generic", **settings_given(self, PrepareOptions)}
+        if self.reward is not None:
+            options["reward"] = Expression(self.reward, "--reward")
+        if self.split is not None:
+            options["split"] = parse_split(self.split)
+        if (master := self.find_spark()) is not None:
+            options["spark_master"] = master
+        how = PrepareOptions(**options)
         if self.validate:
             print(format_report(validate(files, mapping, how)))
             print("\nnothing was written; next: the same command with --out STORE, not --validate")
@@ -70,10 +69,6 @@ class Prepare(LogOptions, SparkOption):
             f"\nstore: {store}; policies learn from its train split, later rows validate and test "
             f"them\nnext: ucfrec train {store} --out RUN"
         )
-
-
-_SAME = ("session_by", "gap_minutes", "duplicates", "max_session", "memory_limit", "engine")
-"""Options that are fields of `PrepareOptions`."""
 
 
 class Datasets(Table):

@@ -16,8 +16,6 @@ from ucfrec.policies.registry import policy_names
 if TYPE_CHECKING:
     from ucfrec.runs.record import RunRecord
 
-_NARROWEST: Final = 40
-"""Terminal columns that the meaning needs; with fewer it goes on a line of its own below."""
 _WIDEST: Final = 160
 """Most terminal columns of a line."""
 
@@ -230,33 +228,22 @@ def settings_text(policy: str, width: int) -> str:
     from ucfrec.settings import describe
 
     config, width = resolve_config(policy), min(width, _WIDEST)
-    rows = {
-        name: [
-            ((each.key, _format_toml(each.value), each.allowed), each.meaning)
-            for each in describe(name, getattr(config, name))
-        ]
-        for name in TABLES
-    }
-    columns = zip(*(cells for table in rows.values() for cells, _ in table), strict=True)
-    widths = [max(map(len, column)) for column in columns]
     text = textwrap.wrap(
         f"Settings of `ucfrec train --policy {policy}`: --set KEY=VALUE, or a TOML file "
         "(--config FILE) with a table for each section.",
         width,
     )
-    for name, table in rows.items():
-        summary = inspect.cleandoc(type(getattr(config, name)).__doc__ or "").partition("\n\n")[0]
+    for name in TABLES:
+        table = getattr(config, name)
+        summary = inspect.cleandoc(type(table).__doc__ or "").partition("\n\n")[0]
         text += ["", *textwrap.wrap(f"[{name}]  {summary}", width)]
-        for cells, meaning in table:
-            padded = (cell.ljust(size) for cell, size in zip(cells, widths, strict=True))
-            start = "  " + "  ".join(padded)
-            indent = len(start) + 2
-            if width - indent < _NARROWEST:
-                text.append(start.rstrip())
-                start, indent = "", 6
-            first, *others = textwrap.wrap(meaning, width - indent) or [""]
-            text.append(f"{start}  {first}" if start else " " * indent + first)
-            text += [" " * indent + line for line in others]
+        for setting in describe(name, table):
+            value = _format_toml(setting.value)
+            text.append(f"  {setting.key:<26}  {value:<22}  {setting.allowed}")
+            indent = " " * 6
+            text += textwrap.wrap(
+                setting.meaning, width, initial_indent=indent, subsequent_indent=indent
+            )
     return "\n".join(text)
 
 

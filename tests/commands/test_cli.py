@@ -22,14 +22,19 @@ from ucfrec.commands.train import settings_text
 from ucfrec.evaluation.collect import collect_store
 from ucfrec.evaluation.simulator import Environment
 from ucfrec.files.atomic import write_json
+from ucfrec.logs.join import join_feedback
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
+from ucfrec.off_policy.ab_test import compare_arms
 from ucfrec.plugins import load_plugin
 from ucfrec.provenance import provenance
 from ucfrec.results.rows import ResultRow, ResultTable, read_results
+from ucfrec.runs.config import settings_given
 from ucfrec.runs.promoted import promote
 from ucfrec.runs.screened import screen_store
 from ucfrec.runs.trained_policy import TrainedPolicy
+from ucfrec.tuning.space import Search
+from ucfrec.tuning.study import Plan, tune
 
 TINY = [
     "train.steps=40",
@@ -241,7 +246,7 @@ def save(table: ResultTable | pd.DataFrame) -> None:
         table.save("out")
 
 
-STORE, LATER = "synthetic-catalog-store", "later.parquet"
+STORE, LATER, SHOWN = "synthetic-catalog-store", "later.parquet", "shown.parquet"
 ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
     "prepare": (
         "prepare later.parquet --out out --reward is_click --session-by gap --gap-minutes 7",
@@ -288,9 +293,24 @@ ALIKE: dict[str, tuple[str, Callable[[Recommender], object]]] = {
         lambda _: print(settings_text("dt", shutil.get_terminal_size().columns)),
     ),
     "promote": ("promote run --force", lambda _: promote(Path("run"), force=True)),
+    "join": (
+        f"join {SHOWN} {LATER} --within 1h --out out",
+        lambda _: join_feedback([SHOWN], [LATER], Path("out"), 3_600_000),
+    ),
+    "compare": (
+        f"compare {SHOWN} --column propensity --json out",
+        lambda _: write_json(Path("out"), asdict(compare_arms([SHOWN], "propensity"))),
+    ),
+    "tune": (
+        f"tune {STORE} --out out --policy dt --metric ndcg --trials 1 {' '.join(settings())}",
+        lambda _: tune(
+            Plan(Path(STORE), Path("out"), Search(("dt",), settings_given(TINY), False, 0), "ndcg"),
+            trials=1,
+        ),
+    ),
 }
 """Command line, and what does the same in Python."""
-SLOW = ("train", "rank", "update", "export")
+SLOW = ("train", "rank", "update", "export", "tune")
 
 
 @pytest.mark.parametrize(
@@ -308,12 +328,17 @@ def test_a_command_does_what_the_python_api_does(
     """The same numbers and files, model cards of the run too."""
     arguments, function = ALIKE[command]
     log = pd.read_parquet(catalog[1])
+    shown = log[["user_id", "item_id", "timestamp"]].head(300)
+    shown = shown.assign(request_id=shown.index.astype(str), position=1, run="r", rule="d")
+    shown["propensity"] = np.linspace(0.1, 0.9, len(shown))
+    shown["arm"] = np.where(shown.index % 2, "a", "b")
     written, printed = [], []
     for place in ("command", "api"):
         shutil.copytree(catalog[0], tmp_path / place / "run")
         shutil.copytree(folder / STORE, tmp_path / place / STORE)
         monkeypatch.chdir(tmp_path / place)
         log.head(400).to_parquet(LATER)
+        shown.to_parquet(SHOWN)
         log.assign(timestamp=log.timestamp + 10**9).head(600).to_parquet("newer.parquet")
         capsys.readouterr()
         if place == "command":

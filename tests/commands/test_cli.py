@@ -110,29 +110,6 @@ def test_help_fits_one_screen_and_the_rest_is_a_word_away(
 
 
 @pytest.mark.parametrize(
-    "environment", [pytest.param("synthetic-taobao", marks=pytest.mark.slow), "synthetic-catalog"]
-)
-def test_evaluate_writes_the_rows_it_prints(
-    folder: Path, environment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "rows.json"
-    run = trained_on(folder, environment)
-    arguments = ["evaluate", run, "--env", environment, "--episodes", "10", "--seed", "7"]
-    arguments += ["--behavior", "random", "--json", str(out)]
-    assert main(arguments) == 0
-    rows = read_results(out)
-    assert [row.method for row in rows] == ["ucf", "random"]
-    for row in rows:
-        assert row.environment == environment
-        assert (row["episodes"], row.evaluation_seed) == (10, 7)
-        assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
-        assert row["R_avg_pooled"] * row["length"] == pytest.approx(row["R_cum"])
-    assert "R_avg_episode" in capsys.readouterr().out
-    assert main(arguments) == 0
-    assert [row.metrics for row in read_results(out)] == [row.metrics for row in rows]
-
-
-@pytest.mark.parametrize(
     "line",
     [
         "ope run --json F logs",
@@ -161,44 +138,6 @@ def test_a_run_after_results_is_a_run(folder: Path, tmp_path: Path) -> None:
     arguments = ["report", "--out", str(out), "--results", str(tmp_path / "rows.json"), str(run)]
     assert main(arguments) == 0
     assert "Trained on" in out.read_text()
-
-
-def test_recommend_ranks_for_known_and_new_users(folder: Path, tmp_path: Path) -> None:
-    logs = folder / "synthetic-catalog-logs" / "sessions.parquet"
-    log = pd.read_parquet(logs)
-    stranger = log[log.user_id == log.user_id.iloc[0]].assign(user_id=10**6)
-    pd.concat([log, stranger]).to_parquet(tmp_path / "log.parquet")
-    arguments = ["recommend", str(folder / "synthetic-catalog-run"), str(tmp_path / "log.parquet")]
-    out = tmp_path / "top.parquet"
-    assert main([*arguments, "--k", "7", "--temperature", "0", "--out", str(out)]) == 0
-    top = pd.read_parquet(out)
-    assert list(top.columns[:4]) == ["user_id", "rank", "item_id", "score"]
-    assert (top.propensity == 1).all()  # the best items, for certain
-    assert set(top.user_id) == {*log.user_id, 10**6}
-    assert (top.groupby("user_id")["rank"].apply(list).map(lambda r: r == [*range(1, 8)])).all()
-    assert (top.groupby("user_id").score.diff().dropna() <= 0).all()
-    assert not top.duplicated(["user_id", "item_id"]).any()
-    seen = set(zip(log.user_id, log.item_id, strict=True))
-    assert not seen & set(zip(top.user_id, top.item_id, strict=True))
-    assert main([*arguments, "--k", "7", "--keep-seen", "--out", str(out)]) == 0
-    kept = pd.read_parquet(out)
-    assert seen & set(zip(kept.user_id, kept.item_id, strict=True))
-
-
-def test_recommend_refuses_unknown_items(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = pd.read_parquet(folder / "synthetic-catalog-logs" / "sessions.parquet").head(50)
-    log["item_id"] = np.where(np.arange(50) == 3, 987654, log.item_id)
-    log.to_parquet(tmp_path / "log.parquet")
-    arguments = ["recommend", str(folder / "synthetic-catalog-run"), str(tmp_path / "log.parquet")]
-    arguments += ["--out", str(tmp_path / "top.parquet")]
-    printed = refused(arguments, capsys)
-    assert "987654" in printed
-    assert "1 row has an item_id" in printed
-    assert "--skip-unknown" in printed
-    assert not (tmp_path / "top.parquet").exists()
-    assert main([*arguments, "--skip-unknown"]) == 0
 
 
 @pytest.fixture(scope="module")
@@ -230,12 +169,6 @@ def test_score_tells_the_probability_of_every_choice(
     assert main([*arguments, "--temperature", "0"]) == 0
     best = pd.read_parquet(out)
     assert (best.probability == (scores["rank"] == 1)).all()
-    # Without options it is the run's own rule that is scored.
-    rule = TrainedPolicy.load(Path(run)).rule
-    assert main(arguments) == 0
-    own = pd.read_parquet(out)
-    assert main([*arguments, "--temperature", str(rule.temperature)]) == 0
-    pd.testing.assert_frame_equal(own, pd.read_parquet(out))
 
 
 def save(table: ResultTable | pd.DataFrame) -> None:
@@ -413,17 +346,9 @@ def test_ope_writes_the_rows_it_prints(
     assert not weighted or {"IPS", "SNIPS", "PDIS", "SNPDIS", "DR", "SNDR"} <= weighted
     log = pd.read_parquet(logs)
     assert rows["logged"]["R_cum"] == pytest.approx(log.is_click.sum() / 300)
-    for name, row in rows.items():
-        if name in ("DM", "FQE") or row["R_cum_low"] is None:
-            # Their error is the model's, which no resampling of sessions shows.
-            assert (row["R_cum_low"], row["R_cum_high"]) == (None, None)
-            assert re.search(rf"^{name} .*\[–, –\]", printed, re.MULTILINE)
-        else:
-            assert row["R_cum_low"] <= row["R_cum"] <= row["R_cum_high"]
-        assert (row["sessions"], row["steps"], row.evaluation_seed) == (300, len(log), 3)
-        assert (row["run"], row["checkpoint"]) == (Path(run).name, "best")
-        assert row.data_fingerprint
-        assert row.command
+    # Their error is the model's, which no resampling of sessions shows.
+    assert rows["DM"]["R_cum_low"] is rows["FQE"]["R_cum_high"] is None
+    assert re.search(r"^DM .*\[–, –\]", printed, re.MULTILINE)
     # These are the logs that the run was trained on, and it says so.
     logged = rows["logged"]
     assert all(f"warning: {line}" in printed for line in logged.details["warnings"])
@@ -431,8 +356,6 @@ def test_ope_writes_the_rows_it_prints(
     assert "of the rows were seen in training" in logged.details["warnings"][0]
     assert logged.details["reliable"] is False
     assert "verdict: Do not rely on this estimate" in printed
-    again, _ = estimate(arguments, logs, tmp_path, capsys)
-    assert [row.metrics for row in again.values()] == [row.metrics for row in rows.values()]
 
 
 def test_ope_tells_from_uniform_logs_what_playing_tells(

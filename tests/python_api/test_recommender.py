@@ -260,16 +260,6 @@ def test_a_loaded_policy_is_the_one_saved(
         Recommender.load(tmp_path)
 
 
-def test_text_and_integers_that_look_alike_are_the_same_ids(
-    fitted: Recommender, log: pd.DataFrame
-) -> None:
-    text = log.assign(user_id=log.user_id.astype(str), item_id=log.item_id.astype(str))
-    found, expected = fitted.recommend(text, k=30), fitted.recommend(log, k=30)
-    assert found.user_id.map(type).eq(str).all()
-    found = found.astype({"user_id": np.int64}).sort_values(["user_id", "rank"])
-    pd.testing.assert_frame_equal(found.reset_index(drop=True), expected, rtol=1e-4)
-
-
 def test_six_rows_with_new_users_in_validation_are_enough_for_a_policy(tmp_path: Path) -> None:
     rows = {"user_id": [2, 1, 1, 0, 0, 0], "item_id": [0, 0, 0, 1, 1, 1], "reward": [0, 1] * 3}
     tiny = pd.DataFrame(rows).assign(timestamp=1_700_000_000_000 + 10**7 * np.arange(6))

@@ -170,21 +170,6 @@ def test_files_of_any_name_are_read_alone(tmp_path: Path, name: str) -> None:
         assert connection.execute(f"FROM {table.sql}").fetchall() == [(1,), (2,)]
 
 
-def test_relative_and_linked_paths_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "logs").mkdir()
-    (tmp_path / "here").mkdir()
-    (tmp_path / "linked").symlink_to(tmp_path / "logs")
-    monkeypatch.chdir(tmp_path / "here")
-    pd.DataFrame({"x": [1]}).to_parquet("../logs/a.parquet")
-    for path in ("../logs/a.parquet", "../linked/a.parquet", "./../here/../logs/a.parquet"):
-        with engine([Path(path)], Path()) as connection:
-            (table,) = open_tables(connection, [Path(path)])
-            assert connection.execute(f"FROM {table.sql}").fetchall() == [(1,)]
-    assert not list(Path().iterdir())
-
-
 def test_rows_spill_into_the_scratch_folder_and_vanish(tmp_path: Path) -> None:
     folder = tmp_path / "it's a folder"
     folder.mkdir()
@@ -272,11 +257,6 @@ OVERFLOWING = {
 def test_integers_of_any_width_do_not_overflow(kind: str, reward: str, tmp_path: Path) -> None:
     columns = {"a": np.array([100, 3], dtype=kind), "b": np.array([100, 10], dtype=kind)}
     assert rewards_of(columns, reward, tmp_path) == OVERFLOWING[reward]
-
-
-def test_lists_of_narrow_integers_do_not_overflow(tmp_path: Path) -> None:
-    counts = [np.array([100, 100], dtype="int8"), np.array([3, 2], dtype="int8")]
-    assert rewards_of({"n": counts}, "n[1] * n[2]", tmp_path) == [10_000.0, 6.0]
 
 
 @pytest.mark.parametrize(
@@ -393,13 +373,6 @@ def test_a_later_row_of_csv_with_a_leading_zero_is_text_in_expressions(tmp_path:
         assert sum(len(batch.item_ids) for batch in batches) == rows
 
 
-def test_the_line_is_named_where_an_identifier_is_also_in_an_expression(tmp_path: Path) -> None:
-    path = csv_of(tmp_path, "visitor", "1", "u7")
-    mapping = LogMapping({"user_id": "visitor"}, where="visitor <> 'bot'")
-    with pytest.raises(InputError, match=r"log.csv, line 25001: column visitor: .*Parquet"):
-        list(read_histories([path], mapping, "1", last=1))
-
-
 @pytest.mark.parametrize("later", ["u7", "9" * 100_000])
 def test_later_rows_of_csv_of_another_kind_are_named(tmp_path: Path, later: str) -> None:
     path = csv_of(tmp_path, "visit", "1", later)
@@ -482,25 +455,6 @@ def test_a_later_log_is_read_as_the_first_whatever_its_names(folder: Path, log: 
     expected = scored(folder, "late.parquet", "--mapping", str(folder / "shop.toml"))
     assert 0 < len(expected) < 400
     pd.testing.assert_frame_equal(scored(folder, log), expected)
-
-
-def test_no_command_needs_the_mapping_again(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, late, mapping = (str(folder / name) for name in ("run", "late.parquet", "shop.toml"))
-    for command in ("rank", "ope"):
-        told = []
-        for more in ([], ["--mapping", mapping]):
-            assert main([command, run, late, *more]) == 0
-            told.append(capsys.readouterr().out)
-        assert told[0] == told[1]
-    frames = []
-    for n, more in enumerate(([], ["--mapping", mapping])):
-        out = folder / f"next-{n}.parquet"
-        assert main(["recommend", run, late, "--k", "3", "--out", str(out), *more]) == 0
-        frames.append(pd.read_parquet(out))
-    pd.testing.assert_frame_equal(frames[0], frames[1])
-    assert 7 not in set(frames[0].user_id)
 
 
 def test_a_given_column_or_condition_wins(folder: Path) -> None:

@@ -13,7 +13,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import SafetensorError
@@ -167,42 +166,6 @@ def test_csv_and_parquet_give_the_same_store(tmp_path: Path) -> None:
     assert stores[0].reward == "reward * 2"
     assert stores[0].source.mapping == {"user_id": "uid", "timestamp": "when"}
     assert steps_of(tmp_path / "csv")["user_id"].str.startswith("u").all()
-
-
-@pytest.mark.parametrize(
-    ("unit", "zone"),
-    [("ms", None), ("us", None), ("ns", "UTC"), ("ms", "America/New_York"), ("ns", None)],
-)
-def test_times_of_every_unit_and_zone_are_read(
-    unit: str, zone: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = make_log(users=5)
-    log["timestamp"] = log["timestamp"] // 1000 * 1000
-    prepared(tmp_path, log)
-    table = pa.Table.from_pandas(log)
-    column = table.schema.get_field_index("timestamp")
-    times = pa.array(log["timestamp"], pa.timestamp("ms")).cast(pa.timestamp(unit))
-    named = pa.field("timestamp", pa.timestamp(unit, zone))
-    pq.write_table(table.set_column(column, named, times.cast(named.type)), tmp_path / "t.parquet")
-    features = {"item_id": range(30), "published": pa.array(range(30)).cast(named.type)}
-    pq.write_table(pa.table(features), tmp_path / "items.parquet")
-    items = FeatureTable((tmp_path / "items.parquet",), "item_id")
-    monkeypatch.setenv("TZ", "Asia/Tokyo")
-    time.tzset()
-    try:
-        for out, mapping in (
-            ("found", LogMapping()),
-            ("featured", LogMapping(item_features=(items,))),
-        ):
-            prepare([tmp_path / "t.parquet"], mapping, tmp_path / out, SMALL)
-    finally:
-        monkeypatch.undo()
-        time.tzset()
-    found, featured, wanted = (
-        EpisodeStore.open(tmp_path / name) for name in ("found", "featured", "store")
-    )
-    assert found.record.fingerprint == wanted.record.fingerprint
-    assert not torch.equal(found.item_states.embeddings, featured.item_states.embeddings)
 
 
 def test_every_dropped_row_has_a_reason(tmp_path: Path) -> None:

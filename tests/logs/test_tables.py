@@ -66,16 +66,6 @@ def test_a_folder_is_read_with_its_sub_folders(tmp_path: Path) -> None:
     assert validate([f"{lake}/**/p*.parquet"], LogMapping())["steps"] == 400
 
 
-def test_a_table_may_be_a_folder_with_sub_folders(tmp_path: Path) -> None:
-    write(random_log(), tmp_path / "log.parquet")
-    users = pd.DataFrame({"user_id": range(100), "age": np.arange(100) % 7 * 1.0})
-    for part in range(2):
-        write(users[part::2], tmp_path / "users.parquet" / f"part={part}" / "0.parquet")
-    logs, mapping = generic.DATASET.resolve([tmp_path], LogMapping())
-    assert logs == (tmp_path / "log.parquet",)
-    assert len(mapping.user_features[0].files) == 2
-
-
 def test_columns_come_from_folders_on_purpose(tmp_path: Path) -> None:
     log = random_log()
     log["user_id"] %= 9

@@ -143,20 +143,6 @@ def test_scores_are_the_policys_at_the_next_step(
     np.testing.assert_allclose(scores.to_numpy(), expected.numpy(), rtol=1e-4, atol=1e-5)
 
 
-def test_other_users_and_the_order_of_rows_change_nothing(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame
-) -> None:
-    policy, _ = fitted
-    everybody = policy.recommend(log, k=30)
-    pd.testing.assert_frame_equal(
-        policy.recommend(log.sample(frac=1, random_state=0), 30), everybody
-    )
-    few = log[log.user_id.isin([3, 17, 30])]
-    alone = policy.recommend(few, k=30)
-    expected = everybody[everybody.user_id.isin([3, 17, 30])].reset_index(drop=True)
-    pd.testing.assert_frame_equal(alone, expected, rtol=1e-4)
-
-
 def test_only_the_latest_session_makes_the_state_but_all_is_seen(
     fitted: tuple[Recommender, Path], log: pd.DataFrame
 ) -> None:
@@ -170,19 +156,6 @@ def test_only_the_latest_session_makes_the_state_but_all_is_seen(
     pd.testing.assert_frame_equal(alone, both)
     filtered = policy.recommend(pd.concat([earlier, recent]), k=30)
     assert not set(filtered.item_id) & {*earlier.item_id, *recent.item_id}
-
-
-def test_the_command_equals_the_python_api(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
-) -> None:
-    policy, folder = fitted
-    repeated = pd.concat([log.assign(reward=0.0), log])  # of two rewards, the higher counts
-    repeated.to_parquet(tmp_path / "log.parquet")
-    arguments = [str(folder / "run"), str(tmp_path / "log.parquet"), "--k", "7", "--keep-seen"]
-    assert main(["recommend", *arguments, "--out", str(tmp_path / "out.parquet")]) == 0
-    written = pd.read_parquet(tmp_path / "out.parquet")
-    pd.testing.assert_frame_equal(written, policy.recommend(log, k=7, filter_seen=False))
-    pd.testing.assert_frame_equal(written, policy.recommend(repeated, k=7, filter_seen=False))
 
 
 def test_only_candidates_are_recommended(
@@ -322,23 +295,6 @@ def test_times_mean_the_same_here_and_in_prepare(
     assert set(read[0][1]) == set(whole.timestamp)
 
 
-def test_seconds_need_a_mapping_here_and_in_prepare(
-    fitted: tuple[Recommender, Path], log: pd.DataFrame, tmp_path: Path
-) -> None:
-    policy, _ = fitted
-    seconds = log.assign(timestamp=log.timestamp / 1000)
-    seconds.to_parquet(tmp_path / "log.parquet")
-    with pytest.raises(InputError, match="is the time in milliseconds"):
-        policy.recommend(seconds)
-    with pytest.raises(InputError, match="is the time in milliseconds"):
-        prepare([tmp_path / "log.parquet"], LogMapping(), tmp_path / "store")
-    mapping = LogMapping({"timestamp": "timestamp * 1000"})
-    pd.testing.assert_frame_equal(policy.recommend(seconds, mapping=mapping), policy.recommend(log))
-    prepare([tmp_path / "log.parquet"], mapping, tmp_path / "store")
-    store = EpisodeStore.open(tmp_path / "store")
-    assert set(store.step_values("timestamp", *store.all_steps())) == set(log.timestamp)
-
-
 WRONG: dict[str, tuple[Callable[[pd.DataFrame], object], str]] = {
     "a list": (lambda log: [1, 2], r"histories is \[1, 2\]; give a pandas DataFrame"),
     "no rows": (lambda log: log.head(0), "the frame has no rows"),
@@ -428,16 +384,6 @@ def test_wrong_histories_are_refused(
     with pytest.raises(InputError, match=message) as caught:
         fitted[0].recommend(change(log))  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
-
-
-def test_wrong_numbers_are_refused(fitted: tuple[Recommender, Path], log: pd.DataFrame) -> None:
-    policy, _ = fitted
-    for k in (0, -1, 2.0, "3", True, None):
-        with pytest.raises(InputError, match=r"k is .*; give a whole number, 1 or more"):
-            policy.recommend(log, k=k)  # type: ignore[arg-type]
-    assert policy.recommend(log, k=np.int64(2)).groupby("user_id").size().max() == 2
-    with pytest.raises(InputError, match="target is nan; it must be a number"):
-        policy.recommend(log, rule=DecisionRule(float("nan")))
 
 
 def test_sessions_by_id_need_the_column(log: pd.DataFrame) -> None:

@@ -270,22 +270,18 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
 
     @app.get("/")
     def page(request: Request) -> Response:
-        """The page, filled in as the address says."""
         return html(explorer.page(request.query_params))
 
     @app.get("/results")
     def results(request: Request) -> Response:
-        """The list alone."""
         return html(explorer.results(request.query_params))
 
     @app.get("/explore.js")
     def javascript() -> Response:
-        """The script of the page."""
         return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
 
     @app.get("/report/{number}")
     def report(number: int) -> Response:
-        """The report of a run."""
         if not 0 <= number < len(explorer.runs):
             return Response("there is no such run", 404)
         return html(explorer.reports[number])

@@ -208,41 +208,35 @@ def _tabulate_data(record: RunRecord) -> Table:
     }
     for level, value in record.return_quantiles.items():
         rows[f"{float(level):.0%} of returns are at most"] = value
-    return Table.from_values("Training data", ["value"], [(n, [v]) for n, v in rows.items()])
+    return Table("Training data", ["value"], [(name, [value]) for name, value in rows.items()])
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
     fitted = [run.record.policy for run in runs]
+    times = [run.record.wall_time_s if run.record.policy else None for run in runs]
     rows: list[tuple[str, Sequence[object]]] = [
         ("policy", [run.record.name for run in runs]),
         ("seed", [str(run.record.seed) for run in runs]),
         ("status", [run.status for run in runs]),
         ("best validation loss", [fit and fit.best_validation for fit in fitted]),
         ("at step", [fit and fit.best_step for fit in fitted]),
-        ("wall time, s", [run.record.wall_time_s if fit else None
-                          for run, fit in zip(runs, fitted, strict=True)]),
-    ]  # fmt: skip
+        ("wall time, s", times),
+    ]
     if any(run.references for run in runs):
         for key, name in REFERENCES.items():
             rows.append((f"loss with {name}", [run.references.get(key) for run in runs]))
-    return Table.from_values("Runs", [run.name for run in runs], rows)
+    return Table("Runs", [run.name for run in runs], rows)
 
 
 def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    settings = [
-        _flatten(run.record.settings) | _flatten({"version": run.record.versions}) for run in runs
-    ]
-    names = dict.fromkeys(name for run_settings in settings for name in run_settings)
-    rows = [(name, [run_settings.get(name) for run_settings in settings]) for name in names]
-    rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]
-    columns = [run.name for run in runs]
-    return Table.from_values("Settings that differ", columns, rows) if rows else None
-
-
-def _flatten(tables: Mapping[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tables.items():
-        inner = {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {}
-        flat |= inner or {name: value}
-    return flat
+    settings: dict[str, list[object]] = {}
+    for number, run in enumerate(runs):
+        for table, fields in {**run.record.settings, "version": run.record.versions}.items():
+            flat = {table: fields}
+            if isinstance(fields, dict) and fields:
+                flat = {f"{table}.{field}": value for field, value in fields.items()}
+            for name, value in flat.items():
+                settings.setdefault(name, [None] * len(runs))[number] = value
+    rows = [(n, values) for n, values in settings.items() if any(v != values[0] for v in values)]
+    return Table("Settings that differ", [run.name for run in runs], rows) if rows else None

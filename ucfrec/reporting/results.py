@@ -104,13 +104,20 @@ def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
     for environment, rows in results.environments.items():
-        names, lines = _name_rows(rows), [evaluation_line(row) for row in rows]
+        names, lines = [], [evaluation_line(row) for row in rows]
+        for line in lines:
+            # The policy, with the fields that differ if it has several rows.
+            same = [other for other in lines if other["policy"] == line["policy"]]
+            fields = ("run", "checkpoint", *_SEEDS)
+            differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
+            parts = (f"{key} {_format_cell(line, key)}" for key in differing)
+            names.append(", ".join([line["policy"], *parts]))
         columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
         body = [
             (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
             for name, row, line in zip(names, rows, lines, strict=True)
         ]
-        table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
+        table = Table(f"{environment}: means of episodes", ["R_cum", *columns], body, "policy")
         title = f"R_cum in {environment}, with 95% intervals"
         pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
     return pictures
@@ -143,12 +150,12 @@ def _draw_rows(rows: Sequence[ResultRow], unit: str, policy: str) -> tuple[Chart
         head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
     names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
     body = [
-        (name, [format_interval(row), *(format_value(row.as_line().get(key)) for key in columns)])
+        (name, [format_interval(row), *(row.as_line().get(key) for key in columns)])
         for name, row in zip(names, rows, strict=True)
     ]
     title = f"{head.capitalize()}{of}: {policy}, with 95% intervals"
     chart = interval_chart(title, _list_intervals(names, rows))
-    return chart, Table(f"{caption} {policy}", "", [head, *columns.values()], body)
+    return chart, Table(f"{caption} {policy}", [head, *columns.values()], body)
 
 
 def draw_forest(results: Results) -> Chart | None:
@@ -185,18 +192,6 @@ def format_interval(row: ResultRow) -> str:
     return f"{format_value(row.value)} [{ends}]"
 
 
-def _name_rows(rows: Sequence[ResultRow]) -> list[str]:
-    """Policy of each row, with the fields that differ if a policy has several rows."""
-    names, lines = [], [evaluation_line(row) for row in rows]
-    for line in lines:
-        same = [row for row in lines if row["policy"] == line["policy"]]
-        fields = ("run", "checkpoint", *_SEEDS)
-        differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-        parts = [line["policy"], *(f"{key} {_format_cell(line, key)}" for key in differing)]
-        names.append(", ".join(parts))
-    return names
-
-
 def _format_cell(line: Mapping[str, Any], column: str) -> str:
     value = line.get(column)
     return str(value) if column in _SEEDS and value is not None else format_value(value)
@@ -222,7 +217,7 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
         if value > highest:
             highest = curve[users] = value
             between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
-            body.append((str(rule), [format_value(value), f"{users:.0f}", between]))
+            body.append((str(rule), [value, f"{users:.0f}", between]))
     if not curve:
         return None
     curves = [("best rule", 0, curve)]
@@ -232,7 +227,7 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
     title = "Value in the search for a rule, against evidence"
     chart = line_chart(title, "effective users of the log", curves)
     head = ["value in the search", "effective users", "off-policy interval"]
-    return chart, Table(title, "rule", head, body)
+    return chart, Table(title, head, body, "rule")
 
 
 NO_RESULTS = (

@@ -85,8 +85,8 @@ def tabulate_rows(source: Source) -> list[Table]:
     ]
     rows = [(name, count) for name, count in counts if count != [None]]
     return [
-        Table.from_values("Rows of the logs", ["count"], rows),
-        Table.from_values("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
+        Table("Rows of the logs", ["count"], rows),
+        Table("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
     ]
 
 
@@ -100,11 +100,12 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
         quantiles.append((title, [values.quantiles.get(level) for level in _LEVELS]))
         if total := sum(values.counts):
             bins = name_bins(values.edges, values.values)
-            cells = [[format_value(count), f"{count / total:.2%}"] for count in values.counts]
-            table = Table(title, x_label, ["count", "share"], list(zip(bins, cells, strict=True)))
+            cells = [[count, f"{count / total:.2%}"] for count in values.counts]
+            rows = list(zip(bins, cells, strict=True))
+            table = Table(title, ["count", "share"], rows, x_label)
             pictures.append((histogram(title, x_label, values.counts, bins), table))
     columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
-    return pictures, Table.from_values("Quantiles", columns, quantiles) if quantiles else None
+    return pictures, Table("Quantiles", columns, quantiles) if quantiles else None
 
 
 def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
@@ -120,11 +121,9 @@ def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
 def draw_curves(
     names: Sequence[str], logged: Sequence[Curves], references: Sequence[Mapping[str, float]]
 ) -> list[tuple[Chart, Table]]:
-    """Chart and table of every scalar that at least one run logged.
+    """Chart and table of every scalar that at least one of R runs on the same data logged.
 
     Args:
-        names: (R,) names of runs on the same data.
-        logged: (R,) curves that each run logged.
         references: (R,) losses (nats) of showing items uniformly and by popularity, by key of
             `REFERENCES`; empty if the loss of the run is not comparable.
     """
@@ -146,8 +145,8 @@ def draw_curves(
                 levels = {REFERENCES[key]: first[key] for key in REFERENCES if key in first}
         lines = [(names[style], style, curve) for style, curve in curves.items()]
         steps = sorted({step for curve in curves.values() for step in curve})
-        rows = [(f"{s:g}", [format_value(c.get(s)) for c in curves.values()]) for s in steps]
-        table = Table(title, "step", [names[style] for style in curves], rows)
+        rows = [(f"{step:g}", [c.get(step) for c in curves.values()]) for step in steps]
+        table = Table(title, [names[style] for style in curves], rows, "step")
         pictures.append((line_chart(title, "step", lines, levels), table))
     return pictures
 
@@ -193,7 +192,7 @@ def tabulate_augmentation(runs: Sequence[tuple[str, int, AugmentationReport]]) -
     caption = (
         "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
     )
-    return Table.from_values(caption, [name for name, _, _ in runs], rows)
+    return Table(caption, [name for name, _, _ in runs], rows)
 
 
 def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | None:
@@ -285,13 +284,10 @@ def _tabulate_session(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
-    lines = [("shown before", item, format_value(reward)) for item, reward in history]
-    lines.append(("shown next in the log", session["logged"], "–"))
+    body = [("shown before", [reward, *items[item].values()]) for item, reward in history]
+    body.append(("shown next in the log", [None, *items[session["logged"]].values()]))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""
-        lines.append((f"recommended {rank}{again}", item, "–"))
-    columns = list(items[session["logged"]])
-    body = [
-        (what, [reward, *(items[item][name] for name in columns)]) for what, item, reward in lines
-    ]
-    return Table(f"Held-out session {number}", "", ["reward", *columns], body)
+        body.append((f"recommended {rank}{again}", [None, *items[item].values()]))
+    columns = ["reward", *items[session["logged"]]]
+    return Table(f"Held-out session {number}", columns, body)

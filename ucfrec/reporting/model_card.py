@@ -259,5 +259,4 @@ def tabulate_user_model(record: RunRecord) -> Table | None:
         rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
-    body = [(name, [value]) for name, value in rows.items()]
-    return Table("User model, on held-out rows", ["value"], body)
+    return Table.of_columns("User model, on held-out rows", {"value": rows})

@@ -24,6 +24,13 @@ class Table:
     corner: str = ""
     """Head of the column of row names."""
 
+    @classmethod
+    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[str, object]]) -> "Table":
+        """A table of columns by name, with a row for every name in at least one of them."""
+        names = dict.fromkeys(name for column in columns.values() for name in column)
+        rows = [(name, [column.get(name) for column in columns.values()]) for name in names]
+        return cls(caption, list(columns), rows)
+
     def __post_init__(self) -> None:
         self.rows = [(name, [format_value(v) for v in values]) for name, values in self.rows]
 
@@ -107,5 +114,4 @@ def _format_text(value: object) -> str:
         return NONE
     if isinstance(value, float):
         return format_number(value)
-    text = str(value)
-    return text if text.isprintable() else one_line(text)
+    return one_line(str(value))

@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.result_rows import read_configurations
 from ucfrec.benchmark.cells import Cell, Evaluation, Measurement
-from ucfrec.benchmark.grid import run_grid, select_names
+from ucfrec.benchmark.grid import run_grid
 from ucfrec.errors import InputError
 from ucfrec.results.rows import ResultRow, RowKey, read_rows
 
@@ -105,6 +105,10 @@ def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         run_grid(_cells(tmp_path, -1, 5), HOW, results, 1)
     assert {row.task for row in read_rows(results)} == {"5"}
+    results.write_text("\n[broken\n")
+    with pytest.raises(InputError, match="line 2 is not a result row"):
+        run_grid(_cells(tmp_path, 7), HOW, results, 1)
+    assert _marks(tmp_path) == ["-1", "5"]
 
 
 def _interrupted(cell: Cell, key: RowKey) -> list[ResultRow]:
@@ -120,18 +124,3 @@ def test_an_interruption_that_a_library_renames_is_no_failed_cell(tmp_path: Path
         run_grid(_cells(tmp_path, 1, 2), replace(HOW, measure=_interrupted), tmp_path / "rows", 1)
     assert not (tmp_path / "rows").exists()
     assert run_grid(_cells(tmp_path, 1), HOW, tmp_path / "rows", 1)
-
-
-def test_a_line_that_is_no_row_is_named_before_anything_is_measured(tmp_path: Path) -> None:
-    results = tmp_path / "rows.jsonl"
-    results.write_text("\n[broken\n")
-    with pytest.raises(InputError, match="line 2 is not a result row"):
-        run_grid(_cells(tmp_path, 1), HOW, results, 1)
-    assert not (tmp_path / "marks").exists()
-
-
-def test_what_is_chosen_keeps_its_order() -> None:
-    assert select_names(("a", "b", "c"), ["c", "a"], "method") == ["a", "c"]
-    assert select_names(("a", "b"), [], "method") == ["a", "b"]
-    with pytest.raises(InputError, match="no method is called d; there are a, b"):
-        select_names(("a", "b"), ["d"], "method")

@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from matplotlib.figure import Figure
 
 from tests.support.result_rows import distractor_rows, result_row
-from ucfrec.benchmark import tables
 from ucfrec.benchmark.tables import (
     DISTRACTOR_RATES,
     average_seeds,
@@ -33,20 +31,15 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
     scores = {
         ("dt", "a"): (10.0, 20.0), ("dt", "b"): (40.0, 50.0), ("iql", "a"): (30.0,),
     }  # fmt: skip
-    rows = [
-        scored(
-            task,
-            method,
-            seed,
-            score + shift,
-            checkpoint=checkpoint,
-            metrics={} if method == "iql" else {"best_step": 7.0},
-        )
-        for (method, task), seeds in scores.items()
-        for seed, score in enumerate(seeds)
-        for checkpoint, shift in (("last", 0.0), ("best", 1.0))
-        if method != "iql" or checkpoint == "last"
-    ]
+    rows, kept = [], {"best_step": 7.0}
+    for (method, task), seeds in scores.items():
+        for seed, score in enumerate(seeds):
+            if method == "iql":
+                rows.append(scored(task, method, seed, score))
+            else:
+                rows.append(scored(task, method, seed, score, metrics=kept))
+                best = scored(task, method, seed, score + 1, checkpoint="best", metrics=kept)
+                rows.append(best)
     dt, iql = score_table(rows, "last")
     # Of 10 and 20 the standard error is 5.
     scores_of_dt = {"a": "15.0 ± 5", "b": "**45.0 ± 5**", "mean": "**30.0 ± 5**"}
@@ -55,8 +48,29 @@ def test_a_table_of_scores_has_the_spread_over_seeds_and_a_mean_where_nothing_is
     best_dt, best_iql = score_table(rows, "best")
     assert best_dt["mean"] == "**31.0 ± 5**"
     assert best_iql == iql
-    more = scored("a", "dt", 2, 18.0, checkpoint="last", metrics={"best_step": 7.0})
+    more = scored("a", "dt", 2, 18.0, metrics=kept)
     assert score_table([*rows, more], "last")[0]["seeds"] == "2–3"
+
+
+def test_of_several_targets_the_best_in_the_mean_counts() -> None:
+    scores = {1.0: (50.0, 10.0), 2.0: (20.0, 45.0), 3.0: (0.0, 49.0)}
+    rows = [scored("t", "iql", 0, 5.0)]
+    for target, seeds in scores.items():
+        rows += [scored("t", "dt", n, score, target_return=target) for n, score in enumerate(seeds)]
+    kept = select_best_target(rows)
+    assert [(row.target_return, row.value) for row in kept] == [(None, 5), (2, 20), (2, 45)]
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    rows = [
+        {"method": "dt", "seed": 0, "score": 1.0, "other": None},
+        {"method": "dc", "seed": 0, "score": 5.0},
+        {"method": "dt", "seed": 1, "score": 3.0, "other": 4.0},
+    ]
+    assert average_seeds(rows, ("method",), ("score", "other")) == [
+        {"method": "dt", "score": "2 ± 1.4", "other": "4"},
+        {"method": "dc", "score": "5", "other": "–"},
+    ]
 
 
 @pytest.mark.parametrize(("best", "near", "far"), [(100.0, 95.1, 94.9), (-10.0, -10.4, -10.6)])
@@ -66,32 +80,6 @@ def test_bold_is_what_comes_within_a_twentieth_of_the_best(
     scores = {"a": best, "b": near, "c": far}
     found = score_table([scored("t", method, 0, s) for method, s in scores.items()], "last")
     assert [line["t"].startswith("**") for line in found] == [True, True, False]
-
-
-def test_of_several_targets_the_best_in_the_mean_counts() -> None:
-    scores = {1.0: (50.0, 10.0), 2.0: (20.0, 45.0), 3.0: (0.0, 49.0)}
-    rows = [
-        scored("t", "dt", seed, score, target_return=target)
-        for target, seeds in scores.items()
-        for seed, score in enumerate(seeds)
-    ] + [scored("t", "iql", 0, 5.0)]
-    kept = select_best_target(rows)
-    assert [(row.method, row.target_return, row.value) for row in kept] == [
-        ("dt", 2.0, 20.0), ("dt", 2.0, 45.0), ("iql", None, 5.0),
-    ]  # fmt: skip
-
-
-def test_what_was_not_measured_is_a_dash() -> None:
-    rows = [
-        {"method": "dt", "seed": 0, "score": 1.0, "other": None},
-        {"method": "dc", "seed": 0, "score": 5.0},
-        {"method": "dt", "seed": 1, "score": 3.0, "other": 4.0},
-    ]
-    found = average_seeds(rows, ("method",), ("score", "other"))
-    assert [row["method"] for row in found] == ["dt", "dc"]
-    assert [row["other"] for row in found] == ["4", "–"]
-    mean, _, deviation = found[0]["score"].partition(" ± ")
-    assert (float(mean), float(deviation)) == (2.0, pytest.approx(2**0.5, abs=0.05))
 
 
 def test_methods_are_compared_seed_by_seed() -> None:
@@ -128,11 +116,8 @@ def test_tables_give_means_spreads_and_paired_drops() -> None:
     # Seed 0 of another log is another pair: drops of 50, 25 and −100%.
     other = distractor_rows({None: (30.0,), 0.0: (60.0,), 1.0: (40.0,)})
     both = [*every, *(replace(row, log_seed=1) for row in other)]
-    assert (
-        distractor_table(both)
-        .splitlines()[2]
-        .endswith("| 3 | 20 ± 10 | 26.67 ± 29 | 21.33 ± 17 | -8.333 ± 80 |")
-    )
+    line = distractor_table(both).splitlines()[2]
+    assert line.endswith("| 3 | 20 ± 10 | 26.67 ± 29 | 21.33 ± 17 | -8.333 ± 80 |")
 
 
 def test_methods_are_compared_with_ucf_by_log_and_seed() -> None:
@@ -161,25 +146,13 @@ def test_pictures_show_the_means_and_the_spread_of_the_tables(tmp_path: Path) ->
     rows = [replace(r, method=m) for m in ("dt", "ucf") for r in distractor_rows(values)]
     clean = [row for row in rows if row.conditions["distractor"] is None]
     for plot, given, name in (
-        (plot_methods, clean, "methods-w"),
-        (plot_distractor, rows, "distractor-w"),
+        (plot_methods, clean, "methods"),
+        (plot_distractor, rows, "distractor"),
     ):
         made = plot(given, tmp_path)
-        assert made == [tmp_path / f"{name}.png", tmp_path / f"{name}.svg"]
+        assert made == [tmp_path / f"{name}-w.png", tmp_path / f"{name}-w.svg"]
         drawn = made[1].read_text()
-        assert ">ucf<" in drawn
-        assert ">dt<" in drawn
+        assert all(text in drawn for text in (">ucf<", ">dt<"))
         plot(given, tmp_path)
         assert made[1].read_text() == drawn
     assert plot_distractor(clean, tmp_path) == []
-
-
-def test_error_bars_are_those_of_the_tables() -> None:
-    figure = Figure()
-    axes = figure.add_subplot()
-    tables._draw_bars(
-        axes, [result_row(value, training_seed=s) for s, value in enumerate((1.0, 3.0))]
-    )
-    (spread,) = (c.errorbar[2][0] for c in axes.containers if getattr(c, "errorbar", None))
-    ((left, right),) = (segment[:, 0] for segment in spread.get_segments())
-    assert (right - left) / 2 == pytest.approx(2**0.5)

@@ -18,7 +18,7 @@ from ucfrec.results.rows import ResultRow
 def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
     """The forest of policies a, b, … with the logged return and the rows of each."""
     estimates = [
-        Estimates(name, estimate(LOGGED, logged), rows, ())
+        Estimates(name, [estimate(LOGGED, logged), *rows])
         for name, (logged, rows) in zip("ab", policies, strict=False)
     ]
     return draw_forest(Results({}, estimates))
@@ -108,7 +108,7 @@ def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
 
 def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
     rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
-    (said,) = conclude(Results({}, [Estimates("ucf", None, rows, ())]))
+    (said,) = conclude(Results({}, [Estimates("ucf", rows)]))
     assert said == "For ucf: higher."
-    (said,) = conclude(Results({}, [Estimates("ucf", None, rows[:1], ())]))
+    (said,) = conclude(Results({}, [Estimates("ucf", rows[:1])]))
     assert "no verdict" in said

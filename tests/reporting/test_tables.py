@@ -1,17 +1,12 @@
 """Tables and numbers as they are written."""
 
-import pytest
-
 from ucfrec.reporting.tables import (
     format_number,
     format_rows,
     format_value,
     markdown_table,
-    mean_and_sd,
-    signed_difference,
     text_table,
 )
-from ucfrec.results.statistics import summary
 
 
 def test_columns_are_aligned_names_left_and_numbers_right() -> None:
@@ -33,18 +28,6 @@ def test_a_value_with_an_interval_shows_it() -> None:
     assert format_rows([row], ("policy", "R_cum", "n")).splitlines()[2] == (
         "ucf     2.000 [1.500, 0.0123]  3"
     )
-
-
-@pytest.mark.parametrize(
-    ("values", "says"),
-    [([], "–"), ([1234.5], "1234"), ([1.0, 2.0], "1.5 ± 0.71"), ([3.0, 3.0], "3 ± 0")],
-)
-def test_means_are_shown_with_the_spread_of_a_sample(values: list[float], says: str) -> None:
-    assert mean_and_sd(values) == says
-
-
-def test_differences_have_a_sign() -> None:
-    assert signed_difference(summary([3.0, 1.0])) == "+2 ± 1"
 
 
 def test_small_numbers_keep_three_digits() -> None:

@@ -116,8 +116,8 @@ class Budget:
 
     def seeds_of(self, task: str, method: str) -> int:
         """The number of training seeds of a method on a task."""
-        fewer = (self.fewer_seeds.get(name, self.seeds) for name in (task, method))
-        return min(self.seeds, *fewer)
+        fewest = min(self.fewer_seeds.get(name, self.seeds) for name in (task, method))
+        return min(self.seeds, fewest)
 
     def narrow(
         self,
@@ -134,19 +134,14 @@ class Budget:
         for name, number in (("training seeds", seeds), ("logs", logs)):
             if number is not None and number < 1:
                 raise InputError(f"{number} {name} are requested; at least one is needed")
-        evaluation = self.evaluation
+        changes: dict[str, Any] = {"logs": logs or self.logs}
+        if tasks:
+            changes |= {"tasks": tuple(tasks), "tasks_of": {}, "optional": ()}
+        if seeds is not None:
+            changes |= {"seeds": seeds, "fewer_seeds": {}}
         if evaluation_seed is not None:
-            evaluation = replace(evaluation, seed=evaluation_seed)
-        return replace(
-            self,
-            tasks=tuple(tasks) or self.tasks,
-            tasks_of={} if tasks else self.tasks_of,
-            optional=() if tasks else self.optional,
-            seeds=self.seeds if seeds is None else seeds,
-            fewer_seeds=self.fewer_seeds if seeds is None else {},
-            logs=self.logs if logs is None else logs,
-            evaluation=evaluation,
-        )
+            changes["evaluation"] = replace(self.evaluation, seed=evaluation_seed)
+        return replace(self, **changes)
 
 
 @dataclass(frozen=True)
@@ -172,7 +167,7 @@ class Cell:
     shared: SharedStages = OWN
     """Reward models and augmentation that methods have in common."""
     settings: tuple[str, ...] = ()
-    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    presets: Presets = field(default_factory=dict)
     """Defaults of the training for its data, below `settings`."""
     conditioned: bool = False
     screening: str | None = None
@@ -188,17 +183,12 @@ class Cell:
 
 def make_key(cell: Cell) -> RowKey:
     """The key under which the cell's rows are stored; `run_grid` fills in `config_hash`."""
-    conditions: dict[str, Scalar] = {**cell.conditions}
+    conditions = dict(cell.conditions)
     if cell.budget:
         conditions |= {"budget": cell.budget, "episodes": cell.evaluation.episodes}
+    same = ("suite", "table", "task", "method", "policy", "training_seed", "log_seed")
     return RowKey(
-        suite=cell.suite,
-        table=cell.table,
-        task=cell.task,
-        method=cell.method,
-        policy=cell.policy,
-        training_seed=cell.training_seed,
-        log_seed=cell.log_seed,
+        **{name: getattr(cell, name) for name in same},
         evaluation_seed=cell.evaluation.seed,
         conditions=conditions,
         data_fingerprint=None if cell.store is None else open_store(cell).record.fingerprint,
@@ -209,8 +199,10 @@ def training_config(cell: Cell) -> dict[str, Any] | None:
     """The configuration of the cell's training; None for a built-in policy."""
     if cell.store is None:
         return None
-    screening = {} if cell.screening is None else {SCREENING: cell.screening}
-    return asdict(cell.config) | screening
+    config = asdict(cell.config)
+    if cell.screening is not None:
+        config[SCREENING] = cell.screening
+    return config
 
 
 def open_store(cell: Cell) -> EpisodeStore:

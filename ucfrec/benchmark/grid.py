@@ -44,14 +44,11 @@ def run_grid(
     describe: str = "benchmark",
     again: bool = False,
 ) -> list[ResultRow]:
-    """Measure every cell that has no row in `results` yet.
+    """Measure every cell that has no row in `results` yet, and those with the same key once.
 
     The rows of a cell are appended as soon as it is measured, so an interruption loses none. A cell
-    that fails does not stop the others and is reported at the end. Cells with the same key are
-    measured once.
-
-    One worker, or an only cell, is measured in this process, whose peak memory during the cell is
-    then the row's; a worker process has little else in it.
+    that fails does not stop the others and is reported at the end. One worker, or an only cell, is
+    measured in this process.
 
     Args:
         results: file of result rows (JSON lines); its other rows are kept. No other process may
@@ -99,7 +96,8 @@ def _measure_all(
     errors, rows, workers = [], {}, min(workers, len(tasks))
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
     seeds = {name: task.key.training_seed for name, task in tasks.items()}
-    ordered = {n: tasks[n] for n in sorted(tasks, key=lambda n: (seeds[n] is not None, seeds[n]))}
+    names = sorted(tasks, key=lambda name: -1 if (seed := seeds[name]) is None else seed)
+    ordered = {name: tasks[name] for name in names}
     outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
     with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
         for name, outcome in outcomes:

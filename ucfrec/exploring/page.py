@@ -44,7 +44,7 @@ _HEADERS: Final = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass
 class Slider:
     """One number of the rule that a visitor can change."""
 
@@ -54,7 +54,7 @@ class Slider:
     low: float
     high: float
     step: float
-    value: float
+    value: float = 0.0
 
 
 class Explorer:
@@ -91,8 +91,9 @@ class Explorer:
         """
         runs = []
         for run in self.runs:
-            card = run.folder / CARD
-            text = card.read_text(encoding="utf-8") if card.exists() else "There is no model card."
+            card, text = run.folder / CARD, "There is no model card."
+            if card.exists():
+                text = card.read_text(encoding="utf-8")
             runs.append((run.folder.name, run, text))
         return template(_PACKAGE, "explore.html").render(
             **self._fill(fields),
@@ -145,7 +146,7 @@ class Explorer:
         lists, error = [], ""
         try:
             if fields.get("user", "").strip() or fields.get("history", "").strip():
-                k = round(_read_number(fields, "k", 10, 1, _MOST_ITEMS))
+                k = round(_read_number(fields, "k", 1, _MOST_ITEMS, 10))
                 for trained in self.runs:
                     history, rule = _read_history(trained, fields), _read_rule(trained, fields)
                     filter_seen = fields.get("keep_seen") is None
@@ -153,44 +154,41 @@ class Explorer:
                     lists.append((trained.folder.name, str(rule), explained))
         except InputError as fault:
             lists, error = [], str(fault)
-        cards = [explained.cards for _, _, explained in lists]
-        ids = [{str(card.item_id) for card in row} for row in cards]
-        widths = [abs(part) for row in cards for card in row for part in card.parts.values()]
+        ids, widest = [], 0.0
+        for _, _, explained in lists:
+            ids.append({str(card.item_id) for card in explained.cards})
+            for card in explained.cards:
+                widest = max(widest, max(map(abs, card.parts.values())))
         return {
             "lists": lists,
             "error": error,
             "common": ids[0] & ids[1] if len(ids) == 2 else None,
             "parts": PARTS,
-            "widest": max(widths, default=0.0) or 1.0,
+            "widest": widest or 1.0,
             "item": self._item,
         }
 
     def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
-        trained = self.runs[0]
-        rule, returns = trained.rule, trained.training_returns
-        low, high = float(returns[0]), float(returns[-1])
-        target = high if rule.target is None else rule.target
+        trained, states = self.runs[0], self.runs[0].item_states
+        low, high = float(trained.training_returns[0]), float(trained.training_returns[-1])
         span = max(high - low, abs(high), 1e-6)
-        sliders = [
-            Slider("target", "Target return", low, high + span / 2, span / 100, target),
-            Slider("temperature", "Temperature", 0, 2, 0.05, rule.temperature),
-            Slider("tag_window", "Exclude tags of the last items", 0, 10, 1, rule.tag_window),
-        ]
+        sliders = [Slider("target", "Target return", low, high + span / 2, span / 100)]
         if trained.reward_model is not None:
-            weight = Slider("reward_weight", "Reward weight", 0, 32, 0.25, rule.reward_weight)
-            sliders.insert(1, weight)
-        if (states := trained.item_states) is None or not bool((states.tags >= 0).any()):
-            sliders.pop()
-        for n, slider in enumerate(sliders):
-            text = fields.get(slider.name, "")
+            sliders.append(Slider("reward_weight", "Reward weight", 0, 32, 0.25))
+        sliders.append(Slider("temperature", "Temperature", 0, 2, 0.05))
+        if states is not None and bool((states.tags >= 0).any()):
+            sliders.append(Slider("tag_window", "Exclude tags of the last items", 0, 10, 1))
+        for slider in sliders:
+            value, text = getattr(trained.rule, slider.name), fields.get(slider.name, "")
+            slider.value = high if value is None else value
             # Where a number is wrong, the list says so.
             if fields.get("custom") is not None and _NUMBER.fullmatch(text):
-                sliders[n] = replace(slider, value=float(text))
+                slider.value = float(text)
         return sliders
 
     def _item(self, item_id: Any) -> dict[str, Any]:
         """Title, picture and other features of an item."""
-        row = dict(self._features.get(str(item_id), {}))
+        row = {**self._features.get(str(item_id), {})}
         row.pop(schema.ITEM_ID, None)
         title = next((row.pop(name) for name in _TITLES if name in row), None)
         image = next((str(row.pop(name)) for name in _IMAGES if name in row), "")
@@ -209,10 +207,10 @@ def _read_history(trained: TrainedPolicy, fields: Mapping[str, str]) -> Historie
         (history,) = read_histories(trained, read_pasted(text), None, ["pasted"])
         unknown = history.item_ids[trained.items.numbers(history.item_ids) < 0]
         if len(unknown):
+            names = name_some(list(dict.fromkeys(unknown.tolist())))
             raise InputError(
-                f"the run {run} does not know the items "
-                f"{name_some(list(dict.fromkeys(unknown.tolist()))):.200}; take their lines out of "
-                "the history"
+                f"the run {run} does not know the items {names:.200}; take their lines out of the "
+                "history"
             )
         return history
     user = fields.get("user", "").strip()
@@ -233,15 +231,17 @@ def _read_rule(trained: TrainedPolicy, fields: Mapping[str, str]) -> DecisionRul
     """The run's own rule, or that of the sliders."""
     if fields.get("custom") is None:
         return trained.rule
-    names = [name for name in ("target", "reward_weight", "temperature") if name in fields]
-    changes: dict[str, Any] = {name: _read_number(fields, name, 0.0, -1e12, 1e12) for name in names}
+    changes: dict[str, Any] = {}
+    for name in ("target", "reward_weight", "temperature"):
+        if name in fields:
+            changes[name] = _read_number(fields, name, -1e12, 1e12)
     if "tag_window" in fields:
-        changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 0, 10))
+        changes["tag_window"] = round(_read_number(fields, "tag_window", 0, 10))
     return replace(trained.rule, **changes)
 
 
 def _read_number(
-    fields: Mapping[str, str], name: str, default: float, low: float, high: float
+    fields: Mapping[str, str], name: str, low: float, high: float, default: float = 0.0
 ) -> float:
     text = fields.get(name, "")
     try:
@@ -270,22 +270,18 @@ def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
 
     @app.get("/")
     def page(request: Request) -> Response:
-        """The page, filled in as the address says."""
         return html(explorer.page(request.query_params))
 
     @app.get("/results")
     def results(request: Request) -> Response:
-        """The list alone."""
         return html(explorer.results(request.query_params))
 
     @app.get("/explore.js")
     def javascript() -> Response:
-        """The script of the page."""
         return Response(script, media_type="text/javascript; charset=utf-8", headers=_HEADERS)
 
     @app.get("/report/{number}")
     def report(number: int) -> Response:
-        """The report of a run."""
         if not 0 <= number < len(explorer.runs):
             return Response("there is no such run", 404)
         return html(explorer.reports[number])

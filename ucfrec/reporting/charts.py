@@ -133,10 +133,9 @@ def line_chart(
     ordered = sorted((levels or {}).items(), key=lambda level: -level[1])
     for (name, value), side in zip(ordered, ("bottom", "top"), strict=False):
         axes.axhline(value, color=INK, linestyle="dotted", linewidth=1)
-        place = axes.get_yaxis_transform()
-        text = _printable(f"{name}: {value:.4g}")
-        axes.text(1, value, text, transform=place, ha="right", va=side)
-        summaries.append(f"For comparison, {name}: {value:.4g}")
+        place, text = axes.get_yaxis_transform(), f"{name}: {value:.4g}"
+        axes.text(1, value, one_line(text), transform=place, ha="right", va=side)
+        summaries.append(f"For comparison, {text}")
     for axis in (axes.xaxis, axes.yaxis):
         _format_labels(axis)
     return render(figure, title, ". ".join(summaries))
@@ -147,17 +146,16 @@ def histogram(title: str, x_label: str, counts: Sequence[float], names: Sequence
     """Draw counts (N,) of N named bins as columns of equal width, whatever the bins' widths."""
     figure, axes = _plot_axes(x_label)
     axes.bar(range(len(counts)), counts, width=0.95, color=SERIES[0], alpha=0.55)
-    labelled = range(0, len(counts), -(-len(counts) // _MOST_LABELS))
-    edges = [names[number].partition(" to ") for number in labelled]
-    # The label of a range is at its lower edge, that of a value below the middle of its column.
-    places = [n - 0.5 if end else n for n, (_, end, _) in zip(labelled, edges, strict=True)]
-    axes.set_xticks(places, [low for low, _, _ in edges])
+    labels = {}
+    for number in range(0, len(counts), -(-len(counts) // _MOST_LABELS)):
+        # The label of a range is at its lower edge, that of a value below the middle of its column.
+        low, end, _ = names[number].partition(" to ")
+        labels[number - 0.5 if end else number] = low
+    axes.set_xticks(list(labels), list(labels.values()))
     _format_labels(axes.yaxis)
     most = int(np.argmax(counts))
-    summary = (
-        f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is "
-        f"{names[most]}: {counts[most]:,.6g}"
-    )
+    highest = f"{names[most]}: {counts[most]:,.6g}"
+    summary = f"{len(counts)} columns from {names[0]} to {names[-1]}; the highest is {highest}"
     return render(figure, title, summary)
 
 
@@ -180,7 +178,7 @@ def interval_chart(title: str, intervals: Sequence[Interval], logged: float | No
     """
     from matplotlib.figure import Figure
 
-    names = [textwrap.wrap(_printable(row.name), _NAME_CHARACTERS) or [""] for row in intervals]
+    names = [textwrap.wrap(one_line(row.name), _NAME_CHARACTERS) or [""] for row in intervals]
     tops = np.cumsum([0, *(_NAME * len(lines) + _BAR for lines in names)])
     height = max(int(tops[-1]), 1) + _BOTTOM
     figure = Figure(figsize=(WIDTH / 72, height / 72))
@@ -216,7 +214,7 @@ def _plot_axes(x_label: str) -> "tuple[Figure, Axes]":
 
     figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
     axes = figure.add_subplot()
-    axes.set_xlabel(_printable(x_label), loc="right")
+    axes.set_xlabel(one_line(x_label), loc="right")
     axes.grid(axis="y")
     return figure, axes
 
@@ -234,10 +232,6 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"
 
 
-def _printable(text: str) -> str:
-    return text if text.isprintable() else one_line(text)
-
-
 def render(figure: "Figure", title: str, summary: str) -> Chart:
     """The figure as an `<svg>` of a page, with variables for its colors; matplotlib escapes texts.
 
@@ -253,7 +247,7 @@ def render(figure: "Figure", title: str, summary: str) -> Chart:
     body = re.sub(r'<g id="[\w.]+"', "<g", body).replace("xlink:href", "href")
     body = re.sub(r"(?<=: )#01\w\wfe(?=[;\"])", lambda color: f"var(--{_COLORS[color[0]]})", body)
     body = re.sub(r"font-family: [^;\"]*;? ?", "", body)
-    label = html.escape(_printable(f"{title}. {summary}"))
+    label = html.escape(one_line(f"{title}. {summary}"))
     return Chart(title, summary, f'<svg {box[0]} role="img" aria-label="{label}">{body}')
 
 
@@ -298,7 +292,6 @@ def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
         path = folder / f"{_NOT_IN_NAMES.sub('-', name)}.{kind}"
         with atomic_file(path) as scratch:
             # A date in the metadata would make the SVG files of equal figures differ.
-            metadata = {"Date": None} if kind == "svg" else None
-            figure.savefig(scratch, format=kind, metadata=metadata)
+            figure.savefig(scratch, format=kind, metadata={"Date": None})
         files.append(path)
     return files

@@ -5,7 +5,7 @@ which every evaluation of the run adds its newest values; nothing in it is typed
 """
 
 import os
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ def write_card(run: Path) -> Path:
     """
     record, card = read_record(run), run / CARD
     refitted = record.refit_of is not None or (run / REFIT / RunRecord.FILE).is_file()
-    logged, fit = read_metrics(run / "policy"), record.policy
+    fit = record.policy
     parts = [
         f"# Model card: {record.name}",
         _tabulate(
@@ -49,10 +49,9 @@ def write_card(run: Path) -> Path:
         "## Training data",
         _describe_data(record, refitted),
         "## How it acts",
-        _describe_rule(run),
-        _describe_user_model(record),
+        _describe_rule(run, record),
         "## Limits",
-        "\n".join(f"- {limit}" for limit in _list_limits(record, refitted, logged)),
+        "\n".join(f"- {limit}" for limit in _list_limits(run, record, refitted)),
         "## Measured",
         _describe_measurements(_read_measured(run)),
     ]
@@ -86,7 +85,7 @@ def add_evaluation(run: Path, row: ResultRow) -> None:
     """Add a row of `ucfrec evaluate` to the card of its run."""
     names = ("R_cum", "R_avg_pooled", "length", "episodes", "coverage", "diversity")
     of = f"{row.environment}, {_format_rule(row)}, checkpoint {row.checkpoint}"
-    values = _select_values(row, names) | {"seed": row.evaluation_seed}
+    values = _select_values(row, names, {"R_cum": row.interval}) | {"seed": row.evaluation_seed}
     add_measurement(run, "ucfrec evaluate", of, values)
 
 
@@ -100,19 +99,14 @@ def add_estimates(run: Path, logs: Iterable[str], report: "OffPolicyReport") -> 
     of += ", pages" if row.conditions["pages"] else ""
     discount = row.conditions["discount"]
     of += f", discount {discount:g}" if discount != 1 else ""
-    values = _select_values(row, names) | {"logged": rows[LOGGED].value}
+    values = _select_values(row, names, {"R_cum": row.interval}) | {"logged": rows[LOGGED].value}
     others = [text for text in report.warnings if text not in report.verdict.reasons]
     add_measurement(run, "ucfrec ope", of, values, [str(report.verdict), *others])
 
 
 def add_ranking(run: Path, row: ResultRow, on: str, remarks: Sequence[str] = ()) -> None:
     """Add a row of `ucfrec rank` on the logs `on`, and its warnings, to the card of its run."""
-    intervals = row.details["intervals"]
-    values: dict[str, object] = {}
-    for name in Ranking.shown:
-        values[name] = row.metrics.get(name)
-        if name in row.metrics and name in intervals:
-            values[name] = _format_interval(row.metrics[name], intervals[name])
+    values = _select_values(row, Ranking.shown, row.details["intervals"])
     of = f"{on}, {_format_rule(row)}, k {row.conditions['k']}, checkpoint {row.checkpoint}"
     of += f", liked: {row.conditions['liked']}"
     add_measurement(run, "ucfrec rank", of, values, remarks)
@@ -122,17 +116,17 @@ def _format_rule(row: ResultRow) -> str:
     return str(DecisionRule.from_dict(row.details["decision_rule"], "a result row"))
 
 
-def _select_values(row: ResultRow, names: Iterable[str]) -> dict[str, object]:
-    """The named values, `R_cum` with its interval."""
+def _select_values(
+    row: ResultRow, names: Iterable[str], intervals: Mapping[str, Sequence[float] | None]
+) -> dict[str, object]:
+    """The named values, with the intervals of those that have one."""
     line = row.as_line()
-    values = {name: line[name] for name in names if line.get(name) is not None}
-    if row.interval is not None and "R_cum" in values:
-        values["R_cum"] = _format_interval(values["R_cum"], row.interval)
+    values: dict[str, object] = {}
+    for name in names:
+        values[name] = line.get(name)
+        if name in row.metrics and (ends := intervals.get(name)) is not None:
+            values[name] = f"{line[name]:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
     return values
-
-
-def _format_interval(value: float, ends: Sequence[float]) -> str:
-    return f"{value:.4g} [{ends[0]:.4g}, {ends[1]:.4g}]"
 
 
 def _read_measured(run: Path) -> list[dict[str, Any]]:
@@ -140,17 +134,15 @@ def _read_measured(run: Path) -> list[dict[str, Any]]:
 
 
 def _describe_data(record: RunRecord, refitted: bool) -> str:
-    source = record.data
     window = _training_window(record, refitted)
-    files = [PurePath(file).name for file in source.files]
     rows = {
-        "files": ", ".join(files) or None,
+        "files": ", ".join(PurePath(file).name for file in record.data.files) or None,
         "training window (UTC)": None if window is None else " to ".join(map(_format_day, window)),
         "reward": f"`{record.reward}`",
         "sessions by": record.session_by,
         "training sessions": record.train_episodes,
         "training steps": record.train_steps,
-        "users": source.users,
+        "users": record.data.users,
         "items": record.sizes["items"] or None,
         "mean return of a session": record.mean_return,
         "largest return of a session": record.return_quantiles.get("1.0"),
@@ -171,24 +163,22 @@ def _format_day(milliseconds: int) -> str:
     return datetime.fromtimestamp(milliseconds / 1000, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def _describe_rule(run: Path) -> str:
-    if not (run / RULE).exists():
-        return "Its decision rule is not chosen yet."
-    return (
-        f"Its decision rule: {read_rule(run / RULE)}. `evaluate`, `ope`, `rank` and "
-        "`recommend` act by it unless another is named; each measurement below names its own."
-    )
-
-
-def _describe_user_model(record: RunRecord) -> str:
+def _describe_rule(run: Path, record: RunRecord) -> str:
+    text = "Its decision rule is not chosen yet."
+    if (run / RULE).exists():
+        text = (
+            f"Its decision rule: {read_rule(run / RULE)}. `evaluate`, `ope`, `rank` and "
+            "`recommend` act by it unless another is named; each measurement below names its own."
+        )
     numbers = tabulate_user_model(record)
     if numbers is None:
-        return "It was chosen without a user model."
+        return f"{text}\n\nIt was chosen without a user model."
     rows = [[name, *values] for name, values in numbers.rows]
-    return "The user model, which chose the rule:\n\n" + markdown_table(["part", "value"], rows)
+    table = markdown_table(["part", "value"], rows)
+    return f"{text}\n\nThe user model, which chose the rule:\n\n{table}"
 
 
-def _list_limits(record: RunRecord, refitted: bool, logged: Container[str]) -> list[str]:
+def _list_limits(run: Path, record: RunRecord, refitted: bool) -> list[str]:
     items = record.sizes["items"]
     limits = []
     if record.refit_of is not None:
@@ -214,7 +204,7 @@ def _list_limits(record: RunRecord, refitted: bool, logged: Container[str]) -> l
         )
     elif unknown:
         limits.append(f"{unknown:,} steps of its logs have no propensity.")
-    if warning := record.learned_nothing(logged):
+    if warning := record.learned_nothing(read_metrics(run / "policy")):
         limits.append(f"{warning[0].upper()}{warning[1:]}.")
     if record.augmentation is not None:
         limits.append(f"Counterfactual augmentation: {record.augmentation.verdict}")
@@ -233,9 +223,9 @@ def _describe_measurements(measured: Sequence[Mapping[str, Any]]) -> str:
         )
     parts = []
     for row in measured:
-        body = [[name, format_value(value)] for name, value in row["values"].items()]
-        parts += [f"### {row['how']}: {row['of']}", markdown_table(["what", "value"], body)]
-        parts += ["\n".join(f"- {line}" for line in row["said"])] if row["said"] else []
+        parts += [f"### {row['how']}: {row['of']}", _tabulate(row["values"])]
+        if row["said"]:
+            parts.append("\n".join(f"- {line}" for line in row["said"]))
     return "\n\n".join(parts)
 
 
@@ -269,5 +259,4 @@ def tabulate_user_model(record: RunRecord) -> Table | None:
         rows["cannot be trusted, as"] = "; ".join(estimate.doubts) or "-"
     if rule.halves_agree is not None:
         rows["halves that choose this rule"] = sum(rule.halves_agree)
-    body = [(name, [value]) for name, value in rows.items()]
-    return Table.from_values("User model, on held-out rows", ["value"], body)
+    return Table.of_columns("User model, on held-out rows", {"value": rows})

@@ -67,8 +67,8 @@ class _Run:
     @property
     def references(self) -> Mapping[str, float]:
         """Reference losses (nats); none if the run's loss is not the items' log-likelihood."""
-        comparable = "action_loss" in self.logged
-        return (self.record.reference_losses or {}) if comparable else {}
+        losses = self.record.reference_losses
+        return losses if losses and "action_loss" in self.logged else {}
 
 
 def write_report(
@@ -131,16 +131,15 @@ def template(package: str, name: str) -> Template:
 
 def _read_runs(folders: Sequence[Path]) -> list[_Run]:
     runs = []
-    paths = list(dict.fromkeys(folder.resolve() for folder in folders))
+    paths = dict.fromkeys(folder.resolve() for folder in folders)
+    common = os.path.commonpath([path.parent for path in paths]) if paths else ""
     for path in paths:
         record = read_record(path)
         augmentation = record.augmentation
         if augmentation is None and (path / AUGMENTATION).exists():
             augmentation = read_augmentation(path / AUGMENTATION)
-        common = os.path.commonpath([folder.parent for folder in paths])
-        name = str(path.relative_to(common))
         logged = select_curves(read_metrics(path / "policy"), record.settings)
-        runs.append(_Run(path, name, record, augmentation, logged))
+        runs.append(_Run(path, str(path.relative_to(common)), record, augmentation, logged))
     return runs
 
 
@@ -149,8 +148,9 @@ def _warnings(run: _Run) -> list[str]:
     report = run.augmentation
     warnings = [run.status] if run.record.policy is None else []
     if report is not None:
-        useful = report.moves.edits and report.bound < report.reward_model.reward_std
-        warnings += [*report.warnings, "" if useful else report.verdict]
+        warnings += report.warnings
+        if not report.moves.edits or report.bound >= report.reward_model.reward_std:
+            warnings.append(report.verdict)
     warnings.append(run.record.learned_nothing(run.logged))
     return [text for text in warnings if text]
 
@@ -158,12 +158,16 @@ def _warnings(run: _Run) -> list[str]:
 def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
     """Template variables of the section on runs with the same data."""
     names, record = [run.name for run in runs], runs[0].record
-    item_runs = [run for run in runs if run.record.sizes["items"]]
-    edited = [
-        (run.name, style, run.augmentation)
-        for style, run in enumerate(runs)
-        if run.augmentation is not None
-    ]
+    edited, user_models, frontiers, samples = [], [], [], []
+    for style, run in enumerate(runs):
+        if run.augmentation is not None:
+            edited.append((run.name, style, run.augmentation))
+        if run.record.sizes["items"]:
+            if (table := tabulate_user_model(run.record)) is not None:
+                user_models.append((run.name, table))
+            if (drawn := draw_frontier(run.record, read_candidates(run.folder))) is not None:
+                frontiers.append((run.name, drawn))
+            samples.append((run.name, tabulate_samples(run.folder, features)))
     pictures, quantiles = draw_distributions(record.data)
     return {
         "names": names,
@@ -179,17 +183,9 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
         "verdicts": [(name, report.verdict) for name, _, report in edited],
         "augmentation": tabulate_augmentation(edited) if edited else None,
         "moves": draw_moves(edited),
-        "user_models": [
-            (run.name, table)
-            for run in item_runs
-            if (table := tabulate_user_model(run.record)) is not None
-        ],
-        "frontiers": [
-            (run.name, chart)
-            for run in item_runs
-            if (chart := draw_frontier(run.record, read_candidates(run.folder))) is not None
-        ],
-        "samples": [(run.name, tabulate_samples(run.folder, features)) for run in item_runs],
+        "user_models": user_models,
+        "frontiers": frontiers,
+        "samples": samples,
         "differences": _tabulate_differences(runs),
         "records": [(run.name, json_text(run.record.model_dump(), indent=2)) for run in runs],
     }
@@ -197,7 +193,7 @@ def _section(runs: Sequence[_Run], features: pa.Table | None) -> dict[str, Any]:
 
 def _tabulate_data(record: RunRecord) -> Table:
     sizes = record.sizes
-    rows = {
+    rows: dict[str, object] = {
         "fingerprint": record.fingerprint[:12],
         "reward": record.reward,
         "training sessions": record.train_episodes,
@@ -208,41 +204,35 @@ def _tabulate_data(record: RunRecord) -> Table:
     }
     for level, value in record.return_quantiles.items():
         rows[f"{float(level):.0%} of returns are at most"] = value
-    return Table.from_values("Training data", ["value"], [(n, [v]) for n, v in rows.items()])
+    return Table.of_columns("Training data", {"value": rows})
 
 
 def _summarise(runs: Sequence[_Run]) -> Table:
-    fitted = [run.record.policy for run in runs]
-    rows: list[tuple[str, Sequence[object]]] = [
-        ("policy", [run.record.name for run in runs]),
-        ("seed", [str(run.record.seed) for run in runs]),
-        ("status", [run.status for run in runs]),
-        ("best validation loss", [fit and fit.best_validation for fit in fitted]),
-        ("at step", [fit and fit.best_step for fit in fitted]),
-        ("wall time, s", [run.record.wall_time_s if fit else None
-                          for run, fit in zip(runs, fitted, strict=True)]),
-    ]  # fmt: skip
-    if any(run.references for run in runs):
-        for key, name in REFERENCES.items():
-            rows.append((f"loss with {name}", [run.references.get(key) for run in runs]))
-    return Table.from_values("Runs", [run.name for run in runs], rows)
+    columns = {}
+    for run in runs:
+        fit = run.record.policy
+        columns[run.name] = {
+            "policy": run.record.name,
+            "seed": str(run.record.seed),
+            "status": run.status,
+            "best validation loss": fit and fit.best_validation,
+            "at step": fit and fit.best_step,
+            "wall time, s": run.record.wall_time_s if fit else None,
+        }
+        known = {key: name for key, name in REFERENCES.items() if key in run.references}
+        columns[run.name] |= {f"loss with {name}": run.references[k] for k, name in known.items()}
+    return Table.of_columns("Runs", columns)
 
 
 def _tabulate_differences(runs: Sequence[_Run]) -> Table | None:
     """Settings and versions that differ between runs; None if there are none."""
-    settings = [
-        _flatten(run.record.settings) | _flatten({"version": run.record.versions}) for run in runs
-    ]
-    names = dict.fromkeys(name for run_settings in settings for name in run_settings)
-    rows = [(name, [run_settings.get(name) for run_settings in settings]) for name in names]
-    rows = [(name, values) for name, values in rows if any(v != values[0] for v in values)]
-    columns = [run.name for run in runs]
-    return Table.from_values("Settings that differ", columns, rows) if rows else None
-
-
-def _flatten(tables: Mapping[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tables.items():
-        inner = {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {}
-        flat |= inner or {name: value}
-    return flat
+    settings: dict[str, list[object]] = {}
+    for number, run in enumerate(runs):
+        for table, fields in {**run.record.settings, "version": run.record.versions}.items():
+            flat = {table: fields}
+            if isinstance(fields, dict) and fields:
+                flat = {f"{table}.{field}": value for field, value in fields.items()}
+            for name, value in flat.items():
+                settings.setdefault(name, [None] * len(runs))[number] = value
+    rows = [(n, values) for n, values in settings.items() if any(v != values[0] for v in values)]
+    return Table("Settings that differ", [run.name for run in runs], rows) if rows else None

@@ -30,11 +30,9 @@ class Estimates:
     """The estimates of one `ucfrec ope` for one policy."""
 
     name: str
-    logged: ResultRow | None
-    """Row of the logged sessions' own return."""
     rows: Sequence[ResultRow]
-    """One row per estimator, without `logged`."""
-    warnings: tuple[str, ...]
+    """One row per estimator, and that of the logged sessions' own return."""
+    warnings: tuple[str, ...] = ()
     steps: Sequence[ResultRow] = ()
     """Rows per step, with that of the logged steps."""
 
@@ -79,19 +77,17 @@ def read_evidence(paths: Sequence[Path]) -> Results:
 
 def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
     steps = [row for row in group if row.metric == _STEP]
-    sessions = [row for row in group if row.metric != _STEP]
-    logged = next((row for row in sessions if row.method == LOGGED), None)
-    rows = [row for row in sessions if row is not logged]
-    first = rows[0] if rows else group[0]
-    run, choice = first.conditions.get("run"), first.conditions.get("choice")
-    name = first.policy
-    name += "" if choice is None else f" ({choice})"
-    name += "" if run is None else f" of {run}"
+    rows = [row for row in group if row.metric != _STEP]
+    first = next((row for row in rows if row.method != LOGGED), group[0])
+    name, conditions = first.policy, first.conditions
     if first.details.get("selection") is not None:
-        name = f"{first.policy} ({first.details.get('candidate')})"
+        name += f" ({first.details.get('candidate')})"
+    else:
+        name += f" ({conditions['choice']})" if conditions.get("choice") is not None else ""
+        name += f" of {conditions['run']}" if conditions.get("run") is not None else ""
     warnings = (row.details.get("warnings") for row in group)
     texts = (str(text) for texts in warnings if isinstance(texts, list) for text in texts)
-    return Estimates(name, logged, rows, tuple(dict.fromkeys(texts)), steps)
+    return Estimates(name, rows, tuple(dict.fromkeys(texts)), steps)
 
 
 def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
@@ -104,76 +100,74 @@ def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
     for environment, rows in results.environments.items():
-        names, lines = _name_rows(rows), [evaluation_line(row) for row in rows]
+        names, lines = [], [evaluation_line(row) for row in rows]
+        for line in lines:
+            # The policy, with the fields that differ if it has several rows.
+            same = [other for other in lines if other["policy"] == line["policy"]]
+            fields = ("run", "checkpoint", *_SEEDS)
+            differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
+            parts = (f"{key} {_format_cell(line, key)}" for key in differing)
+            names.append(", ".join([line["policy"], *parts]))
         columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
         body = [
             (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
             for name, row, line in zip(names, rows, lines, strict=True)
         ]
-        table = Table(f"{environment}: means of episodes", "policy", ["R_cum", *columns], body)
+        table = Table(f"{environment}: means of episodes", ["R_cum", *columns], body, "policy")
         title = f"R_cum in {environment}, with 95% intervals"
         pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
     return pictures
 
 
-def draw_estimates(results: Results) -> list[tuple[Chart, Table, Sequence[str]]]:
-    """Chart, table and warnings of each policy with estimates from logs, and of those per step."""
-    pictures: list[tuple[Chart, Table, Sequence[str]]] = []
+def draw_estimates(results: Results) -> list[tuple[list[tuple[Chart, Table]], Sequence[str]]]:
+    """Charts and tables, and warnings, of each policy with estimates from logs."""
+    pictures: list[tuple[list[tuple[Chart, Table]], Sequence[str]]] = []
     for estimates in results.estimates:
-        logged = [] if estimates.logged is None else [estimates.logged]
-        parts = [_draw_rows([*logged, *estimates.rows], "sessions", estimates.name)]
+        parts = [_draw_rows(estimates.rows, "sessions", estimates.name)]
         if estimates.steps:
             parts.append(_draw_rows(estimates.steps, "steps", estimates.name))
-        # The warnings come once, below both.
-        pictures += [(*part, ()) for part in parts[:-1]]
-        pictures.append((*parts[-1], estimates.warnings))
+        pictures.append((parts, estimates.warnings))
     return pictures
 
 
 def _draw_rows(rows: Sequence[ResultRow], unit: str, policy: str) -> tuple[Chart, Table]:
     """Chart and table of the estimates for a policy per `unit`, "sessions" or "steps"."""
-    columns = {
-        f"effective_{unit}": "effective sample",
-        "largest_weight": "share of the largest weight",
-    }
+    effective, largest = "effective sample", "share of the largest weight"
+    columns = {f"effective_{unit}": effective, "largest_weight": largest}
+    head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
     if unit == "sessions":
         columns |= {"sessions": "sessions", "overlap": "overlap"}
         head, of, caption = "mean return of a session", "", "Estimates for"
-    else:
-        head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
     names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
     body = [
-        (name, [format_interval(row), *(format_value(row.as_line().get(key)) for key in columns)])
+        (name, [format_interval(row), *(row.as_line().get(key) for key in columns)])
         for name, row in zip(names, rows, strict=True)
     ]
     title = f"{head.capitalize()}{of}: {policy}, with 95% intervals"
     chart = interval_chart(title, _list_intervals(names, rows))
-    return chart, Table(f"{caption} {policy}", "", [head, *columns.values()], body)
+    return chart, Table(f"{caption} {policy}", [head, *columns.values()], body)
 
 
 def draw_forest(results: Results) -> Chart | None:
     """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
-    intervals = [
-        Interval(
-            f"{estimates.name}: {row.method}",
-            row.value,
-            *row.interval,
-            reliable=row.details.get("reliable") is True,
-        )
-        for estimates in results.estimates
-        if (row := find_quoted(estimates.rows)) is not None and row.interval
-    ]
+    intervals, logged = [], set()
+    for estimates in results.estimates:
+        logged |= {row.value for row in estimates.rows if row.method == LOGGED}
+        row = find_quoted(estimates.rows)
+        if row is not None and row.interval is not None:
+            (low, high), reliable = row.interval, row.details.get("reliable") is True
+            name = f"{estimates.name}: {row.method}"
+            intervals.append(Interval(name, row.value, low, high, reliable))
     if not intervals:
         return None
     # The line is of one set of logs; several have a line each in their own charts.
-    logged = {policy.logged.value for policy in results.estimates if policy.logged is not None}
     title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
     return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
 
 
 def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Interval]:
     return [
-        Interval(name, row.value, *row.interval)
+        Interval(name, row.value, row.interval[0], row.interval[1])
         for name, row in zip(names, rows, strict=True)
         if row.interval is not None
     ]
@@ -183,18 +177,6 @@ def format_interval(row: ResultRow) -> str:
     """The value with its 95% interval, if it has one."""
     ends = "–" if row.interval is None else ", ".join(map(format_value, row.interval))
     return f"{format_value(row.value)} [{ends}]"
-
-
-def _name_rows(rows: Sequence[ResultRow]) -> list[str]:
-    """Policy of each row, with the fields that differ if a policy has several rows."""
-    names, lines = [], [evaluation_line(row) for row in rows]
-    for line in lines:
-        same = [row for row in lines if row["policy"] == line["policy"]]
-        fields = ("run", "checkpoint", *_SEEDS)
-        differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-        parts = [line["policy"], *(f"{key} {_format_cell(line, key)}" for key in differing)]
-        names.append(", ".join(parts))
-    return names
 
 
 def _format_cell(line: Mapping[str, Any], column: str) -> str:
@@ -209,30 +191,26 @@ def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[C
     """
     if record.rule is None:
         return None
-    evidence = [
-        (candidate.evidence.effective_users, candidate.value, candidate.rule,
-         candidate.evidence.interval)
-        for candidate in candidates
-        if candidate.value is not None
-        and candidate.evidence
-        and candidate.evidence.effective_users is not None
-    ]  # fmt: skip
-    highest, curve, body = -math.inf, dict[float, float](), []
-    for users, value, rule, ends in sorted(evidence, key=lambda rule: (-rule[0], -rule[1])):
-        if value > highest:
-            highest = curve[users] = value
+    known = [
+        (c.evidence.effective_users, c.value, c.rule, c.evidence.interval)
+        for c in candidates
+        if c.value is not None and c.evidence and c.evidence.effective_users is not None
+    ]
+    curve, body = dict[float, float](), []
+    for users, value, rule, ends in sorted(known, key=lambda place: (-place[0], -place[1])):
+        if value > max(curve.values(), default=-math.inf):
+            curve[users] = value
             between = f"{ends[0]:.4g} to {ends[1]:.4g}" if ends else "-"
-            body.append((str(rule), [format_value(value), f"{users:.0f}", between]))
+            body.append((str(rule), [value, f"{users:.0f}", between]))
     if not curve:
         return None
     curves = [("best rule", 0, curve)]
-    chosen = [(users, value) for users, value, rule, _ in evidence if rule == record.rule.rule]
-    if chosen:
+    if chosen := [(users, value) for users, value, rule, _ in known if rule == record.rule.rule]:
         curves.append(("chosen rule", 1, dict(chosen[:1])))
     title = "Value in the search for a rule, against evidence"
     chart = line_chart(title, "effective users of the log", curves)
     head = ["value in the search", "effective users", "off-policy interval"]
-    return chart, Table(title, "rule", head, body)
+    return chart, Table(title, head, body, "rule")
 
 
 NO_RESULTS = (
@@ -297,22 +275,18 @@ def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:
         return f"In {environment}, only built-in policies were evaluated: {_join(references)}."
     best, *lower = trained
     ends = f"{format_value(best.low)} to {format_value(best.high)}"
-    value = f"{format_value(best.value)} (95% interval {ends})"
+    of = f"(95% interval {ends})"
     if best.trainings > 1:
-        value = f"{format_value(best.value)} in the mean of {best.trainings} trainings "
-        value += f"(their 95% intervals span {ends})"
-    if lower:
-        text = (
-            f"In {environment}, {best.policy} has the highest return of {len(trained)} trained "
-            f"policies: {value} per episode."
-        )
-        if close := [policy for policy in lower if not best.above(policy)]:
-            text += f" Its interval overlaps that of {_join(close)}:"
-            text += " which of them has the higher return is open."
-        else:
-            text += f" Its interval lies above those of the others, the next being {lower[0]}."
-    else:
-        text = f"In {environment}, {best.policy} has a return of {value} per episode."
+        of = f"in the mean of {best.trainings} trainings (their 95% intervals span {ends})"
+    rank = f"the highest return of {len(trained)} trained policies:" if lower else "a return of"
+    text = (
+        f"In {environment}, {best.policy} has {rank} {format_value(best.value)} {of} per episode."
+    )
+    if close := [policy for policy in lower if not best.above(policy)]:
+        text += f" Its interval overlaps that of {_join(close)}: which of them has the higher "
+        text += "return is open."
+    elif lower:
+        text += f" Its interval lies above those of the others, the next being {lower[0]}."
     text += _compare(best, references)
     if max(policy.trainings for policy in trained) < 2:
         once = "Each policy was" if lower else "It was"
@@ -327,8 +301,8 @@ def _compare(best: _Return, references: Sequence[_Return]) -> str:
     below = [policy for policy in references if best.above(policy)]
     above = [policy for policy in references if policy.above(best)]
     unclear = [policy for policy in references if policy not in (*above, *below)]
-    parts = [f"higher than that of {_join(below)}"] if below else []
-    parts += [f"lower than that of {_join(above)}"] if above else []
+    groups = {"higher": below, "lower": above}
+    parts = [f"{word} than that of {_join(group)}" for word, group in groups.items() if group]
     text = f" Its return is {', and '.join(parts)}." if parts else ""
     if unclear:
         text += f" Whether it is higher or lower than that of {_join(unclear)} is open: intervals "
@@ -338,11 +312,10 @@ def _compare(best: _Return, references: Sequence[_Return]) -> str:
 
 def _quote(estimates: Estimates) -> str:
     """What `ucfrec ope` concluded of a policy, as its rows say."""
-    rows = [*estimates.rows, *([estimates.logged] if estimates.logged else [])]
-    verdicts = (row.details["verdict"] for row in rows if row.details.get("verdict"))
-    if (quoted := next(verdicts, None)) is None:
-        return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
-    return f"For {estimates.name}: {quoted}."
+    for row in estimates.rows:
+        if verdict := row.details.get("verdict"):
+            return f"For {estimates.name}: {verdict}."
+    return f"For {estimates.name}, the rows have no verdict of ucfrec ope."
 
 
 def _join(policies: Sequence[_Return]) -> str:

@@ -11,41 +11,39 @@ from ucfrec.results.statistics import Summary, summary
 
 NONE = "–"
 """Cell of a missing value."""
-_EVALUATION = (
-    *("environment", "policy", "R_cum", "R_avg_pooled", "R_avg_episode", "length", "episodes"),
-    "seed",
-)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Table:
-    """A table of the report."""
+    """A table of the report, whose values become texts as `format_value` writes them."""
 
     caption: str
-    corner: str
-    """Head of the column of row names."""
     columns: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[str]]]
-    """(name, one cell per column) of each row."""
+    rows: Sequence[tuple[str, Sequence[object]]]
+    """(name, one value per column) of each row."""
+    corner: str = ""
+    """Head of the column of row names."""
 
     @classmethod
-    def from_values(
-        cls, caption: str, columns: Sequence[str], rows: Iterable[tuple[str, Sequence[object]]]
-    ) -> "Table":
-        """A table of (name, one value per column), as `format_value` writes them."""
-        cells = [(name, [format_value(value) for value in values]) for name, values in rows]
-        return cls(caption, "", columns, cells)
+    def of_columns(cls, caption: str, columns: Mapping[str, Mapping[str, object]]) -> "Table":
+        """A table of columns by name, with a row for every name in at least one of them."""
+        names = dict.fromkeys(name for column in columns.values() for name in column)
+        rows = [(name, [column.get(name) for column in columns.values()]) for name in names]
+        return cls(caption, list(columns), rows)
+
+    def __post_init__(self) -> None:
+        self.rows = [(name, [format_value(v) for v in values]) for name, values in self.rows]
 
 
 def text_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """An aligned table for a terminal; the first two columns are left-aligned, others right."""
     table = [[_format_text(cell) for cell in line] for line in (head, *lines)]
     widths = [max(len(line[i]) for line in table) for i in range(len(head))]
+    table.insert(1, ["-" * width for width in widths])
     written = []
     for line in table:
         cells = [line[i].ljust(w) if i < 2 else line[i].rjust(w) for i, w in enumerate(widths)]
         written.append("  ".join(cells).rstrip())
-    written.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(written)
 
 
@@ -57,17 +55,15 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> st
 
 def evaluation_line(row: ResultRow) -> dict[str, Any]:
     """A row with its values by the column names of tables of evaluations."""
-    return {
-        **row.as_line(),
-        "policy": row.method,
-        "seed": row.evaluation_seed,
-        "train_seed": row.training_seed,
-    }
+    seeds = {"seed": row.evaluation_seed, "train_seed": row.training_seed}
+    return {**row.as_line(), "policy": row.method, **seeds}
 
 
 def evaluation_table(rows: Iterable[ResultRow]) -> str:
     """Rows of evaluations as an aligned text table."""
-    return format_rows([evaluation_line(row) for row in rows], _EVALUATION)
+    returns = ("R_cum", "R_avg_pooled", "R_avg_episode")
+    columns = ("environment", "policy", *returns, "length", "episodes", "seed")
+    return format_rows([evaluation_line(row) for row in rows], columns)
 
 
 def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
@@ -118,5 +114,4 @@ def _format_text(value: object) -> str:
         return NONE
     if isinstance(value, float):
         return format_number(value)
-    text = str(value)
-    return text if text.isprintable() else one_line(text)
+    return one_line(str(value))

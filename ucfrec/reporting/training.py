@@ -75,18 +75,15 @@ def tabulate_rows(source: Source) -> list[Table]:
     total = source.rows_read
     if total is None:
         return []
-    counts = [(name, [getattr(source, key)]) for key, name in _COUNTS.items()]
-    dropped = [
-        (
-            f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}",
-            [rows, f"{rows / total:.2%}" if total else None],
-        )
-        for reason, rows in source.dropped.items()
-    ]
-    rows = [(name, count) for name, count in counts if count != [None]]
+    values = {name: getattr(source, key) for key, name in _COUNTS.items()}
+    counts = {name: value for name, value in values.items() if value is not None}
+    dropped = []
+    for reason, rows in source.dropped.items():
+        name = f"{reason.replace('_', ' ')}: {_REASONS.get(reason, 'dropped')}"
+        dropped.append((name, [rows, f"{rows / total:.2%}" if total else None]))
     return [
-        Table.from_values("Rows of the logs", ["count"], rows),
-        Table.from_values("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
+        Table.of_columns("Rows of the logs", {"count": counts}),
+        Table("Rows dropped, by reason", ["rows", "share of rows read"], dropped),
     ]
 
 
@@ -94,17 +91,18 @@ def draw_distributions(source: Source) -> tuple[list[tuple[Chart, Table]], Table
     """Chart and table of each distribution that `prepare` summarised, and their quantiles."""
     pictures, quantiles = [], []
     for name, (title, x_label) in _DISTRIBUTIONS.items():
-        values = source.summary.get(name) if source.rows_read is not None else None
-        if values is None:
+        values = source.summary.get(name)
+        if values is None or source.rows_read is None:
             continue
         quantiles.append((title, [values.quantiles.get(level) for level in _LEVELS]))
         if total := sum(values.counts):
             bins = name_bins(values.edges, values.values)
-            cells = [[format_value(count), f"{count / total:.2%}"] for count in values.counts]
-            table = Table(title, x_label, ["count", "share"], list(zip(bins, cells, strict=True)))
+            cells = [[count, f"{count / total:.2%}"] for count in values.counts]
+            rows = list(zip(bins, cells, strict=True))
+            table = Table(title, ["count", "share"], rows, x_label)
             pictures.append((histogram(title, x_label, values.counts, bins), table))
     columns = ["smallest", "25%", "median", "75%", "99%", "largest"]
-    return pictures, Table.from_values("Quantiles", columns, quantiles) if quantiles else None
+    return pictures, Table("Quantiles", columns, quantiles) if quantiles else None
 
 
 def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
@@ -120,34 +118,30 @@ def select_curves(logged: Curves, config: Mapping[str, Any]) -> Curves:
 def draw_curves(
     names: Sequence[str], logged: Sequence[Curves], references: Sequence[Mapping[str, float]]
 ) -> list[tuple[Chart, Table]]:
-    """Chart and table of every scalar that at least one run logged.
+    """Chart and table of every scalar that at least one of R runs on the same data logged.
 
     Args:
-        names: (R,) names of runs on the same data.
-        logged: (R,) curves that each run logged.
         references: (R,) losses (nats) of showing items uniformly and by popularity, by key of
             `REFERENCES`; empty if the loss of the run is not comparable.
     """
     scalars = {name for curves in logged for name in curves}
     pictures = []
     for name in sorted(scalars, key=lambda n: ([*_TITLES, n].index(n), n)):
-        curves = {
-            style: curve
+        lines = [
+            (names[style], style, curve)
             for style, run in enumerate(logged)
-            if name in run and (curve := _thin_curve(run[name]))
-        }
-        if not curves:
+            if (curve := _thin_curve(run.get(name, {})))
+        ]
+        if not lines:
             continue
-        title = _TITLES.get(name, name)
-        levels = {}
+        title, levels = _TITLES.get(name, name), {}
         if name in ("validation_loss", "action_loss"):
-            first, *further = (references[style] for style in curves)
+            first, *further = (references[style] for _, style, _ in lines)
             if all(losses == first for losses in further):
                 levels = {REFERENCES[key]: first[key] for key in REFERENCES if key in first}
-        lines = [(names[style], style, curve) for style, curve in curves.items()]
-        steps = sorted({step for curve in curves.values() for step in curve})
-        rows = [(f"{s:g}", [format_value(c.get(s)) for c in curves.values()]) for s in steps]
-        table = Table(title, "step", [names[style] for style in curves], rows)
+        steps = sorted({step for _, _, curve in lines for step in curve})
+        rows = [(f"{step:g}", [curve.get(step) for _, _, curve in lines]) for step in steps]
+        table = Table(title, [run for run, _, _ in lines], rows, "step")
         pictures.append((line_chart(title, "step", lines, levels), table))
     return pictures
 
@@ -161,39 +155,38 @@ def _thin_curve(curve: Mapping[int, float]) -> dict[float, float]:
 
 def tabulate_augmentation(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Table:
     """Quality of the reward model and of the edits, one column per run (name, style, report)."""
-    reports = [report for _, _, report in runs]
-    models, moves = [r.reward_model for r in reports], [r.moves for r in reports]
-    actions = [r.actions for r in reports]
-    rows: list[tuple[str, Sequence[object]]] = [
-        ("R² of the reward model, from state and action", [m.r2_without_z for m in models]),
-        ("R² with the abduced z, which has seen the reward", [m.r2 for m in models]),
-        ("standard deviation of the reward", [m.reward_std for m in models]),
-        ("active latent dimensions",
-         [f"{m.active_dimensions} of {m.latent_dim}" for m in models]),
-        ("share of z in the reward's variance", [m.z_share for m in models]),
-        ("leak: correlation of z with E[r | s, a]", [m.z_leak for m in models]),
-        ("augmented episodes", [r.copies for r in reports]),
-        ("accepted edits", [m.edits for m in moves]),
-        ("acceptance (share of proposals)", [r.acceptance for r in reports]),
-        ("δ, error of the reward model", [r.delta for r in reports]),
-        ("ε_r, tolerance of the gate", [r.epsilon_r for r in reports]),
-        ("bound δ + ε_r", [r.bound for r in reports]),
-        ("mean-move ratio (1: one shift for all states)", [m.mean_move_ratio for m in moves]),
-        ("effective rank of the moves",
-         [f"{format_value(m.effective_rank)} of {m.dimensions}" for m in moves]),
-        ("median length of a move ‖Δ‖₂", [m.length_quantiles.get("0.5") for m in moves]),
-    ]  # fmt: skip
-    if any(actions):
-        rows += [
-            ("other actions proposed", [a and a.proposals for a in actions]),
-            ("copies with another action", [a and a.copies for a in actions]),
-            ("mean change of their reward", [a and a.mean_change for a in actions]),
-            ("share of them with a higher reward", [a and a.earns_more for a in actions]),
-        ]
+    columns: dict[str, dict[str, object]] = {}
+    for name, _, report in runs:
+        model, moves, actions = report.reward_model, report.moves, report.actions
+        columns[name] = {
+            "R² of the reward model, from state and action": model.r2_without_z,
+            "R² with the abduced z, which has seen the reward": model.r2,
+            "standard deviation of the reward": model.reward_std,
+            "active latent dimensions": f"{model.active_dimensions} of {model.latent_dim}",
+            "share of z in the reward's variance": model.z_share,
+            "leak: correlation of z with E[r | s, a]": model.z_leak,
+            "augmented episodes": report.copies,
+            "accepted edits": moves.edits,
+            "acceptance (share of proposals)": report.acceptance,
+            "δ, error of the reward model": report.delta,
+            "ε_r, tolerance of the gate": report.epsilon_r,
+            "bound δ + ε_r": report.bound,
+            "mean-move ratio (1: one shift for all states)": moves.mean_move_ratio,
+            "effective rank of the moves":
+                f"{format_value(moves.effective_rank)} of {moves.dimensions}",
+            "median length of a move ‖Δ‖₂": moves.length_quantiles.get("0.5"),
+        }  # fmt: skip
+        if actions:
+            columns[name] |= {
+                "other actions proposed": actions.proposals,
+                "copies with another action": actions.copies,
+                "mean change of their reward": actions.mean_change,
+                "share of them with a higher reward": actions.earns_more,
+            }
     caption = (
         "Reward model and augmented episodes, on held-out steps; δ, ε_r in units of the reward"
     )
-    return Table.from_values(caption, [name for name, _, _ in runs], rows)
+    return Table.of_columns(caption, columns)
 
 
 def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | None:
@@ -272,11 +265,11 @@ def _item_cells(
 
 def _describe_item(features: Mapping[str, Any]) -> str:
     """Text of the features that are neither missing nor zero, cut to `_MOST_CHARACTERS`."""
-    parts = [
-        f"{name} {', '.join(map(format_value, value if isinstance(value, list) else [value]))}"
-        for name, value in features.items()
-        if value
-    ]
+    parts = []
+    for name, value in features.items():
+        if value:
+            values = value if isinstance(value, list) else [value]
+            parts.append(f"{name} {', '.join(map(format_value, values))}")
     text = "; ".join(parts) or "–"
     return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 1]}…"
 
@@ -285,13 +278,10 @@ def _tabulate_session(
     number: int, session: Mapping[str, Any], items: Mapping[int, Mapping[str, str]]
 ) -> Table:
     history = zip(session["history"], session["rewards"], strict=True)
-    lines = [("shown before", item, format_value(reward)) for item, reward in history]
-    lines.append(("shown next in the log", session["logged"], "–"))
+    body = [("shown before", [reward, *items[item].values()]) for item, reward in history]
+    body.append(("shown next in the log", [None, *items[session["logged"]].values()]))
     for rank, item in enumerate(session["recommended"], start=1):
         again = " (shown before)" if item in session["history"] else ""
-        lines.append((f"recommended {rank}{again}", item, "–"))
-    columns = list(items[session["logged"]])
-    body = [
-        (what, [reward, *(items[item][name] for name in columns)]) for what, item, reward in lines
-    ]
-    return Table(f"Held-out session {number}", "", ["reward", *columns], body)
+        body.append((f"recommended {rank}{again}", [None, *items[item].values()]))
+    columns = ["reward", *items[session["logged"]]]
+    return Table(f"Held-out session {number}", columns, body)

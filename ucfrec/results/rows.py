@@ -1,7 +1,6 @@
 """Result rows of all measurements: what was measured, its numbers and their origin.
 
-Rows are lines of JSON in files that several processes may append to. In Python they are a table: a
-data frame, a chart, HTML for notebooks.
+Rows are lines of JSON in files that several processes may append to; in Python they are a table.
 """
 
 import json
@@ -9,7 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
@@ -18,14 +17,7 @@ from annotated_types import Ge, Lt
 from pydantic import AfterValidator, AllowInfNan, ConfigDict, Strict, TypeAdapter, ValidationError
 
 from ucfrec.errors import InputError
-from ucfrec.files.atomic import (
-    atomic_file,
-    claim,
-    lock_path,
-    read_json,
-    remove_leftovers,
-    write_json,
-)
+from ucfrec.files import atomic
 from ucfrec.provenance import config_hash
 
 if TYPE_CHECKING:
@@ -138,27 +130,16 @@ class ResultRow(RowKey):
         return self.as_line()[name]
 
     def extended(self, values: Mapping[str, Any], **changes: Any) -> "ResultRow":
-        """The row with further values: finite numbers are metrics, the rest that is not None are
-        details.
-        """
-        metrics = {
-            name: float(value)
-            for name, value in values.items()
-            if isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and math.isfinite(value)
-        }
-        details = {
-            name: plain(value)
-            for name, value in values.items()
-            if name not in metrics and plain(value) is not None
-        }
-        return replace(
-            self,
-            metrics={**self.metrics, **metrics},
-            details={**self.details, **details},
-            **changes,
-        )
+        """The row with further values: finite numbers are metrics, others but None are details."""
+        metrics, details = {**self.metrics}, {**self.details}
+        for name, value in values.items():
+            if plain(value) is None:
+                continue
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                metrics[name] = float(value)
+            else:
+                details[name] = plain(value)
+        return replace(self, metrics=metrics, details=details, **changes)
 
     def of(self, key: RowKey) -> "ResultRow":
         """The row as a measurement `key`, whose conditions are added to its own."""
@@ -167,18 +148,16 @@ class ResultRow(RowKey):
 
     def as_line(self) -> dict[str, Any]:
         """Every field, condition and metric in one flat mapping, for tables and figures."""
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NESTED}
+        flat = {name: value for name, value in vars(self).items() if name not in _NESTED}
         low, high = self.interval or (None, None)
         ends = {f"{self.metric}_low": low, f"{self.metric}_high": high}
-        return {**plain, **self.conditions, **ends, **self.metrics}
+        return {**flat, **self.conditions, **ends, **self.metrics}
 
     def to_json(self) -> dict[str, Any]:
         """The row as JSON values, without fields at their default."""
-        written = {}
-        for f in fields(self):
-            value, factory = getattr(self, f.name), f.default_factory
-            if value != (f.default if factory is MISSING else factory()):
-                written[f.name] = list(value) if isinstance(value, tuple) else value
+        written = {name: v for name, v in vars(self).items() if v not in (None, "", {})}
+        if self.interval is not None:
+            written["interval"] = list(self.interval)
         return written
 
 
@@ -195,8 +174,6 @@ def row_from_json(value: object, where: str) -> ResultRow:
     Raises:
         InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
     """
-    if not isinstance(value, dict):
-        raise InputError(f"{where} is not a result row; delete it to measure it again")
     try:
         row = _ROWS.validate_python(value)
     except ValidationError as error:
@@ -216,7 +193,7 @@ def read_rows(path: Path) -> list[ResultRow]:
     Raises:
         InputError: a line is not a result row, or the file is not UTF-8 text.
     """
-    return [row_from_json(value, f"{path}, line {n}") for n, value in read_lines(path)]
+    return [row_from_json(value, f"{path}, line {n}") for n, value in _read_lines(path)]
 
 
 def read_results(path: Path) -> list[ResultRow]:
@@ -229,7 +206,7 @@ def read_results(path: Path) -> list[ResultRow]:
         if not path.exists():
             raise InputError(f"{path} does not exist; check the path")
         return read_rows(path)
-    rows = read_json(path)
+    rows = atomic.read_json(path)
     if not isinstance(rows, list):
         raise InputError(f"{path} holds no list of result rows; name a file that --json wrote")
     return [row_from_json(row, f"{path}, row {n}") for n, row in enumerate(rows, start=1)]
@@ -237,15 +214,11 @@ def read_results(path: Path) -> list[ResultRow]:
 
 def write_results(path: Path, rows: Sequence[ResultRow]) -> None:
     """Write rows as a JSON list, for `read_results`."""
-    write_json(path, [row.to_json() for row in rows])
+    atomic.write_json(path, [row.to_json() for row in rows])
 
 
-def read_lines(path: Path) -> list[tuple[int, object]]:
-    """Read (line number, JSON value) of every line that is not blank; none if there is no file.
-
-    Raises:
-        InputError: a line is not JSON, or the file is not UTF-8 text.
-    """
+def _read_lines(path: Path) -> list[tuple[int, object]]:
+    """(line number, JSON value) of every line that is not blank; none if there is no file."""
     values: list[tuple[int, object]] = []
     try:
         lines = path.read_text(encoding="utf-8").split("\n") if path.exists() else []
@@ -283,17 +256,17 @@ def append_rows(
     for row in rows:
         row_from_json(json.loads(json.dumps(row.to_json())), f"a row for {path}")
     configurations = path.with_name(CONFIGURATIONS)
-    with claim(configurations, wait=True):
-        configured = [value for _, value in read_lines(configurations) if isinstance(value, dict)]
-        if config is not None and digest not in [value.get("hash") for value in configured]:
+    with atomic.claim(configurations, wait=True):
+        written = [value for _, value in _read_lines(configurations) if isinstance(value, dict)]
+        if config is not None and digest not in [value.get("hash") for value in written]:
             _append(configurations, [{"hash": digest, "config": config}])
-    with claim(path, wait=True):
+    with atomic.claim(path, wait=True):
         _append(path, [row.to_json() for row in rows])
 
 
 def remove_rows(path: Path, keys: Sequence[RowKey]) -> None:
     """Remove the rows of some measurements from a file; atomic, other rows stay as they are."""
-    with claim(path, wait=True):
+    with atomic.claim(path, wait=True):
         rows = read_rows(path)
         remaining = [row for row in rows if not any(key.covers(row) for key in keys)]
         if len(remaining) < len(rows):
@@ -317,8 +290,8 @@ def benchmarking(path: Path) -> Iterator[None]:
     Raises:
         InputError: another command does; the message names it.
     """
-    with lock_path(path, "filled", part="benchmark"):
-        remove_leftovers(path.parent)
+    with atomic.lock_path(path, "filled", part="benchmark"):
+        atomic.remove_leftovers(path.parent)
         yield
 
 
@@ -330,7 +303,7 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
-    with atomic_file(path) as scratch, scratch.open("wb") as file:
+    with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
         file.write(head)
         for value in values:
             line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
@@ -349,7 +322,7 @@ class ResultTable:
 
     rows: Sequence[ResultRow]
     shown: ClassVar[tuple[str, ...]] = ()
-    """Columns of the HTML table, after `method`; empty for those of the rows' own metrics."""
+    """Columns of the table, after `method`; empty for those of the rows' own metrics."""
 
     def __iter__(self) -> Iterator[ResultRow]:
         return iter(self.rows)
@@ -371,17 +344,17 @@ class ResultTable:
 
         lines = []
         for row in self.rows:
-            ends = {name: ends for name, ends in row.details.get("intervals", {}).items() if ends}
+            intervals = {**row.details.get("intervals", {})}
             if row.interval is not None:
-                ends[row.metric] = row.interval
+                intervals[row.metric] = row.interval
             line: dict[str, Any] = {"method": row.method}
             for name, value in row.metrics.items():
                 line[name] = value
-                if name in ends:
-                    line[f"{name}_low"], line[f"{name}_high"] = ends[name]
-            others = row.as_line().items()
-            lines.append(line | {n: v for n, v in others if n not in _IDENTITY and n not in line})
-        return pd.DataFrame(lines).dropna(axis="columns", how="all")
+                if ends := intervals.get(name):
+                    line[f"{name}_low"], line[f"{name}_high"] = ends
+            lines.append({**line, **row.as_line(), **line})
+        frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY))
+        return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
         """Draw one metric of every method with its 95% interval.
@@ -395,18 +368,16 @@ class ResultTable:
         """
         from matplotlib import pyplot
 
-        metric, frame = metric or self.rows[0].metric, self.to_frame()
-        names = dict.fromkeys(name for row in self.rows for name in row.metrics)
+        metric, names = metric or self.rows[0].metric, self._list_metrics()
         if metric not in names:
             raise InputError(f"no row has the metric {metric!r}; they have {', '.join(names)}")
-        frame = frame[frame[metric].notna()].iloc[::-1]
+        frame = self.to_frame().dropna(subset=metric).iloc[::-1]
         axes = pyplot.subplots()[1] if ax is None else ax
-        low, high = (
-            frame.get(f"{metric}_{end}", frame[metric]).fillna(frame[metric])
-            for end in ("low", "high")
-        )
-        errors = [frame[metric] - low, high - frame[metric]]
-        axes.errorbar(frame[metric], range(len(frame)), xerr=errors, fmt="o", capsize=3)
+        values = frame[metric]
+        low = frame.get(f"{metric}_low", values).fillna(values)
+        high = frame.get(f"{metric}_high", values).fillna(values)
+        errors = [values - low, high - values]
+        axes.errorbar(values, range(len(frame)), xerr=errors, fmt="o", capsize=3)
         axes.set_yticks(range(len(frame)), frame["method"].tolist())
         axes.set_xlabel(f"{metric}, with 95% intervals")
         return axes
@@ -415,9 +386,12 @@ class ResultTable:
         """Write the rows as JSON, as `--json` of the commands does, for `report`."""
         write_results(Path(file), self.rows)
 
+    def _list_metrics(self) -> list[str]:
+        return list(dict.fromkeys(name for row in self.rows for name in row.metrics))
+
     def _table(self) -> "pd.DataFrame":
         frame = self.to_frame()
-        columns = self.shown or dict.fromkeys(name for row in self.rows for name in row.metrics)
+        columns = self.shown or self._list_metrics()
         return frame[["method", *(name for name in columns if name in frame)]]
 
     def _repr_html_(self) -> str:

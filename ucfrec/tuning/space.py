@@ -43,11 +43,6 @@ class Dimension:
                 "true"
             )
 
-    @property
-    def example(self) -> Value:
-        """One of the values."""
-        return self.choices[0] if self.choices else self.low or 0
-
     def suggest(self, trial: "Trial", name: str) -> Value:
         """The value of this setting in a trial."""
         if self.choices:
@@ -139,8 +134,8 @@ class Search:
 
     def __post_init__(self) -> None:
         for policy in self.policies:
-            for name, dimension in self.space(policy).items():
-                self.config(policy, {name: dimension.example})
+            for name, of in self.space(policy).items():
+                self.config(policy, {name: of.choices[0] if of.choices else of.low or 0})
 
     def space(self, policy: str) -> Space:
         """The settings that vary: those of the space that are not fixed."""

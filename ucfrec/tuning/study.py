@@ -46,7 +46,6 @@ _MEASURES: Final = {"ndcg": "ndcg_liked", "gauc": "gauc"}
 _OTHER_METRICS: Final = f"use --metric {' or '.join(_MEASURES)}"
 STUDY, BEST, STAGES, TRIAL = "study.db", "best", "stages", "trial-"
 BEST_TOML, PAGE = "best.toml", "tuning.md"
-_NAME: Final = "ucfrec"
 _COMPARED: Final = 4
 """Earlier trials of the same policy from which on a trial may be ended early."""
 
@@ -100,9 +99,9 @@ class Plan:
     """Whether trials are ended early whose validation loss is above the median of the others'."""
 
     @property
-    def storage(self) -> str:
-        """Address of the study's SQLite file."""
-        return f"sqlite:///{self.out / STUDY}"
+    def stored(self) -> dict[str, str]:
+        """Address of the study's SQLite file, and the name of the study, for Optuna."""
+        return {"storage": f"sqlite:///{self.out / STUDY}", "study_name": "ucfrec"}
 
 
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
@@ -132,25 +131,20 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
             )
     with lock_path(plan.out, "tuned"):
         plan.out.mkdir(parents=True, exist_ok=True)
-        study: Study = optuna.create_study(
-            storage=plan.storage, study_name=_NAME, direction="maximize", load_if_exists=True
-        )
+        study: Study = optuna.create_study(**plan.stored, direction="maximize", load_if_exists=True)
         _require_same(study, plan, store)
         _enqueue_again(study)
         left, seed = trials - len(list_finished(study)), plan.search.seed + len(study.trials)
         shares = [len(part) for part in np.array_split(range(max(left, 0)), workers) if len(part)]
         if len(shares) == 1:
-            _run_trials(plan, 0, shares[0], seed)
+            _run_trials(plan, shares[0], seed)
         elif shares:
             threads = max(1, torch.get_num_threads() // len(shares))
+            seeds = range(seed, seed + 1000 * len(shares), 1000)
             with pool_of_processes(len(shares), partial(torch.set_num_threads, threads)) as pool:
                 with block_ctrl_c():
-                    processes = [
-                        pool.submit(_run_trials, plan, worker, share, seed)
-                        for worker, share in enumerate(shares)
-                    ]
-                for process in processes:
-                    process.result()
+                    results = pool.map(partial(_run_trials, plan), shares, seeds)
+                list(results)
         _keep_best(study, plan)
         _write_report(study, plan)
     return study
@@ -216,12 +210,12 @@ def _enqueue_again(study: "Study") -> None:
     study.set_user_attr("again", sorted(again))
 
 
-def _run_trials(plan: Plan, worker: int, count: int, seed: int) -> None:
+def _run_trials(plan: Plan, count: int, seed: int) -> None:
     """Run some trials one after the other; also in a process of its own."""
     optuna = _optuna()
     # A search that goes on must not draw the first points once more.
-    sampler = optuna.samplers.TPESampler(seed=seed + 1000 * worker)
-    study = optuna.load_study(storage=plan.storage, study_name=_NAME, sampler=sampler)
+    sampler = optuna.samplers.TPESampler(seed=seed)
+    study = optuna.load_study(**plan.stored, sampler=sampler)
     objective = partial(_objective, plan, EpisodeStore.open(plan.store))
     study.optimize(objective, n_trials=count, catch=(InputError,))
 
@@ -250,8 +244,7 @@ def _objective(plan: Plan, store: EpisodeStore, trial: "Trial") -> float:
             trial.set_user_attr("error", str(error))
         shutil.rmtree(run, ignore_errors=True)
         raise
-    earlier = [other.value for other in _list_measured(trial.study) if other.value is not None]
-    if value <= max(earlier, default=-math.inf):
+    if value <= max(_list_values(trial.study), default=-math.inf):
         shutil.rmtree(run, ignore_errors=True)
     return value
 
@@ -260,8 +253,10 @@ def _name_run(plan: Plan, config: Config) -> Path:
     return plan.out / f"{TRIAL}{config_hash(asdict(config))}"
 
 
-def _list_measured(study: "Study") -> "list[FrozenTrial]":
-    return [trial for trial in study.trials if trial.state.name == "COMPLETE"]
+def _list_values(study: "Study") -> list[float]:
+    """The metric of each trial that was measured."""
+    trials = (trial for trial in study.trials if trial.state.name == "COMPLETE")
+    return [trial.value for trial in trials if trial.value is not None]
 
 
 def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
@@ -282,7 +277,7 @@ def _is_hopeless(study: "Study", number: int, policy: str) -> bool:
 
 def _keep_best(study: "Study", plan: Plan) -> None:
     """Move the best run to its place and delete those of the other trials."""
-    if not _list_measured(study):
+    if not _list_values(study):
         errors = (t.user_attrs["error"] for t in study.trials if t.user_attrs.get("error"))
         reason = next(errors, "all were ended early; search more of them")
         raise InputError(f"no trial could be measured: {reason}")
@@ -302,7 +297,7 @@ def importances(study: "Study") -> dict[str, float]:
     """
     import optuna
 
-    if len({trial.value for trial in _list_measured(study)}) < 4:
+    if len(set(_list_values(study))) < 4:
         return {}
     try:
         evaluator = optuna.importance.FanovaImportanceEvaluator(seed=0)
@@ -314,21 +309,20 @@ def importances(study: "Study") -> dict[str, float]:
 def _write_report(study: "Study", plan: Plan) -> None:
     """Write `best.toml` and `tuning.md` to the folder of the search."""
     config = config_of(plan, study.best_trial)
-    names = [name for name in study.best_params if name != POLICY]
+    names = {*study.best_params} - {POLICY}
     if "train.steps" in names:
-        names.append("train.warmup_steps")
-    chosen, tables = asdict(config), dict[str, list[str]]()
+        names.add("train.warmup_steps")
+    chosen, tables = asdict(config), dict[str, str]()
     for name in sorted({*plan.search.fixed, *names}):
         table, _, field = name.partition(".")
         value = chosen[table][field] if name in names else plan.search.fixed[name]
-        tables.setdefault(table, [f"[{table}]"]).append(f"{field} = {format_toml(value)}")
+        tables[table] = tables.get(table, f"\n[{table}]\n") + f"{field} = {format_toml(value)}\n"
     file = plan.out / BEST_TOML
     command = f"ucfrec train {plan.store} --policy {config.policy_name} --config {file}"
     count = len(list_finished(study))
-    parts = [f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"]
-    parts += ["\n".join(lines) + "\n" for lines in tables.values()]
+    head = f"# {plan.metric} {study.best_value:.6g}, of {count} trials\n# {command}\n"
     with atomic_file(file) as scratch:
-        scratch.write_text("\n".join(parts), encoding="utf-8")
+        scratch.write_text(head + "".join(tables.values()), encoding="utf-8")
     with atomic_file(plan.out / PAGE) as scratch:
         scratch.write_text(_page(study, plan, command), encoding="utf-8")
 
@@ -341,14 +335,11 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
     names = list(dict.fromkeys(name for trial in trials for name in trial.params))
     body = []
     for trial in trials:
-        outcome = str(trial.user_attrs.get("error", "interrupted"))[:80]
-        if trial.state.name == "COMPLETE":
-            outcome = f"{trial.value:.6g}"
-        elif trial.state.name == "PRUNED":
-            outcome = "ended early"
+        outcomes = {"COMPLETE": f"{trial.value or 0:.6g}", "PRUNED": "ended early"}
+        error = str(trial.user_attrs.get("error", "interrupted"))[:80]
         values = (trial.params.get(name, "") for name in names)
-        cells = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in values)
-        body.append((trial.number, outcome, *cells))
+        cells = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
+        body.append((trial.number, outcomes.get(trial.state.name, error), *cells))
     shares = importances(study)
     parts = [
         f"# Search on {plan.store}",
@@ -368,12 +359,5 @@ def _page(study: "Study", plan: Plan, command: str) -> str:
 
 
 def format_toml(value: Any) -> str:
-    """A value of a setting as TOML."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (tuple, list)):
-        return f"[{', '.join(map(format_toml, value))}]"
-    if isinstance(value, str):
-        # A JSON string is a TOML string, but for a control character that JSON leaves as it is.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)
+    """A value of a setting as TOML, which differs from JSON in one control character only."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -12,8 +12,8 @@ import operator
 import reprlib
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import wraps
+from dataclasses import field, fields
+from functools import partial, wraps
 from itertools import pairwise
 from numbers import Real
 from types import NoneType, UnionType
@@ -22,6 +22,7 @@ from typing import (
     Any,
     Final,
     Literal,
+    NamedTuple,
     ParamSpec,
     TypeVar,
     Union,
@@ -32,9 +33,10 @@ from typing import (
 )
 
 import numpy as np
-import pydantic
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
+from pydantic.dataclasses import is_pydantic_dataclass
+from pydantic.fields import FieldInfo
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError
@@ -62,17 +64,12 @@ class SettingError(InputError):
     """A value, or a combination of values, that a table of settings rejects."""
 
     def __init__(self, message: str, *keys: str) -> None:
-        """
-        Args:
-            message: names the field, its value and the allowed values.
-            keys: the rejected fields, as `table.field`.
-        """
+        """`message` names the value and the allowed ones, `keys` the fields, as `table.field`."""
         super().__init__(message)
         self.keys = keys
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """The description of one field of a table."""
 
     key: str
@@ -90,8 +87,8 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     """A decorator that makes a class a frozen dataclass with validated fields.
 
     Ranges are annotated for pydantic (`Annotated[int, Field(ge=1)]`); constraints between fields
-    are checked in `__post_init__`, with `require`. A list is accepted for a tuple.
-    Constructing the class with an invalid value raises `SettingError`.
+    are checked in `__post_init__`, with `require`. Lists become tuples, as TOML and JSON have lists
+    only. Constructing the class with an invalid value raises `SettingError`.
 
     Args:
         name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
@@ -101,14 +98,12 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     def decorate(cls: type[Table]) -> type[Table]:
         table: Any = pydantic_dataclass(frozen=True, config=_CONFIG)(cls)
         build, names = table.__init__, [f.name for f in fields(table)]
-        tuples = {key for key, info in _fields(table).items() if _takes_tuple(info.annotation)}
 
         @wraps(build)
         def check(self: Any, *args: Any, **values: Any) -> None:
             values |= dict(zip(names, args, strict=False))
-            converted = {key: _convert_lists(values[key]) for key in tuples & values.keys()}
             try:
-                build(self, *args[len(names) :], **{**values, **converted})
+                build(self, *args[len(names) :], **_convert_lists(values))
             except ValidationError as error:
                 raise _setting_error(table, name, error, values) from None
 
@@ -120,15 +115,7 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
 
 
 def require(holds: bool, message: str, *keys: str) -> None:
-    """Check a constraint between fields, in the `__post_init__` of a table.
-
-    Args:
-        message: names the fields, their values and the allowed values.
-        keys: the fields of the constraint, as `table.field`.
-
-    Raises:
-        SettingError: `holds` is false.
-    """
+    """Raise a `SettingError` of `message` and `keys` if a constraint of fields does not hold."""
     if not holds:
         raise SettingError(message, *keys)
 
@@ -142,12 +129,12 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
         name: of the table, the prefix of the keys.
     """
     meanings: dict[str, str] = {}
-    for base in reversed([base for base in type(table).__mro__ if _fields(base)]):
+    for base in filter(is_table, reversed(type(table).__mro__)):
         meanings |= _read_docstrings(base)
-    for key, info in _fields(type(table)).items():
-        meaning = meanings.get(key, "")
+    for key, info in type(table).__pydantic_fields__.items():
+        meaning = " ".join(meanings.get(key, "").split())
         allowed = _allowed(info.annotation, info.metadata)
-        yield Setting(f"{name}.{key}", getattr(table, key), allowed, " ".join(meaning.split()))
+        yield Setting(f"{name}.{key}", getattr(table, key), allowed, meaning)
 
 
 def _read_docstrings(table: type) -> dict[str, str]:
@@ -163,9 +150,8 @@ def _read_docstrings(table: type) -> dict[str, str]:
     }
 
 
-def is_table(cls: type) -> bool:
-    """Whether `cls` itself is decorated by `settings_table`, not only a base class of it."""
-    return bool(_fields(cls))
+is_table: Final = is_pydantic_dataclass
+"""Whether a class itself is decorated by `settings_table`, not only a base class of it."""
 
 
 def nearest(name: str, names: Sequence[str]) -> str:
@@ -174,23 +160,9 @@ def nearest(name: str, names: Sequence[str]) -> str:
     return f"did you mean {matches[0]!r}?" if matches else f"there are {', '.join(names)}"
 
 
-def _fields(table: type) -> Mapping[str, Any]:
-    """Pydantic's `FieldInfo` of each field; empty for any other class."""
-    if not pydantic.dataclasses.is_pydantic_dataclass(table):
-        return {}
-    infos: Mapping[str, Any] = table.__dict__["__pydantic_fields__"]
-    return infos
-
-
-def _takes_tuple(annotation: Any) -> bool:
-    origin = get_origin(annotation)
-    if origin in (Annotated, Union, UnionType):
-        return any(map(_takes_tuple, get_args(annotation)))
-    return tuple in (origin, annotation)
-
-
 def _convert_lists(value: Any) -> Any:
-    """A list, and lists in it, as tuples, because TOML and JSON have lists only."""
+    if isinstance(value, dict):
+        return {key: _convert_lists(entry) for key, entry in value.items()}
     return tuple(map(_convert_lists, value)) if isinstance(value, list) else value
 
 
@@ -198,7 +170,7 @@ def _setting_error(
     table: Any, name: str, error: ValidationError, values: Mapping[str, Any]
 ) -> SettingError:
     """The first of pydantic's errors, as one line."""
-    first, infos = error.errors(include_url=False)[0], _fields(table)
+    first, infos = error.errors(include_url=False)[0], table.__pydantic_fields__
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):
         # Not the same one: it would hold `error`, which holds it, and Python finds no cycles there.
@@ -216,10 +188,8 @@ def _setting_error(
 
 def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     """A type and its range, in words."""
-    if get_origin(annotation) is Annotated:
-        annotation, *more = get_args(annotation)
-        constraints = [c for m in more for c in getattr(m, "metadata", [m])]
-        return _allowed(annotation, [*constraints, *metadata])
+    info = FieldInfo.from_annotation(annotation)
+    annotation, metadata = info.annotation, [*info.metadata, *metadata]
     if get_origin(annotation) in (Union, UnionType):
         kinds = [_allowed(kind, metadata) for kind in get_args(annotation) if kind is not NoneType]
         return f"{' or '.join(kinds)}, or unset"
@@ -286,13 +256,8 @@ def require_whole(name: str, value: object, least: int = 1, most: int | None = N
     return whole
 
 
-def require_seed(name: str, value: object) -> int:
-    """The seed that `value` is: a whole number from 0 to `LARGEST_SEED`.
-
-    Raises:
-        InputError: it is something else.
-    """
-    return require_whole(name, value, 0, LARGEST_SEED)
+require_seed: Final = partial(require_whole, least=0, most=LARGEST_SEED)
+"""`require_whole` for seeds."""
 
 
 def require_number(name: str, value: object) -> float:

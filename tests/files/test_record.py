@@ -93,7 +93,7 @@ def test_what_was_sealed_comes_back_and_holds(three_files: Path) -> None:
     assert record.version == 1
     assert set(record.files) == {"a", "b", "inner/c"}
     assert list(files.faults()) == []
-    files.require_small()
+    files.require()
 
 
 def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_path: Path) -> None:
@@ -134,6 +134,6 @@ def test_each_kind_of_fault_is_named(three_files: Path) -> None:
     assert "a" in faults
     assert files.strangers() == ["foreign", "record.json"]
     with pytest.raises(InputError, match="restore the file, or make it again"):
-        files.require_sizes()
+        files.require(small=-1)
     (three_files / "b").unlink()
     assert dict(files.faults())["b"] == "is missing"

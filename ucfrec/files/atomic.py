@@ -7,7 +7,6 @@ scratch is dead, and removes it.
 """
 
 import json
-import math
 import os
 import secrets
 import shutil
@@ -175,12 +174,11 @@ def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None
         if held:
             yield
             return
-        words = b""
+        holder = "another process"
         with suppress(OSError), _lock_of(part_path).open("rb") as content:
-            content.seek(1)
-            words = content.read(1024)
-        stated = words.startswith(b"process ")
-        holder = words.decode(errors="replace") if stated else "another process"
+            words = content.read(1024)[1:]
+            if words.startswith(b"process "):
+                holder = words.decode(errors="replace")
         raise InputError(
             f"{path} is being {use} by {holder}; wait for it to end, or name another path"
         )
@@ -249,15 +247,8 @@ def json_text(value: Any, **layout: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, **layout)
     except ValueError:
-        return json.dumps(_finite(value), allow_nan=False, **layout)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
+        return json.dumps(finite, allow_nan=False, **layout)
 
 
 def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = False) -> None:
@@ -290,22 +281,27 @@ def read_json(path: Path) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file of at most 16 MiB.
-
-    Raises:
-        InputError: the file is missing, cannot be read, or is not TOML.
-    """
+    """Read a TOML file; errors as of `read_json`."""
     import tomllib  # only a few commands read TOML
 
     value: dict[str, Any] = _parse(path, _LARGEST_TOML, "TOML", tomllib.loads)
     return value
 
 
-def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
-    """Read a text file of at most so many bytes; a pipe or a device might never end."""
+def require_file(path: Path, remedy: str) -> None:
+    """Check that a file is there, and no pipe or device, reading which might never end.
+
+    Raises:
+        InputError: it is not; the message ends with `remedy`.
+    """
     if not path.is_file():
         what = "is not a regular file" if path.exists() else "does not exist"
-        raise InputError(f"{path} {what}; check the path")
+        raise InputError(f"{path} {what}; {remedy}")
+
+
+def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
+    """Read a text file of at most so many bytes."""
+    require_file(path, "check the path")
     if path.stat().st_size > largest:
         raise InputError(f"{path} has more than {largest:,} bytes; name another file")
     try:

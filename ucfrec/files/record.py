@@ -37,7 +37,7 @@ RUN_RECORD: Final = "run.json"
 _BLOCK: Final = 2**19
 _THREADS: Final = 2
 _LARGEST: Final = 2**48
-_SMALL: Final = 2**26
+SMALL: Final = 2**26
 """Bytes of a file that is always read to check it."""
 Text = InstanceOf[str]
 """A text; unlike pydantic's own, file names may have bytes that are not valid Unicode."""
@@ -67,34 +67,16 @@ class Sealed:
     files: Mapping[str, tuple[int, str]]
     """Path in the folder to size in bytes and checksum."""
 
-    def require_sizes(self) -> None:
-        """Check that every file is there with its size; no file is read.
-
-        Raises:
-            InputError: the first file that is missing, or has another size.
-        """
-        for name in self.files:
-            self._refuse(name, self._find_fault(name, content=False))
-
-    def require(self, name: str) -> None:
-        """Read a file and check its size and checksum; a file that is not listed passes.
-
-        Raises:
-            InputError: the file is missing or has another content.
-        """
-        if name in self.files:
-            self._refuse(name, self._find_fault(name))
-
-    def require_small(self) -> None:
-        """Check the sizes of all files, and the content of small ones.
+    def require(self, names: Container[str] = (), small: int = SMALL) -> None:
+        """Check the sizes of all files, and the content of `names` and of those up to `small` bytes.
 
         Raises:
             InputError: the first file that is missing or has another content.
         """
-        self.require_sizes()
         for name, (size, _) in self.files.items():
-            if size <= _SMALL:
-                self.require(name)
+            if fault := self._find_fault(name, size <= small or name in names):
+                where = self.folder / name
+                raise InputError(f"{where} {fault}; restore the file, or {self.remedy}")
 
     def faults(self) -> Iterator[tuple[str, str]]:
         """Read every file, several at a time; yields (path in the folder, what is wrong with it).
@@ -124,10 +106,6 @@ class Sealed:
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
 
-    def _refuse(self, name: str, fault: str) -> None:
-        if fault:
-            raise InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
-
 
 def _names(folder: Path) -> Iterator[str]:
     for where, folders, files in os.walk(folder):
@@ -145,6 +123,9 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
     return files
 
 
+_ABSENT: Final = (None, (), [], {})
+
+
 class Entry(BaseModel):
     """An immutable JSON object; optional entries that are None or empty are excluded."""
 
@@ -156,12 +137,8 @@ class Entry(BaseModel):
         return {
             name: value
             for name, value in dump(self).items()
-            if name not in fields or fields[name].is_required() or not _absent(value)
+            if name not in fields or fields[name].is_required() or value not in _ABSENT
         }
-
-
-def _absent(value: object) -> bool:
-    return value is None or (isinstance(value, tuple | list | dict) and not value)
 
 
 class Record(Entry):

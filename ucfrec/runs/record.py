@@ -351,7 +351,7 @@ def read_record(run: Path) -> RunRecord:
         InputError: `run` is not a run folder, or is damaged.
     """
     record = RunRecord.read(run)
-    record.checksums(run).require_small()
+    record.checksums(run).require()
     return record
 
 

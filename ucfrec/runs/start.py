@@ -24,8 +24,9 @@ from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Windows
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_file, atomic_folder, write_json
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import MetricsLog, load_tensors, load_weights, save_tensors
+from ucfrec.fitting.checkpoint import load_tensors, load_weights, save_tensors
 from ucfrec.fitting.loop import SILENT, Callbacks, Fit, fit, load_trained
+from ucfrec.fitting.metrics import MetricsLog
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class, policy_package

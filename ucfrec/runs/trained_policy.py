@@ -107,8 +107,8 @@ class TrainedPolicy:
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
-        for name in (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"):
-            record.checksums(folder).require(name)  # however large
+        however_large = (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}")
+        record.checksums(folder).require(however_large, small=-1)
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))

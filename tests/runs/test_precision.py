@@ -12,7 +12,8 @@ from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.metrics import read_metrics
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.start import fit_policy, new_policy, training_views
+from ucfrec.runs.policy_fit import fit_policy
+from ucfrec.runs.start import new_policy, training_views
 
 SETTINGS = [
     "train.steps=16", "train.validate_every=4", "train.batch_size=16", "train.warmup_steps=2",

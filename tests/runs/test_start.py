@@ -27,9 +27,10 @@ from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.fitting.metrics import read_metrics
 from ucfrec.logs.append import append_logs
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
-from ucfrec.runs.start import fit_policy, new_policy, start_warm, warm_settings
+from ucfrec.runs.start import new_policy, start_warm, warm_settings
 
 LOGGED = {"action_loss", "validation_loss"}
 SETTINGS = ["train.steps=150", "train.validate_every=150", "policy.dim=16", "policy.context=4"]

@@ -68,7 +68,7 @@ class Sealed:
     """Path in the folder to size in bytes and checksum."""
 
     def require(self, names: Container[str] = (), small: int = SMALL) -> None:
-        """Check the sizes of all files, and the content of `names` and of those up to `small` bytes.
+        """Check the sizes of all files, and the content of `names` and of those of `small` bytes.
 
         Raises:
             InputError: the first file that is missing or has another content.
@@ -123,7 +123,7 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
     return files
 
 
-_ABSENT: Final = (None, (), [], {})
+_ABSENT: Final[tuple[object, ...]] = (None, (), [], {})
 
 
 class Entry(BaseModel):

@@ -3,9 +3,10 @@
 import math
 import os
 from collections.abc import Container, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -35,6 +36,7 @@ from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import SessionEndReport
 
+_Report = TypeVar("_Report")
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
@@ -45,10 +47,9 @@ CANDIDATES: Final = "candidates.json"
 
 
 def _complete(sizes: dict[str, int]) -> dict[str, int]:
-    of_items = ("users", "tags") if sizes.get("items") else ()
-    for name in ("state", "action", "items", *of_items):
-        if name not in sizes:
-            raise ValueError(f"there is no size {name!r}")
+    of_items = {"users", "tags"} if sizes.get("items") else set()
+    if missing := {"state", "action", "items", *of_items} - sizes.keys():
+        raise ValueError(f"there is no size {', '.join(sorted(missing))}")
     return sizes
 
 
@@ -62,12 +63,6 @@ def _levels(quantiles: dict[str, float]) -> dict[str, float]:
     if not quantiles or not all(0 <= float(level) <= 1 for level in quantiles):
         raise ValueError("there are none, or one is not of a share")
     return quantiles
-
-
-def _named(value: object) -> object:
-    if not isinstance(value, dict) or not isinstance(value.get("policy_name"), str):
-        raise InputError("its config has no policy_name")
-    return value
 
 
 def _config(value: object) -> Config:
@@ -84,8 +79,8 @@ class TrainingRecord(Record):
     library: Text = "ucfrec"
     """What trained the policy."""
     command: Text
-    config: Annotated[Any, PlainValidator(_named)]
-    """Settings, with the `policy_name`."""
+    config: Any
+    """Settings."""
     policy: Any = None
     """Report of the training; None until it has ended."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)]
@@ -247,11 +242,9 @@ class RunRecord(TrainingRecord):
         name = config.get("policy_name") if isinstance(config, Mapping) else None
         if isinstance(name, str) and name not in BUILT_IN:
             if name not in policy_names():
-                package, numbers = value.get("policy_package"), value.get("versions")
-                source = "an unknown package"
-                if isinstance(package, str):
-                    number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
-                    source = f"package {package} {number}".rstrip()
+                package, numbers = str(value.get("policy_package") or ""), value.get("versions")
+                number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
+                source = f"package {package} {number}".rstrip() if package else "an unknown package"
                 raise InputError(
                     f"{path}: trained with policy {name!r} (of {source}), which is not installed: "
                     "install it"
@@ -266,11 +259,10 @@ class RunRecord(TrainingRecord):
         Followed by `-augmented` or `-no-augmentation` if the run's use of augmentation is not the
         method's default.
         """
-        config = self.config
-        augmented = config.augment.augments
-        if augmented == policy_class(config.policy_name).augmented:
-            return config.policy_name
-        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+        name, augmented = self.config.policy_name, self.config.augment.augments
+        if augmented == policy_class(name).augmented:
+            return name
+        return f"{name}-{'augmented' if augmented else 'no-augmentation'}"
 
     @property
     def summary(self) -> str:
@@ -299,9 +291,9 @@ class RunRecord(TrainingRecord):
 
     def is_of(self, store: StoreRecord) -> bool:
         """Whether the run was trained on a store: on the same steps and item states."""
-        states = [stored.files.get(ITEM_STATES) for stored in (self, store)]
+        own, others = self.files.get(ITEM_STATES), store.files.get(ITEM_STATES)
         # A store whose states a caller made lists no file of them.
-        same_states = None in states or states[0] == states[1]
+        same_states = own is None or others is None or own == others
         return self.fingerprint == store.fingerprint and same_states
 
     def learned_nothing(self, logged: Container[str]) -> str:
@@ -384,10 +376,7 @@ def read_candidates(run: Path) -> tuple[Candidate, ...]:
         InputError: the file is damaged.
     """
     path = run / CANDIDATES
-    if not path.exists():
-        return ()
-    with damage_explained(path, RunRecord.REMEDY):
-        return TypeAdapter(tuple[Candidate, ...]).validate_python(read_json(path))
+    return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
 
 
 def read_augmentation(path: Path) -> AugmentationReport:
@@ -396,20 +385,20 @@ def read_augmentation(path: Path) -> AugmentationReport:
     Raises:
         InputError: the file is damaged.
     """
+    return _read_stage(path, AugmentationReport)
+
+
+def _read_stage(path: Path, kind: type[_Report]) -> _Report:
     with damage_explained(path, RunRecord.REMEDY):
-        return TypeAdapter(AugmentationReport).validate_python(read_json(path))
+        return TypeAdapter(kind).validate_python(read_json(path))
 
 
 def place_of(store: Path, run: Path) -> dict[str, str | None]:
-    """Entries of the record of a run: where its store lies, and as seen from the run.
-
-    There is no path from a run to a store on another drive of Windows.
-    """
-    try:
-        seen_from_run = os.path.relpath(store.resolve(), run.resolve())
-    except ValueError:
-        seen_from_run = None
-    return {"store": str(store.resolve()), "store_from_run": seen_from_run}
+    """Entries of the record of a run: where its store lies, and as seen from the run."""
+    store, seen_from_run = store.resolve(), None
+    with suppress(ValueError):  # there is no path to another drive of Windows
+        seen_from_run = os.path.relpath(store, run.resolve())
+    return {"store": str(store), "store_from_run": seen_from_run}
 
 
 def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
@@ -421,10 +410,8 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
     Raises:
         InputError: it is damaged.
     """
-    places = [Path(record.store)]
-    if record.store_from_run:
-        places.insert(0, Path(os.path.normpath(run.resolve() / record.store_from_run)))
-    for path in places:
+    seen_from_run = os.path.normpath(run.resolve() / (record.store_from_run or record.store))
+    for path in (Path(seen_from_run), Path(record.store)):
         if (path / StoreRecord.FILE).is_file():
             store = EpisodeStore.open(path)
             if record.is_of(store.record):
@@ -451,7 +438,7 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
     crm, moves, actions = report.reward_model, report.moves, report.actions
     lines = [
         f"reward model  R² {crm.r2:.3f} with the disturbance z, {crm.r2_without_z:.3f} without; "
-        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active",
+        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active"
     ]
     if report.proposals:
         lines.append(

@@ -1,8 +1,9 @@
 """Train a policy (Algorithm 1) and keep everything it produces in a run folder."""
 
+import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -39,6 +40,7 @@ from ucfrec.policies.registry import note_ignored
 from ucfrec.processes import phase, random_state_kept
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
     CANDIDATES,
     RUN,
@@ -50,7 +52,6 @@ from ucfrec.runs.record import (
 )
 from ucfrec.runs.start import (
     begin,
-    fit_policy,
     new_policy,
     require_startable,
     rule_to_start_from,
@@ -110,17 +111,13 @@ OWN: Final = SharedStages(None)
 """For a run that makes all its stages itself."""
 
 
-def _copy(source: Path, to: Path, names: Sequence[str]) -> None:
+def _copy(source: Path, to: Path, names: Iterable[str]) -> None:
     for name in names:
         if (source / name).is_dir():
-            shutil.copytree(source / name, to / name, dirs_exist_ok=True, copy_function=_copy_file)
+            _copy(source / name, to / name, os.listdir(source / name))
         elif (source / name).exists():
-            _copy_file(source / name, to / name)
-
-
-def _copy_file(source: str | Path, to: str | Path) -> None:
-    with atomic_file(Path(to)) as scratch:
-        shutil.copyfile(source, scratch)
+            with atomic_file(to / name) as scratch:
+                shutil.copyfile(source / name, scratch)
 
 
 @dataclass(frozen=True)
@@ -198,19 +195,24 @@ def train_run(
             if more_augmentation is not None:
                 more = more_augmentation
                 augmented = more if augmented is None else augmented.join(more)
-            first: Path | None = None
-            validation: EpisodeStore | None = run.validation
-            updated = run.record.update
+            updated, first = run.record.update, None
             if refit_of is not None:
-                first, validation = refit_of / "policy" / "best.safetensors", None
                 updated = read_record(refit_of).update
+                first = refit_of / "policy" / "best.safetensors"
             newest = None
             if updated is not None:
                 since = run.train.record.n_episodes - updated.episodes
                 newest = np.flatnonzero(run.train.episode_ids >= since)
-            policy, train, settings = run.policy, run.train, run.config
             fit = fit_policy(
-                policy, train, validation, out, settings, first, newest, callbacks, augmented
+                run.policy,
+                run.train,
+                run.validation if refit_of is None else None,
+                out,
+                config,
+                first,
+                newest,
+                callbacks,
+                augmented,
             )
         if not distributed.leads():
             return run.record
@@ -240,7 +242,7 @@ def _prepare_inputs(
     refit_of: Path | None,
     shared: SharedStages,
 ) -> _Inputs:
-    """Check all inputs and begin the run or reopen it; views of the episodes, untrained policy."""
+    """Check all inputs and begin the run, or reopen it."""
     train, validation = logged, held_out = training_views(store)
     if refit_of is not None:
         train = logged = store
@@ -298,7 +300,8 @@ def _augment(
 
     with distributed.leader_first():
         if not (out / AUGMENTATION).exists():
-            inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
+            inputs = _dependencies(run.train, run.validation, config.seed, run.device)
+            inputs["settings"] = [asdict(table) for table in settings]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
             shared.provide(inputs, augment_episodes.__module__, out, files, make)
         augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
@@ -310,7 +313,7 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     train, validation = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     simulated, folder = run.record.return_to_go.per_session, run.out / REWARD_MODEL
     inputs = _dependencies(train, validation, run.config.seed, torch.device("cpu"))
-    inputs["simulated"] = simulated
+    inputs |= {"settings": [], "simulated": simulated}
     first = None if initial is None else initial / REWARD_MODEL
     fit = partial(UserModel.fit, train, validation, folder, run.config.seed, simulated, first)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
@@ -343,7 +346,6 @@ def _dependencies(
     validation: EpisodeStore,
     seed: int,
     device: torch.device,
-    *settings: Any,
 ) -> dict[str, Any]:
     """All that a reward model or copies depend on."""
     return {
@@ -353,7 +355,6 @@ def _dependencies(
         "state_size": train.state_size,
         "seed": seed,
         "device": device.type,
-        "settings": [asdict(table) for table in settings],
     }
 
 

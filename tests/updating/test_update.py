@@ -138,8 +138,8 @@ def test_a_folder_that_is_no_update_is_refused_before_a_store_is_written(
 ) -> None:
     trained_run(tmp_path)
     (tmp_path / "other").mkdir()
-    for name, fault in (("run", "is not an update of"), ("other", "is no run")):
-        with pytest.raises(InputError, match=fault):
+    for name in ("run", "other"):
+        with pytest.raises(InputError, match="is not an update of"):
             update_run(folder / "run", [folder / "later.parquet"], tmp_path / name)
         assert not (tmp_path / f"{name}-store").exists()
 

@@ -72,16 +72,15 @@ def promote(run: Path, force: bool = False) -> Promoted:
     verify_run(run)
     folder = run.parent
     with claim(folder / POINTER, wait=True):
-        pointer = promoted(folder)
+        pointer, fingerprint = promoted(folder), TrainedPolicy.load(run).fingerprint
         if pointer is None:
-            return _current(run, ()).write(folder)
-        fingerprint = TrainedPolicy.load(run).fingerprint
+            return _write(run, fingerprint, ())
         again = pointer.current == run.name
         if not force and not (again and pointer.fingerprint in ("", fingerprint)):
             _require_verdict(run, pointer.run(folder))
         previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
-        return _current(run, previous).write(folder)
+        return _write(run, fingerprint, previous)
 
 
 def promote_back(folder: Path) -> Promoted:
@@ -94,25 +93,24 @@ def promote_back(folder: Path) -> Promoted:
         pointer = promoted(folder)
         if pointer is None or not pointer.previous:
             raise InputError(f"{folder}: no run was current before; promote one")
-        back = Promoted(files={}, current=pointer.previous[-1]).run(folder)
+        *previous, name = pointer.previous
+        back = pointer.copy_with(current=name).run(folder)
         verify_run(back)
-        return _current(back, pointer.previous[:-1]).write(folder)
+        return _write(back, TrainedPolicy.load(back).fingerprint, tuple(previous))
 
 
-def _current(run: Path, previous: tuple[str, ...]) -> Promoted:
-    fingerprint = TrainedPolicy.load(run).fingerprint
-    return Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
+def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
+    pointer = Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
+    return pointer.write(run.parent)
 
 
 def _require_verdict(run: Path, current: Path) -> None:
-    remedy = "compare them, and add --force to promote it all the same"
-    update = RunRecord.read(run).update
+    update, fault = RunRecord.read(run).update, ""
     if update is None or update.verdict is None:
-        raise InputError(f"{run} has no verdict against the current run {current.name}; {remedy}")
-    if update.run != TrainedPolicy.load(current, split=True).fingerprint:
-        raise InputError(
-            f"{run} was compared with {update.of}, not with the current run {current.name}; "
-            f"{remedy}"
-        )
-    if update.verdict.result == "worse":
-        raise InputError(f"{run} is worse than {current.name} by its verdict; {remedy}")
+        fault = f"has no verdict against the current run {current.name}"
+    elif update.run != TrainedPolicy.load(current, split=True).fingerprint:
+        fault = f"was compared with {update.of}, not with the current run {current.name}"
+    elif update.verdict.result == "worse":
+        fault = f"is worse than {current.name} by its verdict"
+    if fault:
+        raise InputError(f"{run} {fault}; compare them, and add --force to promote it all the same")

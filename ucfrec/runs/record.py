@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -162,10 +162,13 @@ class Difference(Entry):
         return 0 if self.doubt else int(self.low > 0) - int(self.high < 0)
 
 
+UpdateResult: TypeAlias = Literal["better", "no significant difference", "worse"]
+
+
 class UpdateVerdict(Entry):
     """Whether a new run is better than the old one (`ucfrec.updating.verdict`)."""
 
-    result: Literal["better", "no significant difference", "worse"]
+    result: UpdateResult
     decided_by: Text
     """The measure that decides."""
     differences: tuple[Difference, ...]

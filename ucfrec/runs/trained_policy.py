@@ -1,6 +1,5 @@
 """A trained policy, read back from its run folder."""
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.errors import InputError, InputNote, damage_explained
+from ucfrec.errors import InputError, damage_explained, warn_user
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
@@ -92,11 +91,9 @@ class TrainedPolicy:
         if not (in_training or split) and (refit := refit_of_run(run, record)) is not None:
             record, folder = refit, run / REFIT
         if record.policy is None and not in_training:
-            warnings.warn(
+            warn_user(
                 f"the training in {run} has not ended: later weights may be better, and its "
-                "decision rule is not chosen yet; train again with the same command",
-                InputNote,
-                stacklevel=2,
+                "decision rule is not chosen yet; train again with the same command"
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
@@ -314,11 +311,9 @@ def _note_other_version(run: Path, record: RunRecord) -> None:
     now = policy_package(name)
     trained = f"{package} {record.versions.get(package, '')}"
     if trained != (installed := f"{now} {versions([now] if now else []).get(now, '')}"):
-        warnings.warn(
+        warn_user(
             f"{run} was trained with {trained}, but {installed} is installed: its policy {name!r} "
-            "may behave differently",
-            InputNote,
-            stacklevel=3,
+            "may behave differently"
         )
 
 

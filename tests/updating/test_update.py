@@ -98,7 +98,8 @@ def test_the_command_says_what_was_read_and_what_is_better(
     assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "new rows      300 of 300 read (0 not newer" in said
-    assert "drift " in said
+    assert "of the new rows have new items, " in said
+    assert "the old run's reward model predicts " in said
     assert "verdict " in said
     record = RunRecord.read(tmp_path / "run2")
     assert record.update is not None

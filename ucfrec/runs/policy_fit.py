@@ -36,11 +36,9 @@ def fit_policy(
     callbacks: Callbacks = SILENT,
     augmented: AugmentedEpisodes | None = None,
 ) -> Fit:
-    """Train the policy, or resume its training.
+    """Train the policy in place, or resume its training.
 
     Args:
-        policy: trained in place.
-        train: episodes to learn from.
         validation: held-out episodes; None to keep the last weights.
         start: weights of another training to go on from; of a policy that is fitted without
             gradients, only what was chosen on held-out episodes is taken from there.

@@ -33,31 +33,19 @@ class Promoted(Record):
     previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
 
     def run(self, folder: Path) -> Path:
-        """The folder of the current run.
-
-        Raises:
-            InputError: the name is not that of a folder beside the file.
-        """
+        """The folder of the current run, which must lie beside the file."""
         if self.current in ("", ".", "..") or Path(self.current).name != self.current:
             raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
         return folder / self.current
 
 
 def promoted(folder: Path) -> Promoted | None:
-    """What the pointer file of a folder says; None if there is none.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """What the pointer file of a folder says; None if there is none."""
     return Promoted.read(folder) if (folder / POINTER).is_file() else None
 
 
 def promote(run: Path, force: bool = False) -> Promoted:
     """Make a run the current one of the folder that it lies in.
-
-    Args:
-        run: a finished run, no link, all of whose files are compared with their checksums.
-        force: whatever its verdict against the current run is.
 
     Raises:
         InputError: the run is a link, not finished or damaged, or, without `force`, is not an

@@ -21,7 +21,7 @@ SHARE: Final = 0.25
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
-    """Go on training the policy of the run `first`, on its validation and test episodes too.
+    """Go on training the policy of the finished run `first`, on all episodes of its store.
 
     Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
     model's effects and the decision rule are those of `first`. The best weights are trained for
@@ -30,8 +30,6 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     split. There is nothing left to evaluate the policy on but later logs.
 
     Args:
-        store: the store of `first`.
-        first: a finished run.
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
 
     Raises:

@@ -64,12 +64,7 @@ def training_views(store: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
 
 
 def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, config: Config) -> None:
-    """Check that a run can begin, or go on, in the folder `out`.
-
-    Raises:
-        InputError: `out` is a run on another store or with another configuration; or the rewards
-            never vary, which augmentation needs.
-    """
+    """Check that a run can begin, or go on, in the folder `out`; see `train_run`."""
     if not (out / RUN).exists():
         if config.augment.augments:
             require_rewards_vary(train)
@@ -176,11 +171,7 @@ def policy_sizes(store: EpisodeStore) -> dict[str, int]:
     """Sizes of states and actions, and of the catalogue (0 for vectors), that policies have."""
     if store.has_items:
         return reward_model_sizes(store)
-    return {
-        "state": store.state_size,
-        "action": store.record.columns[schema.ACTION][0],
-        "items": 0,
-    }
+    return {"state": store.state_size, "action": store.record.columns[schema.ACTION][0], "items": 0}
 
 
 @random_state_kept()
@@ -214,25 +205,20 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
 
 @torch.no_grad()
 def start_warm(policy: SequencePolicy, out: Path, initial: Path) -> None:
-    """Give a policy, and the reward model of its augmentation, the weights of another run.
+    """Give a policy, and the reward model of its augmentation in `out`, the weights of another run.
 
     Rows of users and items that the other run does not know keep what the new policy begins with:
     for items no correction of their vector, and the log of their share of the training steps.
-
-    Args:
-        out: folder of the new run, which receives the reward model's weights.
     """
     acting = initial if refit_of_run(initial, read_record(initial)) is None else initial / REFIT
-    path = acting / "policy" / "best.safetensors"
-    trained, names = load_trained(path), {name for name, _ in policy.named_parameters()}
-    state = policy.state_dict()
+    trained = load_trained(acting / "policy" / "best.safetensors")
+    state, names = policy.state_dict(), dict(policy.named_parameters())
     for name in sorted(state.keys() & trained.keys()):
         new, old = state[name], trained[name]
-        if name not in names and name not in _SCALES:
-            continue
-        if new.shape == old.shape:
+        learned = name in names or name in _SCALES
+        if learned and new.shape == old.shape:
             new.copy_(old)
-        elif new.shape[1:] == old.shape[1:] and len(new) > len(old):
+        elif learned and new.shape[1:] == old.shape[1:] and len(new) > len(old):
             new[: len(old)] = old
     best, target = initial / CRM / "cvae" / "best.safetensors", out / CRM / INITIAL
     if best.exists() and not target.exists():

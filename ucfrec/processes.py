@@ -173,12 +173,9 @@ def _begin(begin: Callable[[], None] | None) -> None:
 
 
 def require_blas_memory() -> None:
-    """Check that there is memory for linear algebra with NumPy, SciPy or scikit-learn.
+    """Raise MemoryError where there is none for linear algebra.
 
     Where the operating system refuses, OpenBLAS asks again for ever, in code that no signal ends.
-
-    Raises:
-        MemoryError: there is none.
     """
     try:
         mmap.mmap(-1, _BLAS).close()
@@ -190,8 +187,7 @@ def require_blas_memory() -> None:
 def random_state_kept() -> Iterator[None]:
     """Restore the global generators of torch (every device), numpy and `random` on exit.
 
-    The code inside may seed them and draw from them. Usable in a `with` statement and as the
-    decorator `@random_state_kept()`.
+    Usable in a `with` statement and as the decorator `@random_state_kept()`.
     """
     import numpy as np  # commands that compute nothing need neither
     import torch

@@ -108,8 +108,7 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
                 raise _setting_error(table, name, error, values) from None
 
         table.__init__ = check
-        result: type[Table] = table
-        return result
+        return cast("type[Table]", table)
 
     return decorate
 
@@ -205,17 +204,17 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def _range(metadata: Sequence[Any]) -> str:
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     limits = {
-        side: getattr(constraint, side)
+        words[side]: _number(getattr(constraint, side))
         for constraint in metadata
-        for side in ("ge", "gt", "le", "lt")
+        for side in words
         if hasattr(constraint, side)
     }
-    if {"ge", "le"} == limits.keys():
-        return f" from {_number(limits['ge'])} to {_number(limits['le'])}"
-    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    parts = [f"{words[side]} {_number(limit)}" for side, limit in limits.items()]
-    return f" {' and '.join(parts)}" if parts else ""
+    if sorted(limits) == ["at least", "at most"]:
+        return f" from {limits['at least']} to {limits['at most']}"
+    parts = [f" {words} {limit}" for words, limit in limits.items()]
+    return " and".join(parts)
 
 
 def _number(value: float) -> str:
@@ -261,11 +260,7 @@ require_seed: Final = partial(require_whole, least=0, most=LARGEST_SEED)
 
 
 def require_number(name: str, value: object) -> float:
-    """The number that `value` is.
-
-    Raises:
-        InputError: it is not a number, or not finite.
-    """
+    """The finite number that `value` is; an `InputError` if it is none."""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise InputError(f"{name} is {shown(value)}; give a finite number")
     return float(value)
@@ -274,11 +269,8 @@ def require_number(name: str, value: object) -> float:
 def require_ids(name: str, value: object, of: str) -> Array:
     """The identifiers (N,) of a list, a series, an array, a set or an iterator, at least one.
 
-    Args:
-        of: what they are, e.g. "user_id".
-
     Raises:
-        InputError: `value` is something else, is empty, or holds lists.
+        InputError: `value` is something else, is empty, or holds lists; `of` is e.g. "user_id".
     """
     if not _is_list(value) or getattr(value, "ndim", 1) != 1:
         raise InputError(f"{name} is {shown(value)}; give a list of {of}s")
@@ -293,11 +285,7 @@ def _is_list(value: object) -> bool:
 
 
 def require_kind(what: str, *kinds: Any) -> Check:
-    """A check that a value is of one of some types.
-
-    Args:
-        what: the remedy, after "give".
-    """
+    """A check that a value is of one of some types; `what` is the remedy, after "give"."""
 
     def check(name: str, value: Any) -> Any:
         if not isinstance(value, kinds):
@@ -308,14 +296,10 @@ def require_kind(what: str, *kinds: Any) -> Check:
 
 
 def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -> list[_Value]:
-    """The values of an argument that is one of them, or any number.
-
-    Args:
-        what: one of them in words, e.g. "a Recommender".
-        kinds: types that they may have.
+    """The values of an argument that is one of `kinds`, or any number of them.
 
     Raises:
-        InputError: one has another type.
+        InputError: one has another type; `what` is one of them in words, e.g. "a Recommender".
     """
     alone = isinstance(argument, kinds) or not _is_list(argument)
     values = [argument] if alone else list(cast("Iterable[object]", argument))
@@ -328,13 +312,7 @@ def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -
 def check_arguments(
     checks: Mapping[str, Check],
 ) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
-    """A decorator that checks arguments by their names, before anything else happens.
-
-    None is not checked where it is the default.
-
-    Args:
-        checks: name of an argument to its check.
-    """
+    """A decorator that checks arguments by their names; None is not, where it is the default."""
 
     def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         signature = inspect.signature(function)
@@ -346,9 +324,8 @@ def check_arguments(
             except TypeError:
                 return function(*args, **keywords)  # raises the same with the function's name
             for name, value in bound.arguments.items():
-                if name in checks and not (
-                    value is None and signature.parameters[name].default is None
-                ):
+                is_default = value is None and signature.parameters[name].default is None
+                if name in checks and not is_default:
                     bound.arguments[name] = checks[name](name, value)
             return function(*bound.args, **bound.kwargs)
 

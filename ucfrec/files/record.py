@@ -63,9 +63,7 @@ class Sealed:
 
     folder: Path
     remedy: str
-    """What to do about a damaged file, for messages."""
     files: Mapping[str, tuple[int, str]]
-    """Path in the folder to size in bytes and checksum."""
 
     def require(self, names: Container[str] = (), small: int = SMALL) -> None:
         """Check the sizes of all files, and the content of `names` and of those of `small` bytes.
@@ -79,10 +77,7 @@ class Sealed:
                 raise InputError(f"{where} {fault}; restore the file, or {self.remedy}")
 
     def faults(self) -> Iterator[tuple[str, str]]:
-        """Read every file, several at a time; yields (path in the folder, what is wrong with it).
-
-        Reading and hashing release Python's lock, so with two processors the hashing costs no time.
-        """
+        """Read every file; yields (path in the folder, what is wrong with it)."""
         from concurrent.futures import ThreadPoolExecutor  # only to verify everything
 
         with ThreadPoolExecutor(_THREADS) as threads:
@@ -171,11 +166,7 @@ class Record(Entry):
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
-        """The record of a JSON object.
-
-        Raises:
-            InputError: an entry is missing, has another type or is out of range.
-        """
+        """The record of a JSON object; an `InputError` names an entry that is missing or wrong."""
         try:
             _require_bounded(value)
             return cls.model_validate(value)
@@ -202,12 +193,7 @@ class Record(Entry):
         return self.copy_with(files=files).write(folder)
 
     def reopen(self, folder: Path, unchanged: Container[str]) -> Self:
-        """Write the record before files of the folder change.
-
-        Args:
-            folder: as `seal` left it.
-            unchanged: files that will not change; the others are no longer listed.
-        """
+        """Write the record before files of the folder change, but for those `unchanged`."""
         files = {name: entry for name, entry in self.files.items() if name in unchanged}
         return self if files == self.files else self.copy_with(files=files).write(folder)
 
@@ -225,13 +211,13 @@ def _first_fault(error: ValidationError, path: Path, remedy: str) -> InputError:
     """The first of pydantic's errors, as one line."""
     fault = error.errors(include_url=False)[0]
     name = ".".join(str(part) for part in fault["loc"] if part != "[key]")
-    cause = fault.get("ctx", {}).get("error")
+    cause = fault.get("ctx", {}).get("error", "")
+    what = f" is damaged: its {name} is {fault['input']!r:.60}{cause and f', {cause}'}"
     if isinstance(cause, InputError):
-        return InputError(f"{path}: {cause}; {remedy}")
-    if fault["type"] == "missing":
-        return InputError(f"{path} has no {name}; {remedy}")
-    what = f", {cause}" if cause else ""
-    return InputError(f"{path} is damaged: its {name} is {fault['input']!r:.60}{what}; {remedy}")
+        what = f": {cause}"
+    elif fault["type"] == "missing":
+        what = f" has no {name}"
+    return InputError(f"{path}{what}; {remedy}")
 
 
 def _require_bounded(value: object, name: str = "") -> None:

@@ -19,11 +19,7 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write named tensors and metadata that JSON can represent, atomically.
-
-    Raises:
-        InputError: the disk is full, or the folder is not writable.
-    """
+    """Write named tensors and metadata that JSON can represent, atomically."""
     plain: dict[str, Tensor] = {}
     places = set()
     for name, tensor in tensors.items():
@@ -48,11 +44,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote."""
     # safetensors may call whatever it cannot read a missing file.
     require_file(path, REMEDY)
     try:
@@ -65,16 +57,10 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Tensor]) -> _Module:
-    """Build a module and load `tensors` into it.
+    """Build a module and load `tensors` into it, which were read from `path`.
 
     The sizes of a module come from a record that may state any. They are compared with those of the
     tensors, which a file holds, before memory is allocated.
-
-    Args:
-        path: where `tensors` were read from, for messages.
-
-    Raises:
-        InputError: they are the weights of another architecture.
     """
     try:
         with torch.device("meta"):
@@ -92,10 +78,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 def load_weights(
     path: Path, module: nn.Module, tensors: Mapping[str, Tensor], assign: bool = False
 ) -> None:
-    """Load `tensors` into `module`; `path`, where they were read from, is for the message.
-
-    Args:
-        assign: whether the tensors become those of the module; otherwise they are copied.
+    """Load `tensors`, which were read from `path`, into `module`; copied unless `assign`.
 
     Raises:
         InputError: they are the weights of another architecture.

@@ -232,10 +232,8 @@ class _Training:
         save_tensors(self._last, tensors, counters)
 
     def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
-        """One optimizer step on the loss `value`; returns the gradient norm before clipping.
-
-        With `count`, the number of rows of `value`, on its mean over all processes.
-        """
+        """One optimizer step on the loss `value`, the mean of `count` rows of all that processes
+        have; returns the gradient norm before clipping."""
         config = self._config
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
@@ -257,11 +255,7 @@ class _Training:
     def validate(
         self, step: int, logged: Mapping[str, float], validate: Callable[[], float] | None
     ) -> dict[str, float]:
-        """Save the weights if their validation loss is the lowest so far, or without validation.
-
-        Returns:
-            The validation loss, for the log; empty without validation.
-        """
+        """Save the weights if their validation loss, which is returned, is the lowest so far."""
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
         found = {}
@@ -296,12 +290,7 @@ class _Training:
 
 
 def load_trained(path: Path) -> dict[str, Tensor]:
-    """The trained weights in a file that `fit` wrote: averages where it has them, without what only
-    resuming needs.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """The trained weights in a file of `fit`: averages where it has them, and nothing else."""
     tensors, counters = load_tensors(path)
     weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, _AVERAGE))}
     with damage_explained(path, REMEDY):
@@ -378,12 +367,7 @@ class WeightAverage:
     """
 
     def __init__(self, module: nn.Module, decay: float, start: int = 0) -> None:
-        """
-        Args:
-            module: averaged from its present weights on, which then change in place.
-            decay: the largest d, above 0 and below 1.
-            start: steps whose weights are not averaged.
-        """
+        """`decay` is the largest d; the weights of the first `start` steps are not averaged."""
         self._decay, self._start, self._step = decay, start, 0
         self._log = 0.0  # Σ log d of the steps so far
         # A checkpoint has shared weights once for each name, so their averages are, too.
@@ -444,11 +428,7 @@ class WeightAverage:
         return tensors, {"averaged_steps": self._step, "average_log": self._log}
 
     def restore(self, tensors: Mapping[str, Tensor], counters: Mapping[str, float]) -> None:
-        """Go on from what `state` returned.
-
-        Raises:
-            KeyError, RuntimeError: an average is missing, or has another shape.
-        """
+        """Go on from what `state` returned; KeyError or RuntimeError if it is damaged."""
         self._step, self._log = int(counters["averaged_steps"]), float(counters["average_log"])
         for name, mean in self._means.items():
             mean.copy_(tensors[f"{_AVERAGE}{name}"])
@@ -461,9 +441,7 @@ def _averages(
 ) -> dict[str, Tensor]:
     """Averages by the names of their weights, every row of a table brought up to date.
 
-    Args:
-        tensors: of `WeightAverage.state`; others are ignored.
-        counters: of `WeightAverage.state`.
+    `tensors` and `counters` are of `WeightAverage.state`; others are ignored.
     """
     means = {}
     for name, table in weights.items():

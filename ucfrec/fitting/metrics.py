@@ -21,11 +21,7 @@ class MetricsLog:
 
     Both are on disk before `add` returns, so a killed training loses nothing that it logged;
     `tensorboardX.SummaryWriter` would write in a thread. A line is `{"step": 500, "loss": 1.25}`; a
-    value that is not finite becomes null.
-
-    Args:
-        folder: of both files; must exist.
-        start: the step that training resumes from; 0 for a new training.
+    value that is not finite becomes null. Training resumes from step `start`.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
@@ -68,9 +64,6 @@ def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
     Returns:
         {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
         if the file does not exist.
-
-    Raises:
-        InputError: a line is not an object of a step and numbers.
     """
     path = folder / METRICS
     if not path.exists():

@@ -87,11 +87,7 @@ def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, An
 
 
 def config_from_dict(values: object) -> Config:
-    """Rebuild a configuration from its `dataclasses.asdict`.
-
-    Raises:
-        InputError: see `resolve_config`.
-    """
+    """Rebuild a configuration from its `dataclasses.asdict`; errors as of `resolve_config`."""
     if not isinstance(values, Mapping) or not {"policy_name", "seed"} <= values.keys():
         raise InputError("the run's configuration has no policy_name or no seed")
     tables = {**values}

@@ -236,11 +236,7 @@ class RunRecord(TrainingRecord):
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
-        """The record of a JSON object; see `Record.of`.
-
-        Raises:
-            InputError: its policy is not installed or cannot be imported, too, which is no damage.
-        """
+        """See `Record.of`; a policy that is not installed or cannot be imported is no damage."""
         config = value.get("config")
         name = config.get("policy_name") if isinstance(config, Mapping) else None
         if isinstance(name, str) and name not in BUILT_IN:
@@ -307,8 +303,7 @@ class RunRecord(TrainingRecord):
                 the validation loss is not a log-likelihood of items and cannot be compared.
 
         Returns:
-            What was found and what to do; empty if the policy learned something, has no validation
-            loss (as a refit), or is not trained yet.
+            What was found and what to do; empty if nothing was, or can be compared.
         """
         best = math.nan if self.policy is None else self.policy.best_validation
         popularity = (self.reference_losses or {}).get("popularity")
@@ -340,11 +335,7 @@ class RunRecord(TrainingRecord):
 
 
 def read_record(run: Path) -> RunRecord:
-    """The record of a run, whose small files are compared with their checksums.
-
-    Raises:
-        InputError: `run` is not a run folder, or is damaged.
-    """
+    """The record of a run, whose small files are compared with their checksums."""
     record = RunRecord.read(run)
     record.checksums(run).require()
     return record
@@ -363,31 +354,19 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
 
 
 def read_training(run: Path) -> TrainingRecord:
-    """The record of a run of whatever library; its other files are not looked at.
-
-    Raises:
-        InputError: `run` is not a run folder, or its record is damaged.
-    """
+    """The record of a run of whatever library; its other files are not looked at."""
     record = TrainingRecord.read(run)
     return RunRecord.read(run) if record.library == "ucfrec" else record
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:
-    """The decision rules that the choice of a run tried; none if it did not choose.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The decision rules that the choice of a run tried; none if it did not choose."""
     path = run / CANDIDATES
     return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
 
 
 def read_augmentation(path: Path) -> AugmentationReport:
-    """The report of an augmentation that is made, of a run that may still be in training.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The report of an augmentation that is made, of a run that may still be in training."""
     return _read_stage(path, AugmentationReport)
 
 
@@ -409,9 +388,6 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
 
     It is looked for where it lies as seen from the run, so that both can be moved or copied
     together, and where it lay when the run was trained.
-
-    Raises:
-        InputError: it is damaged.
     """
     seen_from_run = os.path.normpath(run.resolve() / (record.store_from_run or record.store))
     for path in (Path(seen_from_run), Path(record.store)):
@@ -423,11 +399,7 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
 
 
 def verify_run(run: Path) -> None:
-    """Read every file of a run and compare it with its checksum.
-
-    Raises:
-        InputError: `run` is not a finished run, or a file has another content.
-    """
+    """Read every file of a finished run and compare it with its checksum."""
     record = read_record(run)
     if record.policy is None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")

@@ -45,10 +45,8 @@ class TrainedPolicy:
     """A policy loaded from a run folder, with all that acting and recommending need."""
 
     folder: Path
-    """The run folder."""
     policy: SequencePolicy
     record: RunRecord
-    """The content of `run.json`."""
     item_states: ItemStates | None
     """Builds states from items; None if the logged observation is the state."""
     item_ids: Array | None
@@ -59,7 +57,6 @@ class TrainedPolicy:
     """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
     of steps if a target is set again at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
-    """The decision rule of the run."""
     reward_model: ItemRewardModel | None = None
     """Of the rewards of items, for decision rules with a reward weight; None if the run fitted
     none."""
@@ -218,22 +215,15 @@ class TrainedPolicy:
         return store
 
     def target_return(self, quantile: float) -> float:
-        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units.
-
-        Raises:
-            InputError: the quantile is not between 0 and 1.
-        """
+        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units."""
         if not 0 <= quantile <= 1:
             raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
     def scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """The policy under `rule`, by default the run's own.
+        """The policy under `rule`, by default the run's own, which it must fit.
 
         What it computes once is kept for the next call with the same weights.
-
-        Raises:
-            InputError: the rule does not fit the policy.
         """
         rule, models = rule or self.rule, (self.policy, self.reward_model)
         weights = [
@@ -252,11 +242,7 @@ class TrainedPolicy:
         return kept.under(rule)
 
     def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """`scorer` of a policy of items.
-
-        Raises:
-            InputError: the policy's actions are vectors, or the rule does not fit the policy.
-        """
+        """`scorer` of a policy of items; an `InputError` if its actions are vectors."""
         if self.item_states is None:
             raise InputError(
                 "this policy's actions are vectors; recommending needs a policy trained on items"
@@ -295,11 +281,7 @@ class TrainedPolicy:
 
 
 def read_rule(path: Path) -> DecisionRule:
-    """The decision rule in a file of a run.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """The decision rule in a file of a run."""
     return DecisionRule.from_dict(read_json(path), str(path))
 
 
@@ -326,9 +308,7 @@ class RunOnWorkers:
     """Which policy the workers load; small, as it is sent to them with each task."""
 
     folder: Path
-    """The run folder, which every worker sees."""
     checkpoint: str
-    """`best` or `last` weights."""
     fingerprint: str
 
     @classmethod
@@ -338,11 +318,7 @@ class RunOnWorkers:
 
     @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:
-        """The policy; kept for the next task of this worker.
-
-        Raises:
-            InputError: the folder is missing there, or holds another run.
-        """
+        """The policy; kept for the next task of this worker."""
         # A worker has one core; the cluster runs as many workers as it has cores.
         torch.set_num_threads(1)
         trained = TrainedPolicy.load(self.folder, self.checkpoint)

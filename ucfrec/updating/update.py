@@ -72,7 +72,6 @@ def update_run(
         out: folder of the new run, new or interrupted.
         store: folder of the grown store; None for one beside `out`, with `-store` added.
         mapping: as of `ucfrec.logs.append.append_logs`.
-        options: None for the defaults.
 
     Returns:
         The record of the new run; `update` has the drift of the new rows and the verdict.

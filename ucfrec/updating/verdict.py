@@ -204,11 +204,9 @@ def measure_drift(
     counts: dict[str, Any],
     seed: int,
 ) -> dict[str, Any]:
-    """What is different in new rows.
+    """What is different in the rows `added` to the `training` episodes of a run.
 
     Args:
-        training: the run's training episodes.
-        added: the new episodes of the grown store.
         counts: of `ucfrec.logs.append.append_logs`.
         seed: of the rows that are drawn from many.
 
@@ -268,11 +266,9 @@ def describe_drift(drift: dict[str, Any]) -> str:
 
 
 def restrict_to_run(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
-    """The episodes of a view, in memory, with the item states of a run.
+    """The episodes of a view of a store that was grown from a run's, in memory.
 
-    Args:
-        view: of a store that was grown from the run's.
-        trained: the run; users and items that it does not know become −1.
+    They have the run's item states; users and items that it does not know become −1.
     """
     assert trained.item_states is not None
     steps = {name: view.column(name) for name in view.record.columns}

@@ -1,51 +1,30 @@
 """What the pages say holds: commands parse, code runs, links lead somewhere, the site builds."""
 
 import ast
-import dataclasses
-import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
 from configparser import RawConfigParser
 from pathlib import Path
-from types import ModuleType
 from xml.etree import ElementTree
 
 import pytest
 
 from tests.support.markdown import ROOT, Page, anchors, parse
-from ucfrec.runs.config import resolve_config
+from ucfrec.evaluation.ranking import MEASURES
+from ucfrec.runs.config import TABLES
 
 SITE = [Page(str(path.relative_to(ROOT))) for path in sorted((ROOT / "docs").rglob("*.md"))]
-REPOSITORY = [
-    Page(name)
-    for name in (
-        "README.md",
-        "CHANGELOG.md",
-        "CONTRIBUTING.md",
-        "SECURITY.md",
-        "datasets/README.md",
-        "simulators/README.md",
-        "control/README.md",
-    )
-]
-PAGES = [*REPOSITORY, *SITE]
+REPOSITORY = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
+SIBLINGS = ("datasets/README.md", "simulators/README.md", "control/README.md")
+PAGES = [*map(Page, (*REPOSITORY, *SIBLINGS)), *SITE]
 GENERATED = {"docs/tables.md", "docs/log.md"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 NAV = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:")[1].split("\n\n")[0]
 BUILT = ROOT / "build" / "docs"
 NOTEBOOKS = re.compile(r"^docs/tutorials/(\w+)\.md$")
-
-
-def _script(name: str) -> ModuleType:
-    """A Python file of `docs/`, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize(
@@ -118,11 +97,7 @@ def test_a_page_is_short_and_in_the_navigation(page: Page) -> None:
 
 
 def test_the_settings_reference_has_every_table() -> None:
-    config = resolve_config("ucf")
-    tables = [f.name for f in dataclasses.fields(config)]
-    tables = [name for name in tables if dataclasses.is_dataclass(getattr(config, name))]
-    assert len(tables) == 6
-    assert anchors(Page("docs/settings-reference.md").text) >= set(tables)
+    assert anchors(Page("docs/settings-reference.md").text) >= {*TABLES}
 
 
 def test_every_supported_dataset_has_its_section() -> None:
@@ -130,32 +105,21 @@ def test_every_supported_dataset_has_its_section() -> None:
     assert anchors(Page("docs/datasets.md").text) >= supported
 
 
-def test_every_simulator_is_named() -> None:
-    text = Page("docs/simulators.md").text
-    for name in PROJECT["entry-points"]["ucfrec.simulators"]:
-        stem = re.sub(r"(-on|-n[14](-nx0)?)$", "", name)
-        assert f"`{stem}`" in text, name
-
-
-def test_every_extra_is_in_the_quickstart() -> None:
-    text = Page("docs/quickstart.md").text
-    for extra in set(PROJECT["optional-dependencies"]) - {"dev", "docs"}:
-        assert f"`{extra}`" in text, extra
+def test_every_simulator_extra_and_metric_is_named() -> None:
+    simulators = PROJECT["entry-points"]["ucfrec.simulators"]
+    expected = {
+        "simulators": {re.sub(r"(-on|-n[14](-nx0)?)$", "", name) for name in simulators},
+        "quickstart": set(PROJECT["optional-dependencies"]) - {"dev", "docs"},
+        "numbers": set(MEASURES),
+    }
+    for page, names in expected.items():
+        text = Page(f"docs/{page}.md").text
+        assert [name for name in sorted(names) if f"`{name}`" not in text] == []
 
 
 def test_extras_that_the_pages_name_exist() -> None:
     named = re.findall(r"\.\[([\w,]+)\]", "".join(page.text for page in PAGES))
-    extras = {extra for group in named for extra in group.split(",")}
-    assert extras
-    assert extras <= set(PROJECT["optional-dependencies"])
-
-
-def test_every_metric_of_a_result_is_defined() -> None:
-    from ucfrec.evaluation.ranking import MEASURES
-
-    text = Page("docs/numbers.md").text
-    for name in MEASURES:
-        assert f"`{name}`" in text, name
+    assert {*",".join(named).split(",")} <= set(PROJECT["optional-dependencies"])
 
 
 def _messages() -> str:
@@ -174,8 +138,8 @@ def _messages() -> str:
 
 def test_the_messages_of_troubleshooting_exist() -> None:
     source = _messages()
-    rows = [line for line in Page("docs/troubleshooting.md").text.splitlines() if line[:3] == "| `"]
-    rows += [row for row in Page("docs/troubleshooting.md").text.splitlines() if ": `" in row[:20]]
+    lines = Page("docs/troubleshooting.md").text.splitlines()
+    rows = [line for line in lines if line.startswith("| `") or ": `" in line[:20]]
     shown = [re.findall(r"`([^`]+)`", row)[0] for row in rows]
     assert len(shown) > 20
     for message in shown:
@@ -187,8 +151,8 @@ def test_the_messages_of_troubleshooting_exist() -> None:
 
 
 def test_the_pictures_are_drawn_from_the_tables() -> None:
-    charts = _script("charts")
-    for name, text in charts.pictures().items():
+    charts = runpy.run_path(str(ROOT / "docs" / "charts.py"))
+    for name, text in charts["pictures"]().items():
         found = (ROOT / "docs" / "assets" / name).read_text(encoding="utf-8")
         assert found == text, f"{name}: run python docs/charts.py"
 

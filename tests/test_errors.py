@@ -12,13 +12,8 @@ from ucfrec.errors import InputError, damage_explained, explain_os_error, one_li
 
 @given(st.text())
 def test_every_text_becomes_one_printable_line(text: str) -> None:
-    assert one_line(text).isprintable()
+    assert one_line(text) == text if text.isprintable() else one_line(text).isprintable()
     assert str(InputError(f"a: {text}")).isprintable()
-
-
-@given(st.text(st.characters(categories=["L", "N", "P", "S"])))
-def test_printable_text_stays(text: str) -> None:
-    assert one_line(text) == text
 
 
 def test_a_terminal_is_not_steered() -> None:

@@ -7,7 +7,6 @@ import tomllib
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,13 +18,8 @@ from tests.support.markdown import ROOT
 from ucfrec.logs.mapping import read_mapping
 from ucfrec.logs.prepare import PrepareOptions, validate
 
-SETTINGS = (
-    "train.learning_rate=1e-3",
-    "policy.dim=32",
-    "policy.context=10",
-    "policy.exposure=true",
-    "rule.sessions=20",
-)
+SETTINGS = ("train.learning_rate=1e-3", "policy.dim=32", "policy.context=10")
+SETTINGS += ("policy.exposure=true", "rule.sessions=20")
 SMALLER = {
     "shop": {
         "SESSIONS, ITEMS = 1000": "SESSIONS, ITEMS = 100",
@@ -46,12 +40,6 @@ SMALLER = {
 }
 """Numbers of a notebook that its code runs as well without, and whose results nothing checks."""
 NOTEBOOKS = tuple(SMALLER)
-
-
-def _cells(name: str) -> list[dict[str, Any]]:
-    text = (ROOT / "examples" / f"{name}.ipynb").read_text(encoding="utf-8")
-    cells: list[dict[str, Any]] = json.loads(text)["cells"]
-    return cells
 
 
 @pytest.mark.slow
@@ -84,7 +72,8 @@ def test_the_notebook_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_the_committed_notebook_has_its_outputs(name: str) -> None:
-    code = [cell for cell in _cells(name) if cell["cell_type"] == "code"]
+    notebook = json.loads((ROOT / "examples" / f"{name}.ipynb").read_text(encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert all(cell["execution_count"] for cell in code)
     outputs = [output for cell in code for output in cell["outputs"]]
     assert any("image/svg+xml" in output.get("data", {}) for output in outputs)
@@ -129,8 +118,7 @@ SMALL = ("train.steps=40", "policy.dim=16", "policy.context=4", "rule.sessions=4
 @pytest.mark.slow
 def test_two_days_of_the_month_close_the_loop_and_are_resumed(tmp_path: Path) -> None:
     month = Month(days=2, sessions=50, users=80, items=110, settings=SMALL)
-    days = simulate(tmp_path, replace(month, days=1))
-    assert [each.day for each in days] == [1]
+    assert [each.day for each in simulate(tmp_path, replace(month, days=1))] == [1]
     days = simulate(tmp_path, month)
     assert [each.day for each in days] == [1, 2]
     assert all(0 < each.reward < 20 and 0 < each.frozen < 20 for each in days)

@@ -87,20 +87,9 @@ def test_entry_points_load(entry: EntryPoint) -> None:
     assert callable(loaded) or entry.group != "console_scripts"
 
 
-def test_entry_points_cover_both_kinds_of_plugin() -> None:
-    groups = {entry.group for entry in ENTRY_POINTS}
-    assert groups >= {"console_scripts", "ucfrec.datasets", "ucfrec.simulators"}
-
-
 def test_the_wheel_holds_four_packages_and_nothing_else(tmp_path: Path) -> None:
-    built = subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert built.returncode == 0, built.stderr
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, capture_output=True, timeout=120, check=True)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())

@@ -32,14 +32,8 @@ def test_the_commands_parse(command: str) -> None:
 
 
 def test_the_walk_through_has_its_commands() -> None:
-    assert {line.split()[1] for line in README.commands()} >= {
-        "prepare",
-        "train",
-        "recommend",
-        "ope",
-        "serve",
-        "report",
-    }
+    named = {line.split()[1] for line in README.commands()}
+    assert named >= {"prepare", "train", "recommend", "ope", "serve", "report"}
 
 
 def test_every_built_in_method_is_in_the_table() -> None:

@@ -29,17 +29,13 @@ __all__ = [
 ]
 
 _MODULES = {
-    "DecisionRule": "ucfrec.acting.decision",
-    "EpisodeStore": "ucfrec.episodes.store",
-    "EstimateOptions": "ucfrec.off_policy.evaluate",
-    "FeatureTable": "ucfrec.logs.mapping",
-    "InputError": "ucfrec.errors",
-    "LogFiles": "ucfrec.logs.mapping",
-    "LogMapping": "ucfrec.logs.mapping",
-    "PrepareOptions": "ucfrec.logs.prepare",
-    "Recommender": "ucfrec.python_api.recommender",
-    "UCF": "ucfrec.python_api.recommender",
-    "prepare": "ucfrec.logs.prepare",
+    "acting.decision": ("DecisionRule",),
+    "episodes.store": ("EpisodeStore",),
+    "errors": ("InputError",),
+    "logs.mapping": ("FeatureTable", "LogFiles", "LogMapping"),
+    "logs.prepare": ("PrepareOptions", "prepare"),
+    "off_policy.evaluate": ("EstimateOptions",),
+    "python_api.recommender": ("UCF", "Recommender"),
 }
 
 
@@ -50,6 +46,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     # Lazy, because importing torch takes a second and `ucfrec --help` does not need it.
-    if name in _MODULES:
-        return getattr(import_module(_MODULES[name]), name)
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"ucfrec.{module}"), name)
     raise AttributeError(f"module 'ucfrec' has no attribute {name!r}")

@@ -16,11 +16,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """
-        Args:
-            message: may quote text of files; line breaks and control characters in it are replaced,
-                see `one_line`.
-        """
+        """`message` may quote text of files: see `one_line`."""
         super().__init__(one_line(message))
 
 
@@ -67,13 +63,8 @@ def one_line(text: str) -> str:
     text = " ".join(part for part in text.split("\n") if part.strip()) if "\n" in text else text
     if text.isprintable():
         return text
-    return "".join(_visible(character) for character in text)
-
-
-def _visible(character: str) -> str:
-    if character.isprintable() or character.isspace():
-        return " " if character.isspace() else character
-    return character.encode("unicode_escape").decode("ascii")
+    spaced = (" " if character.isspace() else character for character in text)
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in spaced)
 
 
 def explain_os_error(error: OSError) -> str:

@@ -31,8 +31,7 @@ def load_plugin(group: str, name: str) -> Any:
     """Import the plugin `name` of the entry-point group `ucfrec.<group>`.
 
     Raises:
-        InputError: no plugin of that name is installed, or several that differ; or it cannot be
-            imported, or is something else than its group has.
+        InputError: no such plugin is installed, or several, or it is broken or of another type.
     """
     entry = _entry(group, name)
     kind, module, title = _ONE_OF[group]

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from importlib import import_module
 from types import FrameType
@@ -88,12 +88,12 @@ def interruptions_raised() -> Iterator[None]:
 
     def unraisable(unraised: "sys.UnraisableHookArgs") -> None:
         # A callback of a library cannot pass exceptions on; Python reports them and goes on.
-        if came and issubclass(unraised.exc_type, KeyboardInterrupt):
+        if not came:
+            reported(unraised)
+        elif issubclass(unraised.exc_type, KeyboardInterrupt):
             timer = threading.Timer(_AGAIN, signal.raise_signal, (came[0],))
             timer.daemon = True
             timer.start()
-        elif not came:
-            reported(unraised)
 
     handlers = _handle_signals(interrupt)
     reported, sys.unraisablehook = sys.unraisablehook, unraisable
@@ -148,10 +148,8 @@ def pool_of_processes(
     """Yield a pool whose processes end when the block raises, and when this process is killed.
 
     Work must be submitted within `block_ctrl_c`, because Ctrl-C on a terminal reaches every
-    process of a command, and this one ends the others.
-
-    Args:
-        begin: a module-level function that each process calls first.
+    process of a command, and this one ends the others. Each process calls `begin` first, a function
+    of a module.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
@@ -175,12 +173,9 @@ def _begin(begin: Callable[[], None] | None) -> None:
 
 
 def require_blas_memory() -> None:
-    """Check that there is memory for linear algebra with NumPy, SciPy or scikit-learn.
+    """Raise MemoryError where there is none for linear algebra.
 
     Where the operating system refuses, OpenBLAS asks again for ever, in code that no signal ends.
-
-    Raises:
-        MemoryError: there is none.
     """
     try:
         mmap.mmap(-1, _BLAS).close()
@@ -192,8 +187,7 @@ def require_blas_memory() -> None:
 def random_state_kept() -> Iterator[None]:
     """Restore the global generators of torch (every device), numpy and `random` on exit.
 
-    The code inside may seed them and draw from them. Usable in a `with` statement and as the
-    decorator `@random_state_kept()`.
+    Usable in a `with` statement and as the decorator `@random_state_kept()`.
     """
     import numpy as np  # commands that compute nothing need neither
     import torch
@@ -239,38 +233,30 @@ def progress(
     if not hasattr(tqdm, "_lock"):
         tqdm.set_lock(threading.RLock())  # one between processes would import multiprocessing
     label = _LABEL.get()
+    layout: dict[str, Any] = {"unit_scale": total is None or total >= 100_000, "disable": not shown}
     # Bars of several processes would overwrite each other.
-    layout: dict[str, Any] = {}
     if label or not sys.stderr.isatty():
         tqdm.monitor_interval = 0  # no thread: every update looks at the clock
-        layout = {"delay": FIRST_LINE, "mininterval": NEXT_LINE, "miniters": 1}
+        layout |= {"delay": FIRST_LINE, "mininterval": NEXT_LINE, "miniters": 1}
         layout |= {"ncols": 0, "file": _Lines()}
-    layout["unit_scale"] = total is None or total >= 100_000
-    name = ": ".join(part for part in (label, _PHASE.get(), job) if part)
-    with tqdm(
-        total=total, desc=name, unit=f" {unit}", initial=done, disable=not shown, **layout
-    ) as bar:
+    name = ": ".join(filter(None, (label, _PHASE.get(), job)))
+    with tqdm(total=total, desc=name, unit=f" {unit}", initial=done, **layout) as bar:
         yield bar
 
 
 @contextmanager
-def label_progress(name: str) -> Iterator[None]:
+def label_progress(name: str, label: ContextVar[str] = _LABEL) -> Iterator[None]:
     """Name this job in the progress of all that it does, as one of several at the same time."""
-    token = _LABEL.set(name)
+    token = label.set(name)
     try:
         yield
     finally:
-        _LABEL.reset(token)
+        label.reset(token)
 
 
-@contextmanager
-def phase(doing: str, number: int, of: int) -> Iterator[None]:
+def phase(doing: str, number: int, of: int) -> AbstractContextManager[None]:
     """Name the phase of a long job, e.g. `Fitting the reward model (2 of 5)`, in its progress."""
-    token = _PHASE.set(f"{doing} ({number} of {of})")
-    try:
-        yield
-    finally:
-        _PHASE.reset(token)
+    return label_progress(f"{doing} ({number} of {of})", _PHASE)
 
 
 class _Lines:

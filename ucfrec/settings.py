@@ -12,8 +12,8 @@ import operator
 import reprlib
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from functools import wraps
+from dataclasses import field, fields
+from functools import partial, wraps
 from itertools import pairwise
 from numbers import Real
 from types import NoneType, UnionType
@@ -22,6 +22,7 @@ from typing import (
     Any,
     Final,
     Literal,
+    NamedTuple,
     ParamSpec,
     TypeVar,
     Union,
@@ -32,9 +33,10 @@ from typing import (
 )
 
 import numpy as np
-import pydantic
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
+from pydantic.dataclasses import is_pydantic_dataclass
+from pydantic.fields import FieldInfo
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError
@@ -62,17 +64,12 @@ class SettingError(InputError):
     """A value, or a combination of values, that a table of settings rejects."""
 
     def __init__(self, message: str, *keys: str) -> None:
-        """
-        Args:
-            message: names the field, its value and the allowed values.
-            keys: the rejected fields, as `table.field`.
-        """
+        """`message` names the value and the allowed ones, `keys` the fields, as `table.field`."""
         super().__init__(message)
         self.keys = keys
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """The description of one field of a table."""
 
     key: str
@@ -90,8 +87,8 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     """A decorator that makes a class a frozen dataclass with validated fields.
 
     Ranges are annotated for pydantic (`Annotated[int, Field(ge=1)]`); constraints between fields
-    are checked in `__post_init__`, with `require`. A list is accepted for a tuple.
-    Constructing the class with an invalid value raises `SettingError`.
+    are checked in `__post_init__`, with `require`. Lists become tuples, as TOML and JSON have lists
+    only. Constructing the class with an invalid value raises `SettingError`.
 
     Args:
         name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
@@ -101,34 +98,23 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     def decorate(cls: type[Table]) -> type[Table]:
         table: Any = pydantic_dataclass(frozen=True, config=_CONFIG)(cls)
         build, names = table.__init__, [f.name for f in fields(table)]
-        tuples = {key for key, info in _fields(table).items() if _takes_tuple(info.annotation)}
 
         @wraps(build)
         def check(self: Any, *args: Any, **values: Any) -> None:
             values |= dict(zip(names, args, strict=False))
-            converted = {key: _convert_lists(values[key]) for key in tuples & values.keys()}
             try:
-                build(self, *args[len(names) :], **{**values, **converted})
+                build(self, *args[len(names) :], **_convert_lists(values))
             except ValidationError as error:
                 raise _setting_error(table, name, error, values) from None
 
         table.__init__ = check
-        result: type[Table] = table
-        return result
+        return cast("type[Table]", table)
 
     return decorate
 
 
 def require(holds: bool, message: str, *keys: str) -> None:
-    """Check a constraint between fields, in the `__post_init__` of a table.
-
-    Args:
-        message: names the fields, their values and the allowed values.
-        keys: the fields of the constraint, as `table.field`.
-
-    Raises:
-        SettingError: `holds` is false.
-    """
+    """Raise a `SettingError` of `message` and `keys` if a constraint of fields does not hold."""
     if not holds:
         raise SettingError(message, *keys)
 
@@ -142,12 +128,12 @@ def describe(name: str, table: Any) -> Iterator[Setting]:
         name: of the table, the prefix of the keys.
     """
     meanings: dict[str, str] = {}
-    for base in reversed([base for base in type(table).__mro__ if _fields(base)]):
+    for base in filter(is_table, reversed(type(table).__mro__)):
         meanings |= _read_docstrings(base)
-    for key, info in _fields(type(table)).items():
-        meaning = meanings.get(key, "")
+    for key, info in type(table).__pydantic_fields__.items():
+        meaning = " ".join(meanings.get(key, "").split())
         allowed = _allowed(info.annotation, info.metadata)
-        yield Setting(f"{name}.{key}", getattr(table, key), allowed, " ".join(meaning.split()))
+        yield Setting(f"{name}.{key}", getattr(table, key), allowed, meaning)
 
 
 def _read_docstrings(table: type) -> dict[str, str]:
@@ -163,9 +149,8 @@ def _read_docstrings(table: type) -> dict[str, str]:
     }
 
 
-def is_table(cls: type) -> bool:
-    """Whether `cls` itself is decorated by `settings_table`, not only a base class of it."""
-    return bool(_fields(cls))
+is_table: Final = is_pydantic_dataclass
+"""Whether a class itself is decorated by `settings_table`, not only a base class of it."""
 
 
 def nearest(name: str, names: Sequence[str]) -> str:
@@ -174,23 +159,9 @@ def nearest(name: str, names: Sequence[str]) -> str:
     return f"did you mean {matches[0]!r}?" if matches else f"there are {', '.join(names)}"
 
 
-def _fields(table: type) -> Mapping[str, Any]:
-    """Pydantic's `FieldInfo` of each field; empty for any other class."""
-    if not pydantic.dataclasses.is_pydantic_dataclass(table):
-        return {}
-    infos: Mapping[str, Any] = table.__dict__["__pydantic_fields__"]
-    return infos
-
-
-def _takes_tuple(annotation: Any) -> bool:
-    origin = get_origin(annotation)
-    if origin in (Annotated, Union, UnionType):
-        return any(map(_takes_tuple, get_args(annotation)))
-    return tuple in (origin, annotation)
-
-
 def _convert_lists(value: Any) -> Any:
-    """A list, and lists in it, as tuples, because TOML and JSON have lists only."""
+    if isinstance(value, dict):
+        return {key: _convert_lists(entry) for key, entry in value.items()}
     return tuple(map(_convert_lists, value)) if isinstance(value, list) else value
 
 
@@ -198,7 +169,7 @@ def _setting_error(
     table: Any, name: str, error: ValidationError, values: Mapping[str, Any]
 ) -> SettingError:
     """The first of pydantic's errors, as one line."""
-    first, infos = error.errors(include_url=False)[0], _fields(table)
+    first, infos = error.errors(include_url=False)[0], table.__pydantic_fields__
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, SettingError):
         # Not the same one: it would hold `error`, which holds it, and Python finds no cycles there.
@@ -216,10 +187,8 @@ def _setting_error(
 
 def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     """A type and its range, in words."""
-    if get_origin(annotation) is Annotated:
-        annotation, *more = get_args(annotation)
-        constraints = [c for m in more for c in getattr(m, "metadata", [m])]
-        return _allowed(annotation, [*constraints, *metadata])
+    info = FieldInfo.from_annotation(annotation)
+    annotation, metadata = info.annotation, [*info.metadata, *metadata]
     if get_origin(annotation) in (Union, UnionType):
         kinds = [_allowed(kind, metadata) for kind in get_args(annotation) if kind is not NoneType]
         return f"{' or '.join(kinds)}, or unset"
@@ -235,17 +204,17 @@ def _allowed(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def _range(metadata: Sequence[Any]) -> str:
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     limits = {
-        side: getattr(constraint, side)
+        words[side]: _number(getattr(constraint, side))
         for constraint in metadata
-        for side in ("ge", "gt", "le", "lt")
+        for side in words
         if hasattr(constraint, side)
     }
-    if {"ge", "le"} == limits.keys():
-        return f" from {_number(limits['ge'])} to {_number(limits['le'])}"
-    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    parts = [f"{words[side]} {_number(limit)}" for side, limit in limits.items()]
-    return f" {' and '.join(parts)}" if parts else ""
+    if sorted(limits) == ["at least", "at most"]:
+        return f" from {limits['at least']} to {limits['at most']}"
+    parts = [f" {words} {limit}" for words, limit in limits.items()]
+    return " and".join(parts)
 
 
 def _number(value: float) -> str:
@@ -286,21 +255,12 @@ def require_whole(name: str, value: object, least: int = 1, most: int | None = N
     return whole
 
 
-def require_seed(name: str, value: object) -> int:
-    """The seed that `value` is: a whole number from 0 to `LARGEST_SEED`.
-
-    Raises:
-        InputError: it is something else.
-    """
-    return require_whole(name, value, 0, LARGEST_SEED)
+require_seed: Final = partial(require_whole, least=0, most=LARGEST_SEED)
+"""`require_whole` for seeds."""
 
 
 def require_number(name: str, value: object) -> float:
-    """The number that `value` is.
-
-    Raises:
-        InputError: it is not a number, or not finite.
-    """
+    """The finite number that `value` is; an `InputError` if it is none."""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise InputError(f"{name} is {shown(value)}; give a finite number")
     return float(value)
@@ -309,11 +269,8 @@ def require_number(name: str, value: object) -> float:
 def require_ids(name: str, value: object, of: str) -> Array:
     """The identifiers (N,) of a list, a series, an array, a set or an iterator, at least one.
 
-    Args:
-        of: what they are, e.g. "user_id".
-
     Raises:
-        InputError: `value` is something else, is empty, or holds lists.
+        InputError: `value` is something else, is empty, or holds lists; `of` is e.g. "user_id".
     """
     if not _is_list(value) or getattr(value, "ndim", 1) != 1:
         raise InputError(f"{name} is {shown(value)}; give a list of {of}s")
@@ -328,11 +285,7 @@ def _is_list(value: object) -> bool:
 
 
 def require_kind(what: str, *kinds: Any) -> Check:
-    """A check that a value is of one of some types.
-
-    Args:
-        what: the remedy, after "give".
-    """
+    """A check that a value is of one of some types; `what` is the remedy, after "give"."""
 
     def check(name: str, value: Any) -> Any:
         if not isinstance(value, kinds):
@@ -343,14 +296,10 @@ def require_kind(what: str, *kinds: Any) -> Check:
 
 
 def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -> list[_Value]:
-    """The values of an argument that is one of them, or any number.
-
-    Args:
-        what: one of them in words, e.g. "a Recommender".
-        kinds: types that they may have.
+    """The values of an argument that is one of `kinds`, or any number of them.
 
     Raises:
-        InputError: one has another type.
+        InputError: one has another type; `what` is one of them in words, e.g. "a Recommender".
     """
     alone = isinstance(argument, kinds) or not _is_list(argument)
     values = [argument] if alone else list(cast("Iterable[object]", argument))
@@ -363,13 +312,7 @@ def require_list(name: str, argument: object, what: str, *kinds: type[_Value]) -
 def check_arguments(
     checks: Mapping[str, Check],
 ) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
-    """A decorator that checks arguments by their names, before anything else happens.
-
-    None is not checked where it is the default.
-
-    Args:
-        checks: name of an argument to its check.
-    """
+    """A decorator that checks arguments by their names; None is not, where it is the default."""
 
     def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         signature = inspect.signature(function)
@@ -381,9 +324,8 @@ def check_arguments(
             except TypeError:
                 return function(*args, **keywords)  # raises the same with the function's name
             for name, value in bound.arguments.items():
-                if name in checks and not (
-                    value is None and signature.parameters[name].default is None
-                ):
+                is_default = value is None and signature.parameters[name].default is None
+                if name in checks and not is_default:
                     bound.arguments[name] = checks[name](name, value)
             return function(*bound.args, **bound.kwargs)
 

@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
@@ -29,17 +30,17 @@ def test_ids_come_back(tmp_path: Path) -> None:
 
 
 def test_a_pipe_is_refused_and_not_read(tmp_path: Path) -> None:
-    for name in ("items.parquet", "items.csv", "items.npy"):
-        os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=r"items\.parquet is not a regular file"):
-        read_ids(tmp_path / "items.parquet", "item_id")
-    for name in ("items.parquet", "items.csv"):
-        with pytest.raises(InputError, match="is not a regular file"):
-            read_features(tmp_path / name)
     env = gymnasium.make("CartPole-v1")
-    for name in ("items.parquet", "items.npy"):
-        with pytest.raises(InputError, match="is not a regular file"):
-            item_table(str(tmp_path / name), env, 2)
+    readers: dict[str, list[Callable[[Path], object]]] = {
+        "items.parquet": [lambda p: read_ids(p, "item_id"), read_features],
+        "items.csv": [read_features],
+        "items.npy": [lambda p: item_table(str(p), env, 2)],
+    }
+    for name, calls in readers.items():
+        os.mkfifo(tmp_path / name)
+        for call in calls:
+            with pytest.raises(InputError, match=f"{name} is not a regular file"):
+                call(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -11,23 +11,26 @@ import pytest
 from tests.support.records import Example
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json
-from ucfrec.files.record import Sealed
 
 
 @pytest.fixture
 def sealed(tmp_path: Path) -> Path:
-    """A folder with two files and their record."""
-    for name in ("a", "b"):
-        (tmp_path / name).write_text(name)
-    Example(files={}, version=1, numbers=(0.5,)).seal(tmp_path)
-    return tmp_path
+    """A folder with three files and their record."""
+    folder = tmp_path / "sealed"
+    (folder / "inner").mkdir(parents=True)
+    for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(30_000))):
+        (folder / name).write_bytes(content)
+    Example(files={}, version=1, numbers=(0.5, float("nan"))).seal(folder)
+    return folder
 
 
-def test_absent_entries_are_left_out(sealed: Path) -> None:
-    written = read_json(sealed / "record.json")
-    assert written["numbers"] == [0.5]
+def test_what_was_sealed_comes_back_and_holds(sealed: Path) -> None:
+    written, record = read_json(sealed / "record.json"), Example.read(sealed)
+    assert written["numbers"] == [0.5, None]
     assert "note" not in written
-    assert Example.read(sealed).note is None
+    assert (record.version, record.note, {*record.files}) == (1, None, {"a", "b", "inner/c"})
+    assert list(record.checksums(sealed).faults()) == []
+    record.checksums(sealed).require()
 
 
 def test_sealing_again_signs_off_no_damage(sealed: Path) -> None:
@@ -65,44 +68,19 @@ def test_damage_is_one_line(sealed: Path, changes: dict[str, Any], says: str) ->
 def test_what_is_no_record_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not an example: it has no record"):
         Example.read(tmp_path)
-    (tmp_path / "record.json").write_text("[]")
-    with pytest.raises(InputError, match="it is not a JSON object; make it again"):
-        Example.read(tmp_path)
-    (tmp_path / "record.json").write_text("{}")
-    with pytest.raises(InputError, match=r"record\.json has no files; make it again"):
-        Example.read(tmp_path)
+    for content, says in (("[]", "it is not a JSON object"), ("{}", r"record\.json has no files")):
+        (tmp_path / "record.json").write_text(content)
+        with pytest.raises(InputError, match=f"{says}; make it again"):
+            Example.read(tmp_path)
 
 
-@pytest.fixture
-def three_files(tmp_path: Path) -> Path:
-    """A folder with three files and their record."""
-    folder = tmp_path / "sealed"
-    (folder / "inner").mkdir(parents=True)
-    for name, content in (("a", b""), ("b", b"words"), ("inner/c", bytes(30_000))):
-        (folder / name).write_bytes(content)
-    Example(files={}, version=1, numbers=(0.1, float("nan"))).seal(folder)
-    return folder
-
-
-def read(folder: Path) -> Sealed:
-    return Example.read(folder).checksums(folder)
-
-
-def test_what_was_sealed_comes_back_and_holds(three_files: Path) -> None:
-    record, files = Example.read(three_files), read(three_files)
-    assert record.version == 1
-    assert set(record.files) == {"a", "b", "inner/c"}
-    assert list(files.faults()) == []
-    files.require_small()
-
-
-def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_path: Path) -> None:
-    generator, before = random.Random(0), Example.read(three_files)
+def test_every_flipped_bit_is_found_or_changes_nothing(sealed: Path, tmp_path: Path) -> None:
+    generator, before = random.Random(0), Example.read(sealed)
     found = 0
     for number in range(90):
         copy = tmp_path / "copy"
         shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(three_files, copy)
+        shutil.copytree(sealed, copy)
         path = copy / ("record.json", "b", "inner/c")[number % 3]
         content = bytearray(path.read_bytes())
         content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
@@ -121,19 +99,20 @@ def test_every_flipped_bit_is_found_or_changes_nothing(three_files: Path, tmp_pa
     assert found > 80
 
 
-def test_each_kind_of_fault_is_named(three_files: Path) -> None:
-    (three_files / "a").unlink()
-    (three_files / "a").mkdir()
-    (three_files / "b").write_bytes(b"word")
-    (three_files / "inner" / "c").write_bytes(bytes(30_001))
-    (three_files / "foreign").write_bytes(b"")
-    files = read(three_files)
-    faults = dict(files.faults())
-    assert faults["b"] == "is truncated: 4 of 5 bytes"
-    assert faults["inner/c"] == "is grown: 30,001 of 30,000 bytes"
-    assert "a" in faults
+def test_each_kind_of_fault_is_named(sealed: Path) -> None:
+    (sealed / "a").unlink()
+    (sealed / "a").mkdir()
+    (sealed / "b").write_bytes(b"word")
+    (sealed / "inner" / "c").write_bytes(bytes(30_001))
+    (sealed / "foreign").write_bytes(b"")
+    files = Example.read(sealed).checksums(sealed)
+    assert dict(files.faults()) == {
+        "a": "is not a regular file",
+        "b": "is truncated: 4 of 5 bytes",
+        "inner/c": "is grown: 30,001 of 30,000 bytes",
+    }
     assert files.strangers() == ["foreign", "record.json"]
     with pytest.raises(InputError, match="restore the file, or make it again"):
-        files.require_sizes()
-    (three_files / "b").unlink()
+        files.require(small=-1)
+    (sealed / "b").unlink()
     assert dict(files.faults())["b"] == "is missing"

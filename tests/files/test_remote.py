@@ -60,6 +60,12 @@ def place(request: pytest.FixtureRequest) -> str:
     return f"memory://{name}"
 
 
+def refused(uri: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):  # noqa: SIM117
+        with local_paths(argparse.Namespace(logs=[Input(uri)])):
+            raise AssertionError("the block must not run")
+
+
 def put(file: Path, uri: str) -> None:
     with local_paths(argparse.Namespace(out=Output(uri))) as options:
         options.out.write_bytes(file.read_bytes())
@@ -102,9 +108,7 @@ def test_errors_name_the_place_and_write_nothing(
     assert f"{place}/bad.parquet cannot be read" in message
     assert main(["prepare", f"{place}/none/x.parquet", "--validate"]) == 2
     assert f"{place}/none/x.parquet" in capsys.readouterr().err
-    with pytest.raises(InputError, match=r"has no file|cannot be used"):  # noqa: SIM117
-        with local_paths(argparse.Namespace(store=Input(f"{place}/store"))):
-            pass
+    refused(f"{place}/store", r"has no file|cannot be used")
 
 
 def test_sizes_are_checked_before_anything_is_copied(
@@ -112,9 +116,7 @@ def test_sizes_are_checked_before_anything_is_copied(
 ) -> None:
     put(write_log(tmp_path / "log.parquet"), f"{place}/log.parquet")
     monkeypatch.setattr("shutil.disk_usage", lambda _: argparse.Namespace(free=1000))
-    with pytest.raises(InputError, match=r"more than the 1,000 that are free"):  # noqa: SIM117
-        with local_paths(argparse.Namespace(logs=[Input(f"{place}/log.parquet")])):
-            pass
+    refused(f"{place}/log.parquet", r"more than the 1,000 that are free")
 
 
 def test_only_the_command_line_names_places(tmp_path: Path, place: str) -> None:
@@ -143,9 +145,7 @@ def test_a_name_that_would_lead_out_of_the_folder_is_refused(tmp_path: Path, nam
     system, folder = _open("memory://names-that-lead-out")
     with system.open(f"{folder}/{name}", "wb") as out:
         out.write(b"1")
-    with pytest.raises(InputError, match="has a file named"):  # noqa: SIM117
-        with local_paths(argparse.Namespace(log=Input("memory://names-that-lead-out"))):
-            raise AssertionError("the block must not run")
+    refused("memory://names-that-lead-out", "has a file named")
     system.rm(folder, recursive=True)
 
 
@@ -157,6 +157,4 @@ def test_a_file_that_changes_meanwhile_is_an_error(
     found = system.find("/changing", detail=True)
     grown = {name: {**about, "size": about["size"] + 1} for name, about in found.items()}
     monkeypatch.setattr(type(system), "find", lambda *_, **__: grown)
-    with pytest.raises(InputError, match="changed while it was read"):  # noqa: SIM117
-        with local_paths(argparse.Namespace(log=Input("memory://changing/log.parquet"))):
-            raise AssertionError("the block must not run")
+    refused("memory://changing/log.parquet", "changed while it was read")

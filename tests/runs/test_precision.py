@@ -8,10 +8,12 @@ import torch
 
 from tests.support.tagged import tagged_store
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.fitting.checkpoint import load_tensors, read_metrics
+from ucfrec.fitting.checkpoint import load_tensors
+from ucfrec.fitting.metrics import read_metrics
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.runs.config import resolve_config
-from ucfrec.runs.start import fit_policy, new_policy, training_views
+from ucfrec.runs.policy_fit import fit_policy
+from ucfrec.runs.start import new_policy, training_views
 
 SETTINGS = [
     "train.steps=16", "train.validate_every=4", "train.batch_size=16", "train.warmup_steps=2",

@@ -17,7 +17,6 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import read_json, write_json
 from ucfrec.runs.record import RunRecord, read_record
-from ucfrec.runs.trained_policy import TrainedPolicy
 
 OPTIONAL = {"reference_losses", "augmentation", "policy", "reward_model", "rule"}
 """Entries of stages that may not have ended."""
@@ -75,11 +74,7 @@ def test_every_entry_is_checked(folder: Path, tmp_path: Path, kind: str) -> None
     [
         (("session_gap_ms",), DAMAGE["missing"], "run.json has no session_gap_ms; train it again"),
         (("session_gap_ms",), "soon", "its session_gap_ms is 'soon'; train it again"),
-        (
-            ("config", "policy_name"),
-            "no such",
-            "trained with policy 'no such' (of an unknown package)",
-        ),
+        (("config", "policy_name"), "no such", "policy 'no such' (of an unknown package)"),
         (("config", "seed"), "x", "seed is 'x'"),
         (("config", "train", "steps"), "many", "train.steps is 'many'"),
         (("sizes", "state"), -1, "its sizes.state is -1"),
@@ -124,7 +119,3 @@ def test_no_value_gives_another_error(folder: Path, data: st.DataObject, value: 
     damaged(copy / "run.json", record, path, value)
     with suppress(InputError):
         RunRecord.read(copy).describe()
-
-
-def test_the_policy_is_read_with_its_record(folder: Path) -> None:
-    assert TrainedPolicy.load(folder / "run").record == read_record(folder / "run")

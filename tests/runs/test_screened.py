@@ -1,6 +1,7 @@
 """Training without columns that cause nothing is training without them, also when acting."""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from ucfrec.files.atomic import read_json
 from ucfrec.fitting.checkpoint import load_tensors
 from ucfrec.runs import screened
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.record import RunRecord
 from ucfrec.runs.refit import refit
 from ucfrec.runs.run import SharedStages
 from ucfrec.runs.screened import train_screened
@@ -58,12 +60,10 @@ def test_what_is_dropped_might_never_have_been_logged(items: bool, tmp_path: Pat
     assert record.dropped_observations == FLAGGED
     assert record.sizes == plain.sizes
     for name in ("augmented", "policy/last", "policy/best"):
-        one, other = (
-            load_tensors(tmp_path / run / f"{name}.safetensors")[0] for run in ("dropped", "plain")
-        )
+        files = (tmp_path / run / f"{name}.safetensors" for run in ("dropped", "plain"))
+        one, other = (load_tensors(file)[0] for file in files)
         assert one.keys() == other.keys()
-        for key, value in one.items():
-            assert torch.equal(value, other[key]), (name, key)
+        assert all(torch.equal(value, other[key]) for key, value in one.items()), name
     # The actor is shown everything that was logged, and sees what is left.
     seen = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)
     numbers = np.arange(8) if items else None
@@ -89,14 +89,6 @@ def test_a_run_goes_on_as_it_was_started_and_is_refitted_so(tmp_path: Path) -> N
     assert TrainedPolicy.load(tmp_path / "whole").dropped == FLAGGED
 
 
-def test_copies_intervene_on_the_flagged_columns_of_states_of_items(tmp_path: Path) -> None:
-    store = planted_items(tmp_path / "store", 30, 8)
-    config = resolve_config("dt", None, SETTINGS)
-    record = train_screened(store, tmp_path / "run", config, "copies")
-    assert not record.dropped_observations
-    assert record.sizes["state"] == store.state_size
-
-
 def test_runs_that_share_stages_are_screened_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,26 +99,17 @@ def test_runs_that_share_stages_are_screened_once(
         return verdicts(FLAGGED)(store, seed)
 
     monkeypatch.setattr(screened, "screen_store", screen)
-    stores = [
-        planted_items(tmp_path / name, sessions, 8) for name, sessions in (("a", 30), ("b", 31))
-    ]
-    shared = SharedStages(tmp_path / "stages")
-    records = [
-        train_screened(
-            store,
-            tmp_path / f"{store.path.name}-{how}-{seed}",
-            resolve_config("bc", None, SETTINGS, seed),
-            how,
-            shared=shared,
-        ).screening
-        for store in stores
-        for how in ("copies", "drop")
-        for seed in (0, 1)
-    ]
+    stores = [planted_items(tmp_path / str(n), n, 8) for n in (30, 31)]
+    shared, found = SharedStages(tmp_path / "stages"), []
+    for store, how, seed in product(stores, ("copies", "drop"), (0, 1)):
+        config = resolve_config("bc", None, SETTINGS, seed)
+        out = tmp_path / f"{store.path.name}-{how}-{seed}"
+        found.append(train_screened(store, out, config, how, shared=shared).screening)
     assert screened_stores == [(store.path, 0) for store in stores]
-    found = [screening for screening in records if screening is not None]
-    assert [each.how for each in found[:3]] == ["copies", "copies", "drop"]
-    assert found[0].dimensions == found[1].dimensions == found[2].dimensions
+    assert [each and each.how for each in found[:3]] == ["copies", "copies", "drop"]
+    assert found[0] == found[1]
+    record = RunRecord.read(tmp_path / "30-copies-0")
+    assert (record.dropped_observations, record.sizes["state"]) == ((), stores[0].state_size)
 
 
 def test_screening_that_leaves_no_state_is_refused(

@@ -23,12 +23,14 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import load_tensors, read_metrics
+from ucfrec.fitting.checkpoint import load_tensors
+from ucfrec.fitting.metrics import read_metrics
 from ucfrec.logs.append import append_logs
 from ucfrec.runs.config import resolve_config
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.run import train_run
-from ucfrec.runs.start import fit_policy, new_policy, start_warm, warm_settings
+from ucfrec.runs.start import new_policy, start_warm
 
 LOGGED = {"action_loss", "validation_loss"}
 SETTINGS = ["train.steps=150", "train.validate_every=150", "policy.dim=16", "policy.context=4"]
@@ -114,18 +116,6 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
     assert torch.equal(counts, fresh["head.counts"])
 
 
-def test_warm_settings_are_a_share_of_the_whole() -> None:
-    config = resolve_config("ucf", None, ["train.steps=800"])
-    warm = warm_settings(config)
-    assert warm.train.steps == 50
-    assert warm.train.warmup_steps == 5
-    assert warm.train.validate_every == 50
-    assert warm.crm.epochs == 1
-    assert warm.policy == config.policy
-    assert warm_settings(config, 1.0).train.steps == 800
-
-
-ROOT = Path(__file__).parents[2]
 TOGETHER = [
     "train.steps=12", "train.validate_every=4", "train.batch_size=9", "train.warmup_steps=2",
     "train.learning_rate=0.01", "policy.dim=8", "policy.context=3", "policy.dropout=0.0",
@@ -162,13 +152,10 @@ def same(found: Path, expected: Path) -> None:
     for name in ("loss", "validation_loss", "action_loss", "value_loss", "gradient_norm"):
         assert curves[name] == pytest.approx(others[name], rel=1e-4)
     for name in ("best", "last"):
-        (one, about), (other, said) = (
-            load_tensors(run / "policy" / f"{name}.safetensors") for run in (found, expected)
-        )
-        assert {key: each.shape for key, each in one.items()} == {
-            key: each.shape for key, each in other.items()
-        }
-        assert about["step"] == said["step"]
+        read = [load_tensors(run / "policy" / f"{name}.safetensors") for run in (found, expected)]
+        shapes = [{key: each.shape for key, each in tensors.items()} for tensors, _ in read]
+        assert shapes[0] == shapes[1]
+        assert read[0][1]["step"] == read[1][1]["step"]
 
 
 def test_two_processes_give_the_curve_of_one(store: Path, tmp_path: Path) -> None:
@@ -192,10 +179,9 @@ def started(store: Path, run: Path, *more: str) -> "subprocess.CompletedProcess[
         *("--master-port", "0", "--rdzv-backend", "c10d", "--rdzv-endpoint", "127.0.0.1:0"),
         *("-m", "ucfrec", "train", str(store), "--out", str(run), "--threads", "1", *more),
     ]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=300
-    )
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
 
 
 @pytest.mark.slow
@@ -221,9 +207,8 @@ def test_new_episodes_are_half_of_every_batch(tmp_path: Path) -> None:
     columns = {"item": item.astype(np.int32), "reward": rng.random(n).astype(np.float32)}
     states = ItemStates(torch.randn(4, 3), torch.zeros(0, 0), 0.0, 1.0)
     store = EpisodeStore.from_arrays(columns, np.full(n // 4, 4), None, states)
-    config = resolve_config(
-        "bc", None, ["train.steps=60", "train.learning_rate=0.01", "train.warmup_steps=0"]
-    )
+    settings = ["train.steps=60", "train.learning_rate=0.01", "train.warmup_steps=0"]
+    config = resolve_config("bc", None, settings)
     shares = []
     for newest in (None, np.arange(n // 4 - new // 4, n // 4)):
         policy = new_policy(store, config)

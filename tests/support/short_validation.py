@@ -5,11 +5,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from ucfrec.runs import start
+from ucfrec.runs import policy_fit
 
 BATCHES = 3
 """Of windows; two processes divide them unevenly."""
-ALL_BATCHES = start._VALIDATION_BATCHES
+ALL_BATCHES = policy_fit._VALIDATION_BATCHES
 """Where a command runs in another process, which validates on all of them."""
 
 
@@ -17,5 +17,5 @@ ALL_BATCHES = start._VALIDATION_BATCHES
 def short_validation(batches: int = BATCHES) -> Iterator[None]:
     """Validate on this many batches in the block."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(start, "_VALIDATION_BATCHES", batches)
+        patch.setattr(policy_fit, "_VALIDATION_BATCHES", batches)
         yield

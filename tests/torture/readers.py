@@ -304,7 +304,8 @@ def _mutate_bytes(generator: random.Random, content: bytes) -> bytes:
 def list_readers(inputs: Inputs) -> list[Reader]:
     """The readers of every kind of file."""
     from ucfrec.files.parquet import read_ids
-    from ucfrec.fitting.checkpoint import load_tensors, read_metrics
+    from ucfrec.fitting.checkpoint import load_tensors
+    from ucfrec.fitting.metrics import read_metrics
     from ucfrec.logs.mapping import read_mapping
     from ucfrec.logs.prepare import validate
     from ucfrec.reporting.page import write_report
@@ -402,7 +403,7 @@ def read_store(path: Path) -> list[Any]:
     columns = [store.step_values(name, *store.all_steps()) for name in store.record.columns]
     episodes = [store.episode_values(name) for name in schema.EPISODE_DTYPES]
     states = store.item_states
-    store.record.checksums(path).require_small()
+    store.record.checksums(path).require()
     ids = [read_ids(path / f"{name}.parquet", f"{name[:-1]}_id") for name in ("users", "items")]
     used = ("n_steps", "n_episodes", "reward", "fingerprint", "source", "splits")
     meta = {name: getattr(store.record, name) for name in used}
@@ -411,7 +412,7 @@ def read_store(path: Path) -> list[Any]:
 
 def read_run(path: Path) -> list[Any]:
     """All that ucfrec reads of a run."""
-    from ucfrec.fitting.checkpoint import read_metrics
+    from ucfrec.fitting.metrics import read_metrics
     from ucfrec.runs.trained_policy import TrainedPolicy
 
     parts: list[Any] = []

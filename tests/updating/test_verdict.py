@@ -13,6 +13,7 @@ from tests.support.served import trained_run
 from tests.support.tagged import ITEMS
 from ucfrec import Recommender
 from ucfrec.acting.decision import DecisionRule
+from ucfrec.arrays import Array
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.logs.append import append_logs
 from ucfrec.runs.record import UpdateVerdict
@@ -21,7 +22,6 @@ from ucfrec.updating.verdict import (
     _doubt,
     compare_runs,
     describe,
-    describe_drift,
     popularity_index,
     restrict_to_run,
     reward_index,
@@ -80,24 +80,26 @@ def test_a_run_is_level_with_itself(trained: TrainedPolicy) -> None:
     assert all(each.value == 0 for each in found.differences)
 
 
-def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
+def rows_of(trained: TrainedPolicy, propensities: Array | None) -> EpisodeStore:
+    """The test rows with other propensities, or none."""
     store = EpisodeStore.open(trained.folder.parent / "store").split("test")
-    places = store.all_steps()
-    steps = {n: store.step_values(n, *places) for n in ("item", "reward", "timestamp")}
+    steps = {name: store.column(name) for name in ("item", "reward", "timestamp")}
+    if propensities is not None:
+        steps["propensity"] = propensities
     episodes = {n: store.episode_values(n) for n in ("user", "terminated")}
-    bare = EpisodeStore.from_arrays(steps, store.lengths, episodes, trained.item_states)
+    return EpisodeStore.from_arrays(steps, store.lengths, episodes, trained.item_states)
+
+
+def test_without_propensities_the_ranking_decides(trained: TrainedPolicy) -> None:
+    bare = rows_of(trained, None)
     found = verdict(trained, reversed_of(trained), bare)
     assert (found.result, found.decided_by) == ("better", "ndcg_liked")
     assert len(found.differences) == 1
 
 
 def test_wrong_propensities_are_doubted(trained: TrainedPolicy) -> None:
-    store = EpisodeStore.open(trained.folder.parent / "store").split("test")
-    places = store.all_steps()
-    steps = {n: store.step_values(n, *places) for n in store.record.columns}
-    steps["propensity"] = steps["propensity"] * 5
-    episodes = {n: store.episode_values(n) for n in ("user", "terminated")}
-    wrong = EpisodeStore.from_arrays(steps, store.lengths, episodes, trained.item_states)
+    steps = EpisodeStore.open(trained.folder.parent / "store").split("test").n_steps
+    wrong = rows_of(trained, np.full(steps, 5 / LOGGED_ITEMS, dtype=np.float32))
     rule = DecisionRule(trained.rule.target, temperature=0.3)
     found = verdict(replace(trained, rule=rule), replace(trained, rule=rule), wrong)
     assert (found.result, found.decided_by) == ("no significant difference", "reward per step")
@@ -167,13 +169,6 @@ def test_rewards_of_two_values_and_of_many_are_compared() -> None:
     prices = rng.lognormal(size=(2, 5000))
     assert reward_index(*prices) < 0.02
     assert reward_index(prices[0], 3 * prices[1]) > 0.25
-
-
-def test_drift_is_described_with_and_without_a_reward_model() -> None:
-    found = {"unknown_items": 0.1, "unknown_users": 0.5, "item_popularity": 0.3, "rewards": 0.01}
-    assert "10.0% of the new rows have new items, 50.0% new users" in describe_drift(found)
-    model = {"predicted": 0.2, "observed": 0.3, "calibration_error": 0.1, "slope": 0.9}
-    assert "predicts 0.2, observed 0.3" in describe_drift(found | model)
 
 
 def test_unknown_items_and_users_have_no_number(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ class LogOptions(Table):
         if self.mapping is not None:
             mapping = mapping.over(read_mapping(self.mapping))
         if trained is not None and self.dataset is None:
-            from ucfrec.runs.trained_policy import later_logs
+            from ucfrec.runs.later_logs import later_logs
 
             files, mapping = later_logs(trained, logs, mapping)
         else:

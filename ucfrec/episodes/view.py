@@ -110,7 +110,7 @@ class Columns:
             InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
         columns = cls(path, StoreRecord.read(path))
-        columns._sealed.require_sizes()
+        columns._sealed.require(small=-1)
         return columns
 
     @classmethod

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.files.parquet import require_regular
+from ucfrec.files.atomic import require_file
 from ucfrec.schema import ITEM_ID, USER_IDS
 
 REWARD: Final = "reward"
@@ -219,7 +219,7 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
             that are not finite.
     """
     if source.endswith((".parquet", ".npy")):
-        require_regular(Path(source))
+        require_file(Path(source), "name another file")
     try:
         if source.endswith(".parquet"):
             return _order_rows(pq.read_table(source), source, n_items)

@@ -7,7 +7,6 @@ scratch is dead, and removes it.
 """
 
 import json
-import math
 import os
 import secrets
 import shutil
@@ -29,8 +28,7 @@ SCRATCH: Final = ".ucfrec-partial"
 _CHECKSUM: Final = "checksum"
 """Entry of a JSON object with the checksum of its other entries."""
 _PATIENCE: Final = 0.5
-"""Seconds before a claim is given up: another process may just be checking whether its owner is
-dead."""
+"""Seconds before a claim is given up: another process may just be removing a dead one."""
 _FOREVER: Final = -1.0
 _COMMAND_LENGTH: Final = 160
 _LARGEST_JSON: Final = 2**30
@@ -43,8 +41,6 @@ _held: set[tuple[int, Path]] = set()
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a scratch folder next to `path` that is renamed to `path` when the block succeeds.
-
-    If the block raises, the scratch folder is removed and `path` is not created.
 
     Raises:
         InputError: `path` exists already, or another process is writing it.
@@ -66,8 +62,7 @@ def _require_absent(path: Path) -> None:
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
 
-    If the block raises, the scratch file is removed and `path` keeps its old content. Of two
-    processes that write one file, the second waits for the first.
+    Of two processes that write one file, the second waits for the first.
 
     Raises:
         InputError: `path` is a folder.
@@ -93,10 +88,7 @@ def _scratch_moved(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
-    """Yield a new folder for scratch in `parent` that no other user can read; removed at the end.
-
-    If this process is killed, the next one that calls this or `remove_leftovers` removes it.
-    """
+    """Yield a new folder in `parent` that no other user can read; removed at the end."""
     path = parent / f"{name}-{secrets.token_hex(8)}"
     with lock_path(path):
         remove_leftovers(parent)
@@ -114,11 +106,7 @@ def scratch_of(path: Path) -> Path:
 
 
 def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that files to write are none of those to read, and differ from each other.
-
-    Raises:
-        InputError: one would replace another.
-    """
+    """Check that files to write are none of those to read, and differ from each other."""
     taken = {path.resolve() for path in inputs}
     for path in written:
         if path.resolve() in taken:
@@ -128,14 +116,9 @@ def require_other_files(written: Iterable[Path], inputs: Iterable[Path]) -> None
 
 @contextmanager
 def claim(path: Path, wait: bool = False) -> Iterator[bool]:
-    """Try to hold the claim on `path`; a process that holds it already holds it again.
+    """Try to hold the claim on `path`, which need not exist, or `wait` until it is free.
 
-    Args:
-        path: need not exist; its folder is made if missing.
-        wait: wait until the claim is free, instead of giving up.
-
-    Yields:
-        Whether the claim is held; always true if `wait` is.
+    A process that holds it already holds it again. Yields whether the claim is held.
     """
     key = (os.getpid(), path.parent.resolve() / path.name)
     if key in _held:
@@ -160,38 +143,30 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
 
 @contextmanager
 def lock_path(path: Path, use: str = "written", part: str = "") -> Iterator[None]:
-    """Hold the claim on `path`, or say who does.
-
-    Args:
-        path: see `claim`.
-        use: what the holder of the claim does with the path, for the message.
-        part: claim this use of the path only; the path itself can be claimed by others.
+    """Hold the claim on `path`, or on this `part` of its use only.
 
     Raises:
-        InputError: another process holds it; the message names that process.
+        InputError: another process holds it; the message names that process, and the `use` that it
+            makes of the path.
     """
     part_path = path.with_name(f"{path.name}.{part}") if part else path
     with claim(part_path) as held:
         if held:
             yield
             return
-        words = b""
+        holder = "another process"
         with suppress(OSError), _lock_of(part_path).open("rb") as content:
-            content.seek(1)
-            words = content.read(1024)
-        stated = words.startswith(b"process ")
-        holder = words.decode(errors="replace") if stated else "another process"
+            words = content.read(1024)[1:]
+            if words.startswith(b"process "):
+                holder = words.decode(errors="replace")
         raise InputError(
             f"{path} is being {use} by {holder}; wait for it to end, or name another path"
         )
 
 
 def remove_leftovers(folder: Path, within: bool = False) -> None:
-    """Remove the scratch and locks of processes that were killed while they wrote in `folder`.
-
-    Args:
-        within: and in every folder inside.
-    """
+    """Remove the scratch and locks of processes that were killed while they wrote in `folder`,
+    and `within`, in every folder inside."""
     for file in [*folder.glob(f"{'**/' * within}.?*{LOCK}")]:
         path = file.with_name(file.name[1 : -len(LOCK)])
         if (os.getpid(), path.parent.resolve() / path.name) in _held:
@@ -249,23 +224,12 @@ def json_text(value: Any, **layout: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, **layout)
     except ValueError:
-        return json.dumps(_finite(value), allow_nan=False, **layout)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
+        return json.dumps(finite, allow_nan=False, **layout)
 
 
 def write_json(path: Path, value: Mapping[str, Any] | list[Any], seal: bool = False) -> None:
-    """Write `value` as indented JSON, atomically; see `json_text`.
-
-    Args:
-        seal: add the checksum of an object as its entry `checksum`.
-    """
+    """Write `value` as indented JSON, atomically; an object to `seal` gets an entry `checksum`."""
     if seal and isinstance(value, Mapping):
         value = {**value, _CHECKSUM: _content_checksum(value)}
     with atomic_file(path) as scratch:
@@ -290,22 +254,27 @@ def read_json(path: Path) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file of at most 16 MiB.
-
-    Raises:
-        InputError: the file is missing, cannot be read, or is not TOML.
-    """
+    """Read a TOML file; errors as of `read_json`."""
     import tomllib  # only a few commands read TOML
 
     value: dict[str, Any] = _parse(path, _LARGEST_TOML, "TOML", tomllib.loads)
     return value
 
 
-def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
-    """Read a text file of at most so many bytes; a pipe or a device might never end."""
+def require_file(path: Path, remedy: str) -> None:
+    """Check that a file is there, and no pipe or device, reading which might never end.
+
+    Raises:
+        InputError: it is not; the message ends with `remedy`.
+    """
     if not path.is_file():
         what = "is not a regular file" if path.exists() else "does not exist"
-        raise InputError(f"{path} {what}; check the path")
+        raise InputError(f"{path} {what}; {remedy}")
+
+
+def _parse(path: Path, largest: int, kind: str, parse: Callable[[str], Any]) -> Any:
+    """Read a text file of at most so many bytes."""
+    require_file(path, "check the path")
     if path.stat().st_size > largest:
         raise InputError(f"{path} has more than {largest:,} bytes; name another file")
     try:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError, one_line
-from ucfrec.files.atomic import atomic_file
+from ucfrec.files.atomic import atomic_file, require_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,6 +24,7 @@ _RATIO: Final = 100
 _DEFLATE: Final = 1032
 """Most bytes to which gzip can unfold one."""
 _BLOCK: Final = 2**20
+_REMEDY: Final = "restore it, or make the store or run again"
 _NO_THREAD: Final = "Failed to launch worker thread"
 """How Arrow says that there is no memory for the stack of a thread."""
 
@@ -48,10 +49,7 @@ def require_plausible_rows(path: Path, rows: int) -> None:
 def require_plausible_size(path: Path) -> None:
     """Check that a gzip file does not unfold to fill the disk, by unfolding it without writing.
 
-    Files that are small enough for any content are not read.
-
-    Args:
-        path: of the file; damage to it is left for its reader to find.
+    Files that are small enough for any content are not read; damage is left for the reader to find.
 
     Raises:
         InputError: it unfolds to over 256 MiB, and to over a hundred times its size.
@@ -73,16 +71,6 @@ def require_plausible_size(path: Path) -> None:
         )
 
 
-def require_regular(path: Path) -> None:
-    """Check that a file is not a pipe or device, reading which might never end; it may be missing.
-
-    Raises:
-        InputError: it is one.
-    """
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path} is not a regular file; name or restore the file")
-
-
 def read_ids(path: Path, column: str) -> Array:
     """The ids in a column of a Parquet file, (n,) int64 or text.
 
@@ -93,9 +81,7 @@ def read_ids(path: Path, column: str) -> Array:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    if not path.is_file():
-        what = "is not a regular file" if path.exists() else "does not exist"
-        raise InputError(f"{path} {what}; restore it, or make the store or run again")
+    require_file(path, _REMEDY)
     try:
         with pq.ParquetFile(path) as file:
             require_plausible_rows(path, file.metadata.num_rows)
@@ -105,30 +91,22 @@ def read_ids(path: Path, column: str) -> Array:
     except (pa.ArrowException, OSError, KeyError, ValueError, OverflowError) as error:
         if _NO_THREAD in str(error):
             raise MemoryError(str(error)) from None
-        raise InputError(
-            f"{path} is damaged or has no column {column!r} ({one_line(str(error)):.200}); restore "
-            "it, or make the store or run again"
-        ) from None
+        what = f"is damaged or has no column {column!r} ({one_line(str(error)):.200})"
+        raise InputError(f"{path} {what}; {_REMEDY}") from None
     integers = pa.types.is_integer(ids.type)
     texts = pa.types.is_string(ids.type) or pa.types.is_large_string(ids.type)
     if ids.null_count or not (integers or texts):
-        raise InputError(
-            f"{path}: {column} is {ids.type} with {ids.null_count} missing values, not ids; "
-            "restore it, or make the store or run again"
-        )
+        what = f"{ids.type} with {ids.null_count} missing values"
+        raise InputError(f"{path}: {column} is {what}, not ids; {_REMEDY}")
     return np.asarray(ids, dtype=np.int64 if integers else None)
 
 
 def write_frames(
     out: Path, frames: "Iterable[pd.DataFrame]", metadata: Mapping[str, str] | None = None
 ) -> int:
-    """Write `frames` one after the other as a single Parquet file, atomically.
+    """Write `frames` one after the other as a single Parquet file, atomically; returns its rows.
 
-    Args:
-        metadata: added to the metadata of the schema.
-
-    Returns:
-        The number of rows.
+    `metadata` is added to that of the schema.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

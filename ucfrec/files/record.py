@@ -37,7 +37,7 @@ RUN_RECORD: Final = "run.json"
 _BLOCK: Final = 2**19
 _THREADS: Final = 2
 _LARGEST: Final = 2**48
-_SMALL: Final = 2**26
+SMALL: Final = 2**26
 """Bytes of a file that is always read to check it."""
 Text = InstanceOf[str]
 """A text; unlike pydantic's own, file names may have bytes that are not valid Unicode."""
@@ -63,44 +63,21 @@ class Sealed:
 
     folder: Path
     remedy: str
-    """What to do about a damaged file, for messages."""
     files: Mapping[str, tuple[int, str]]
-    """Path in the folder to size in bytes and checksum."""
 
-    def require_sizes(self) -> None:
-        """Check that every file is there with its size; no file is read.
-
-        Raises:
-            InputError: the first file that is missing, or has another size.
-        """
-        for name in self.files:
-            self._refuse(name, self._find_fault(name, content=False))
-
-    def require(self, name: str) -> None:
-        """Read a file and check its size and checksum; a file that is not listed passes.
-
-        Raises:
-            InputError: the file is missing or has another content.
-        """
-        if name in self.files:
-            self._refuse(name, self._find_fault(name))
-
-    def require_small(self) -> None:
-        """Check the sizes of all files, and the content of small ones.
+    def require(self, names: Container[str] = (), small: int = SMALL) -> None:
+        """Check the sizes of all files, and the content of `names` and of those of `small` bytes.
 
         Raises:
             InputError: the first file that is missing or has another content.
         """
-        self.require_sizes()
         for name, (size, _) in self.files.items():
-            if size <= _SMALL:
-                self.require(name)
+            if fault := self._find_fault(name, size <= small or name in names):
+                where = self.folder / name
+                raise InputError(f"{where} {fault}; restore the file, or {self.remedy}")
 
     def faults(self) -> Iterator[tuple[str, str]]:
-        """Read every file, several at a time; yields (path in the folder, what is wrong with it).
-
-        Reading and hashing release Python's lock, so with two processors the hashing costs no time.
-        """
+        """Read every file; yields (path in the folder, what is wrong with it)."""
         from concurrent.futures import ThreadPoolExecutor  # only to verify everything
 
         with ThreadPoolExecutor(_THREADS) as threads:
@@ -124,10 +101,6 @@ class Sealed:
         except OSError as error:
             return f"cannot be read ({explain_os_error(error)})"
 
-    def _refuse(self, name: str, fault: str) -> None:
-        if fault:
-            raise InputError(f"{self.folder / name} {fault}; restore the file, or {self.remedy}")
-
 
 def _names(folder: Path) -> Iterator[str]:
     for where, folders, files in os.walk(folder):
@@ -145,6 +118,9 @@ def _inside(files: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
     return files
 
 
+_ABSENT: Final[tuple[object, ...]] = (None, (), [], {})
+
+
 class Entry(BaseModel):
     """An immutable JSON object; optional entries that are None or empty are excluded."""
 
@@ -156,12 +132,8 @@ class Entry(BaseModel):
         return {
             name: value
             for name, value in dump(self).items()
-            if name not in fields or fields[name].is_required() or not _absent(value)
+            if name not in fields or fields[name].is_required() or value not in _ABSENT
         }
-
-
-def _absent(value: object) -> bool:
-    return value is None or (isinstance(value, tuple | list | dict) and not value)
 
 
 class Record(Entry):
@@ -194,11 +166,7 @@ class Record(Entry):
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
-        """The record of a JSON object.
-
-        Raises:
-            InputError: an entry is missing, has another type or is out of range.
-        """
+        """The record of a JSON object; an `InputError` names an entry that is missing or wrong."""
         try:
             _require_bounded(value)
             return cls.model_validate(value)
@@ -225,12 +193,7 @@ class Record(Entry):
         return self.copy_with(files=files).write(folder)
 
     def reopen(self, folder: Path, unchanged: Container[str]) -> Self:
-        """Write the record before files of the folder change.
-
-        Args:
-            folder: as `seal` left it.
-            unchanged: files that will not change; the others are no longer listed.
-        """
+        """Write the record before files of the folder change, but for those `unchanged`."""
         files = {name: entry for name, entry in self.files.items() if name in unchanged}
         return self if files == self.files else self.copy_with(files=files).write(folder)
 
@@ -248,13 +211,13 @@ def _first_fault(error: ValidationError, path: Path, remedy: str) -> InputError:
     """The first of pydantic's errors, as one line."""
     fault = error.errors(include_url=False)[0]
     name = ".".join(str(part) for part in fault["loc"] if part != "[key]")
-    cause = fault.get("ctx", {}).get("error")
+    cause = fault.get("ctx", {}).get("error", "")
+    what = f" is damaged: its {name} is {fault['input']!r:.60}{cause and f', {cause}'}"
     if isinstance(cause, InputError):
-        return InputError(f"{path}: {cause}; {remedy}")
-    if fault["type"] == "missing":
-        return InputError(f"{path} has no {name}; {remedy}")
-    what = f", {cause}" if cause else ""
-    return InputError(f"{path} is damaged: its {name} is {fault['input']!r:.60}{what}; {remedy}")
+        what = f": {cause}"
+    elif fault["type"] == "missing":
+        what = f" has no {name}"
+    return InputError(f"{path}{what}; {remedy}")
 
 
 def _require_bounded(value: object, name: str = "") -> None:

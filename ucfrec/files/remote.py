@@ -43,11 +43,7 @@ class Output(str):
 def uri_or_path(
     kind: type[Input] | type[Output], local: Callable[[str], Any]
 ) -> Callable[[str], Any]:
-    """Type of an argument that may be a URI.
-
-    Args:
-        local: type of the argument if it is a path.
-    """
+    """Type of an argument that may be a URI; `local` is its type if it is a path."""
 
     def read(argument: str) -> Any:
         return kind(argument) if _URI.fullmatch(argument) else local(argument)
@@ -154,20 +150,16 @@ def _fetch(uri: str, folder: Path) -> str:
         )
     base = PurePosixPath(root).parent
     for name, size in sizes.items():
-        target = folder / _require_inside(uri, PurePosixPath(name).relative_to(base))
+        inner = PurePosixPath(name).relative_to(base).as_posix()
+        # A name that leads out of the folder of the copies, on whatever system.
+        if re.search(r"[\\\0]|^/|(^|/)(\w:|\.\.(/|$))", inner):
+            raise InputError(f"{uri} has a file named {inner!r:.99}; copy it here under a new name")
+        target = folder / inner
         target.parent.mkdir(parents=True, exist_ok=True)
         system.get_file(name, str(target))
         if target.stat().st_size != size:
             raise InputError(f"{uri}: {name} changed while it was read; run it again")
     return PurePosixPath(pattern).relative_to(base).as_posix()
-
-
-def _require_inside(uri: str, relative: PurePosixPath) -> PurePosixPath:
-    """Refuse a name that leads out of the folder of the copies, on whatever system."""
-    if ".." in relative.parts or re.search(r"[\\\0]|^/|(^|/)\w:", str(relative)):
-        name = str(relative)
-        raise InputError(f"{uri} has a file named {name!r:.200}; copy it here under a new name")
-    return relative
 
 
 def _require_new(uri: str) -> str:

@@ -1,8 +1,6 @@
-"""Files of a training: tensors with metadata (safetensors), and the scalars of `metrics.jsonl`."""
+"""Files of a training that hold tensors with metadata (safetensors)."""
 
 import json
-import math
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -13,23 +11,15 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import atomic_file, json_text
+from ucfrec.files.atomic import atomic_file, require_file
 
 REMEDY: Final = "restore it or train again"
 """What to do about a damaged file."""
-METRICS: Final = "metrics.jsonl"
-_STEP: Final = "step"
-_LARGEST_STEP: Final = 2**53
-"""The largest range of integers that floats represent exactly."""
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write named tensors and metadata that JSON can represent, atomically.
-
-    Raises:
-        InputError: the disk is full, or the folder is not writable.
-    """
+    """Write named tensors and metadata that JSON can represent, atomically."""
     plain: dict[str, Tensor] = {}
     places = set()
     for name, tensor in tensors.items():
@@ -54,14 +44,9 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """Read the tensors, on the CPU, and the metadata that `save_tensors` wrote."""
     # safetensors may call whatever it cannot read a missing file.
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
+    require_file(path, REMEDY)
     try:
         with safe_open(path, framework="pt") as file:
             metadata = json.loads((file.metadata() or {}).get("about", "{}"))
@@ -72,16 +57,10 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Tensor]) -> _Module:
-    """Build a module and load `tensors` into it.
+    """Build a module and load `tensors` into it, which were read from `path`.
 
     The sizes of a module come from a record that may state any. They are compared with those of the
     tensors, which a file holds, before memory is allocated.
-
-    Args:
-        path: where `tensors` were read from, for messages.
-
-    Raises:
-        InputError: they are the weights of another architecture.
     """
     try:
         with torch.device("meta"):
@@ -99,10 +78,7 @@ def load_module(path: Path, build: Callable[[], _Module], tensors: dict[str, Ten
 def load_weights(
     path: Path, module: nn.Module, tensors: Mapping[str, Tensor], assign: bool = False
 ) -> None:
-    """Load `tensors` into `module`; `path`, where they were read from, is for the message.
-
-    Args:
-        assign: whether the tensors become those of the module; otherwise they are copied.
+    """Load `tensors`, which were read from `path`, into `module`; copied unless `assign`.
 
     Raises:
         InputError: they are the weights of another architecture.
@@ -115,97 +91,3 @@ def load_weights(
             f"{path} holds weights of another architecture ({first}); use the settings that it was "
             "trained with, or another folder"
         ) from None
-
-
-class MetricsLog:
-    """Writes scalars to `metrics.jsonl`, which is read back, and to an event file of TensorBoard.
-
-    Both are on disk before `add` returns, so a killed training loses nothing that it logged;
-    `tensorboardX.SummaryWriter` would write in a thread. A line is `{"step": 500, "loss": 1.25}`; a
-    value that is not finite becomes null.
-
-    Args:
-        folder: of both files; must exist.
-        start: the step that training resumes from; 0 for a new training.
-    """
-
-    def __init__(self, folder: Path, start: int) -> None:
-        # Not above: it imports boto3 if that is installed, and most commands only read metrics.
-        from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
-
-        self._path, self._event = folder / METRICS, Event
-        if self._path.exists():
-            with self._path.open("r+b") as file:  # without the part of a line of a killed process
-                file.truncate(file.read().rfind(b"\n") + 1)
-        # tensorboardX names files by the second; the suffix keeps a quick resumption from reusing
-        # the name.
-        self._events = EventsWriter(str(folder / "events"), f".{start:09d}")
-        if start:  # makes TensorBoard discard events that were logged after the checkpoint
-            log = SessionLog(status=SessionLog.START)
-            self._events.write_event(Event(wall_time=time.time(), step=start + 1, session_log=log))
-
-    def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log named scalars; the name `step` is reserved."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json_text({_STEP: step, **scalars}) + "\n")
-        event = self._event(wall_time=time.time(), step=step)
-        for name, value in scalars.items():
-            event.summary.value.add(tag=name, simple_value=value)
-        self._events.write_event(event)
-        self._events.flush()
-
-    def close(self) -> None:
-        """Close the event file."""
-        self._events.close()
-
-
-def read_metrics(folder: Path) -> dict[str, dict[int, float]]:
-    """Read `metrics.jsonl` in `folder`, also while the training is running.
-
-    If a resumed training logged a step again, the later line is used. An incomplete last line is
-    ignored.
-
-    Returns:
-        {name: {step: value}}, steps in ascending order, NaN for a value that was not finite; empty
-        if the file does not exist.
-
-    Raises:
-        InputError: a line is not an object of a step and numbers.
-    """
-    path = folder / METRICS
-    if not path.exists():
-        return {}
-    *lines, _incomplete = path.read_bytes().split(b"\n")
-    scalars: dict[str, dict[int, float]] = {}
-    for number, line in enumerate(lines, start=1):
-        try:
-            step, values = _parse_line(line)
-        except ValueError as error:
-            raise InputError(
-                f"{path}, line {number}, {error}; delete the line, or restore the file"
-            ) from None
-        for name, value in values.items():
-            scalars.setdefault(name, {})[step] = value
-    return {name: dict(sorted(curve.items())) for name, curve in scalars.items()}
-
-
-def _parse_line(line: bytes) -> tuple[int, dict[str, float]]:
-    """Step and scalars of a line; a ValueError says what is wrong with it."""
-    try:
-        values = json.loads(line)
-    except (ValueError, RecursionError):
-        raise ValueError("is not JSON") from None
-    if not isinstance(values, dict):
-        raise ValueError("is not a JSON object")
-    step = values.pop(_STEP, None)
-    if type(step) is not int or not 0 <= step <= _LARGEST_STEP:
-        raise ValueError(f"has no whole number of 0 or more as {_STEP!r}")
-    for name, value in values.items():
-        if value is not None and type(value) not in (int, float):
-            raise ValueError(f"has no number as {name!r}")
-        try:
-            values[name] = math.nan if value is None else float(value)
-        except OverflowError:
-            raise ValueError(f"has too large a number as {name!r}") from None
-    return step, values

@@ -51,9 +51,8 @@ def joined() -> Iterator[None]:
     on_gpu = torch.cuda.is_available() and distributed.is_nccl_available()
     if on_gpu:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-    distributed.init_process_group(
-        "cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_LONGEST_WAIT
-    )
+    backend = "cpu:gloo,cuda:nccl" if on_gpu else "gloo"
+    distributed.init_process_group(backend, timeout=_LONGEST_WAIT)
     if not leads():
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
@@ -119,11 +118,9 @@ def joint_moments(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
-    """Replace gradients by their means over all processes, weighted by `count`, in place.
+    """Replace gradients, of the same layout everywhere, by their means over all processes.
 
-    Args:
-        parameters: the same in all processes, with gradients of the same layout.
-        count: rows of this process that its loss is a mean of.
+    `count` is the number of rows of this process that its loss is a mean of.
     """
     of_some = [parameter for parameter in parameters if parameter.grad is not None]
     tables = [parameter for parameter in of_some if parameter.grad.is_sparse]  # type: ignore[union-attr]

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting import distributed
-from ucfrec.fitting.checkpoint import REMEDY, MetricsLog, load_tensors, load_weights, save_tensors
+from ucfrec.fitting.checkpoint import REMEDY, load_tensors, load_weights, save_tensors
+from ucfrec.fitting.metrics import MetricsLog
 from ucfrec.processes import progress, random_state_kept
 from ucfrec.settings import BatchSize, Count, LearningRate, WeightDecay, settings_table
 
@@ -198,13 +199,8 @@ class _Training:
         self._average = None
         if config.average:
             self._average = WeightAverage(module, config.average, config.warmup_steps)
-        self.counters: dict[str, float] = {
-            "step": 0,
-            "best_step": 0,
-            "best_validation": math.inf,
-            "stale": 0,
-            "seconds": 0.0,
-        }
+        self.counters: dict[str, float] = {"step": 0, "best_step": 0, "stale": 0, "seconds": 0.0}
+        self.counters["best_validation"] = math.inf
         if self._last.exists():
             self._resume()
 
@@ -236,10 +232,8 @@ class _Training:
         save_tensors(self._last, tensors, counters)
 
     def descend(self, value: Tensor, step: int, count: float | None) -> Tensor:
-        """One optimizer step on the loss `value`; returns the gradient norm before clipping.
-
-        With `count`, the number of rows of `value`, on its mean over all processes.
-        """
+        """One optimizer step on the loss `value`, the mean of `count` rows of all that processes
+        have; returns the gradient norm before clipping."""
         config = self._config
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
@@ -261,29 +255,24 @@ class _Training:
     def validate(
         self, step: int, logged: Mapping[str, float], validate: Callable[[], float] | None
     ) -> dict[str, float]:
-        """Save the weights if their validation loss is the lowest so far, or without validation.
-
-        Returns:
-            The validation loss, for the log; empty without validation.
-        """
+        """Save the weights if their validation loss, which is returned, is the lowest so far."""
         self._require_finite("loss", logged["loss"], step)
         self._require_finite("gradient", logged["gradient_norm"], step)
+        found = {}
         with nullcontext() if self._average is None else self._average.applied():
-            metadata: dict[str, float] = {"step": step}
             if validate is not None:
                 self._module.eval()
                 with torch.no_grad():
-                    loss = validate()
+                    found["validation_loss"] = loss = validate()
                 self._require_finite("validation loss", loss, step)
                 if loss >= self.counters["best_validation"]:
                     self.counters["stale"] += 1
-                    return {"validation_loss": loss}
+                    return found
                 self.counters |= {"best_validation": loss, "stale": 0}
-                metadata["validation_loss"] = loss
             self.counters["best_step"] = step
             if distributed.leads():
-                save_tensors(self._best, self._module.state_dict(), metadata)
-        return {} if validate is None else {"validation_loss": loss}
+                save_tensors(self._best, self._module.state_dict(), {"step": step, **found})
+        return found
 
     def _require_finite(self, quantity: str, value: float, step: int) -> None:
         if not math.isfinite(value):
@@ -301,12 +290,7 @@ class _Training:
 
 
 def load_trained(path: Path) -> dict[str, Tensor]:
-    """The trained weights in a file that `fit` wrote: averages where it has them, without what only
-    resuming needs.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """The trained weights in a file of `fit`: averages where it has them, and nothing else."""
     tensors, counters = load_tensors(path)
     weights = {n: t for n, t in tensors.items() if not n.startswith((_OPTIMIZER, _AVERAGE))}
     with damage_explained(path, REMEDY):
@@ -357,13 +341,12 @@ def clip_gradients(parameters: Iterable[nn.Parameter], largest: float) -> Tensor
     """
     gradients = []
     for parameter in parameters:
-        if parameter.grad is None:
-            continue
-        if parameter.grad.is_sparse:
-            parameter.grad = parameter.grad.coalesce()
-            gradients.append(parameter.grad.values())
-        else:
-            gradients.append(parameter.grad)
+        gradient = parameter.grad
+        if gradient is not None and gradient.is_sparse:
+            parameter.grad = gradient.coalesce()
+            gradient = parameter.grad.values()
+        if gradient is not None:
+            gradients.append(gradient)
     norm = nn.utils.get_total_norm(gradients)
     if largest:
         torch._foreach_mul_(gradients, torch.clamp(largest / (norm + 1e-6), max=1.0))
@@ -384,12 +367,7 @@ class WeightAverage:
     """
 
     def __init__(self, module: nn.Module, decay: float, start: int = 0) -> None:
-        """
-        Args:
-            module: averaged from its present weights on, which then change in place.
-            decay: the largest d, above 0 and below 1.
-            start: steps whose weights are not averaged.
-        """
+        """`decay` is the largest d; the weights of the first `start` steps are not averaged."""
         self._decay, self._start, self._step = decay, start, 0
         self._log = 0.0  # Σ log d of the steps so far
         # A checkpoint has shared weights once for each name, so their averages are, too.
@@ -411,11 +389,8 @@ class WeightAverage:
                 if name not in self._when:
                     whole = torch.full((len(parameter),), self._log, dtype=torch.float64)
                     self._when[name] = whole.to(rows.device)
-                self._means[name][rows] = _rested(
-                    self._means[name][rows],
-                    self._weights[name][rows],
-                    self._log - self._when[name][rows],
-                )
+                means, rested = self._means[name], self._log - self._when[name][rows]
+                means[rows] = _rested(means[rows], self._weights[name][rows], rested)
         return moved
 
     def after_step(self, moved: Mapping[str, Tensor]) -> None:
@@ -426,27 +401,25 @@ class WeightAverage:
         if decay:  # otherwise the averages are the weights, also of rows that rest
             self._log += math.log(decay)
         for name, rows in moved.items():
-            self._means[name][rows] = self._means[name][rows].lerp_(
-                self._weights[name][rows], 1 - decay
-            )
+            means = self._means[name]
+            means[rows] = means[rows].lerp_(self._weights[name][rows], 1 - decay)
             self._when[name][rows] = self._log
         dense = [name for name in self._means if name not in self._when]
-        torch._foreach_lerp_(
-            [self._means[name] for name in dense],
-            [self._weights[name] for name in dense],
-            1 - decay,
-        )
+        dense_means = [self._means[name] for name in dense]
+        torch._foreach_lerp_(dense_means, [self._weights[name] for name in dense], 1 - decay)
 
     @contextmanager
     def applied(self) -> Iterator[None]:
         """Inside, the module's weights are the averages."""
         own_weights = {name: weights.clone() for name, weights in self._weights.items()}
         tensors, counters = self.state()
-        self._put(_averages(tensors, own_weights, counters))
         try:
+            for name, mean in _averages(tensors, own_weights, counters).items():
+                self._weights[name].copy_(mean)
             yield
         finally:
-            self._put(own_weights)
+            for name, weights in own_weights.items():
+                self._weights[name].copy_(weights)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Named tensors and counters, for `restore`."""
@@ -455,20 +428,12 @@ class WeightAverage:
         return tensors, {"averaged_steps": self._step, "average_log": self._log}
 
     def restore(self, tensors: Mapping[str, Tensor], counters: Mapping[str, float]) -> None:
-        """Go on from what `state` returned.
-
-        Raises:
-            KeyError, RuntimeError: an average is missing, or has another shape.
-        """
+        """Go on from what `state` returned; KeyError or RuntimeError if it is damaged."""
         self._step, self._log = int(counters["averaged_steps"]), float(counters["average_log"])
         for name, mean in self._means.items():
             mean.copy_(tensors[f"{_AVERAGE}{name}"])
             if (when := tensors.get(f"{_AVERAGE}{name}{_WHEN}")) is not None:
                 self._when[name] = when.to(mean.device)
-
-    def _put(self, values: Mapping[str, Tensor]) -> None:
-        for name, weights in self._weights.items():
-            weights.copy_(values[name])
 
 
 def _averages(
@@ -476,16 +441,15 @@ def _averages(
 ) -> dict[str, Tensor]:
     """Averages by the names of their weights, every row of a table brought up to date.
 
-    Args:
-        tensors: of `WeightAverage.state`; others are ignored.
-        counters: of `WeightAverage.state`.
+    `tensors` and `counters` are of `WeightAverage.state`; others are ignored.
     """
     means = {}
     for name, table in weights.items():
-        if (mean := tensors.get(f"{_AVERAGE}{name}")) is not None:
-            when = tensors.get(f"{_AVERAGE}{name}{_WHEN}")
-            log_shares = None if when is None else counters["average_log"] - when
-            means[name] = mean if log_shares is None else _rested(mean, table, log_shares)
+        mean, when = (tensors.get(f"{_AVERAGE}{name}{end}") for end in ("", _WHEN))
+        if mean is not None and when is not None:
+            mean = _rested(mean, table, counters["average_log"] - when)
+        if mean is not None:
+            means[name] = mean
     return means
 
 

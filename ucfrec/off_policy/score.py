@@ -28,7 +28,8 @@ from ucfrec.logs.rows import mix_bits
 from ucfrec.logs.sessions import EPISODE_USERS
 from ucfrec.logs.summary import note_unknown
 from ucfrec.processes import progress
-from ucfrec.runs.trained_policy import TrainedPolicy, columns_used, reward_of
+from ucfrec.runs.later_logs import columns_used, reward_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 SESSION, PROBABILITY, RANK, GREEDY = "session", "probability", "rank", "greedy_item_id"
 UNKNOWN_ITEMS = "unknown_item_rows"

@@ -20,8 +20,8 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.arrays import Array
 from ucfrec.errors import InputError, one_line
-from ucfrec.files.atomic import atomic_file, atomic_folder
-from ucfrec.files.parquet import part_name, require_regular, write_frames
+from ucfrec.files.atomic import atomic_file, atomic_folder, require_file
+from ucfrec.files.parquet import part_name, write_frames
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.off_policy.estimators import StepSums, normalise_by_step
 from ucfrec.off_policy.evaluate import EstimateOptions, Evidence, OffPolicyReport, make_report
@@ -111,7 +111,7 @@ def evaluate_scored(
 
 def _read_metadata(file: Path, trained: TrainedPolicy, rule: DecisionRule) -> pq.FileMetaData:
     """Metadata of a file that the run and rule scored."""
-    require_regular(file)
+    require_file(file, "score the logs again")
     try:
         described = pq.read_metadata(file)
     except (pa.ArrowException, OSError) as error:

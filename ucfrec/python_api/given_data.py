@@ -25,7 +25,8 @@ from ucfrec.logs.summary import MANY, note_dropped
 from ucfrec.off_policy.score import LoggedSessions, held_out_sessions, read_logged_sessions
 from ucfrec.plugins import load_plugin
 from ucfrec.recommending.histories import histories_of_frame, select_users
-from ucfrec.runs.trained_policy import TrainedPolicy, later_logs
+from ucfrec.runs.later_logs import later_logs
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import require_ids, shown
 
 Logs = pd.DataFrame | LogFiles | Path | str | Sequence[str | Path]

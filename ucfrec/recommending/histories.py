@@ -17,7 +17,8 @@ from ucfrec.logs.expressions import computes_with_reward
 from ucfrec.logs.histories import Histories, frame_histories, read_histories
 from ucfrec.logs.mapping import EARLIEST_MS, LogMapping
 from ucfrec.logs.rows import choose_rows
-from ucfrec.runs.trained_policy import TrainedPolicy, columns_used, reward_of
+from ucfrec.runs.later_logs import columns_used, reward_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 
 _MOST_PLAIN_ROWS = 1_000_000
 """Rows up to which a frame is read at once, not in batches of users."""

@@ -37,7 +37,8 @@ from ucfrec.logs.expressions import Expression, columns_of, computes_with_reward
 from ucfrec.logs.histories import FrameTable, Histories
 from ucfrec.logs.rows import DAY_MS, choose_rows
 from ucfrec.logs.tables import is_number
-from ucfrec.runs.trained_policy import TrainedPolicy, reward_of
+from ucfrec.runs.later_logs import reward_of
+from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.settings import settings_table
 
 _Integer = Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)]

@@ -18,7 +18,8 @@ from ucfrec.logs.spark import UserLog, map_users
 from ucfrec.recommending.exposures import exposures_written
 from ucfrec.recommending.histories import session_by
 from ucfrec.recommending.recommend import recommend
-from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy, columns_used, reward_of
+from ucfrec.runs.later_logs import columns_used, reward_of
+from ucfrec.runs.trained_policy import RunOnWorkers, TrainedPolicy
 from ucfrec.settings import require_whole
 
 

@@ -15,8 +15,7 @@ from ucfrec import schema
 from ucfrec.counterfactual.augmentation import AugmentationReport
 from ucfrec.episodes.record import Source
 from ucfrec.errors import InputError, damage_explained
-from ucfrec.files.atomic import read_json
-from ucfrec.files.parquet import require_regular
+from ucfrec.files.atomic import read_json, require_file
 from ucfrec.logs.rows import REASONS
 from ucfrec.reporting.charts import Chart, histogram, line_chart, name_bins
 from ucfrec.reporting.tables import Table, format_value
@@ -24,7 +23,7 @@ from ucfrec.runs.run import SAMPLES
 from ucfrec.runs.trained_policy import ITEMS
 
 Curves = Mapping[str, Mapping[int, float]]
-"""{name: {step: value}}, as from `ucfrec.fitting.checkpoint.read_metrics`."""
+"""{name: {step: value}}, as from `ucfrec.fitting.metrics.read_metrics`."""
 POINTS: Final = 200
 """Most points of a drawn curve."""
 REFERENCES: Final = {"uniform": "all items alike", "popularity": "items by popularity"}
@@ -211,7 +210,7 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
-    require_regular(run / ITEMS)
+    require_file(run / ITEMS, "restore it")
     with damage_explained(run / SAMPLES, "restore it or train again"):
         sessions = samples["sessions"]
         numbers = {n for s in sessions for n in (*s["history"], s["logged"], *s["recommended"])}
@@ -229,7 +228,7 @@ def read_features(path: Path, text_ids: bool = False) -> pa.Table:
     Raises:
         InputError: the file cannot be read as that or lacks the column.
     """
-    require_regular(path)
+    require_file(path, "name another file")
     try:
         types = csv.ConvertOptions(column_types={schema.ITEM_ID: pa.string()} if text_ids else None)
         text = path.suffix == ".csv"

@@ -60,7 +60,7 @@ def resolve_config(
     seed: int = 0,
     presets: Mapping[str, Any] | None = None,
 ) -> Config:
-    """Build the configuration of a run: `overrides` win over `file`, and `file` over `presets`.
+    """The configuration of a run: `overrides` win over `file`, and `file` over `presets`.
 
     Args:
         policy_name: one of `ucfrec.policies.registry.policy_names`. The default of `augment.copies`
@@ -76,11 +76,9 @@ def resolve_config(
         InputError: a policy, table or field is unknown, or a value or a combination of values is
             not allowed; the message names the source of the setting.
     """
-    settings = [*_from_mapping(presets or {}, "presets")]
-    if file is not None:
-        settings += _from_mapping(read_toml(file), str(file))
-    settings += _from_overrides(overrides)
-    return _build(policy_name, settings, seed)
+    of_file = {} if file is None else read_toml(file)
+    settings = [*_from_mapping(presets or {}, "presets"), *_from_mapping(of_file, str(file))]
+    return _build(policy_name, [*settings, *_from_overrides(overrides)], seed)
 
 
 def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
@@ -89,18 +87,12 @@ def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, An
 
 
 def config_from_dict(values: object) -> Config:
-    """Rebuild a configuration from its `dataclasses.asdict`.
-
-    Raises:
-        InputError: see `resolve_config`.
-    """
-    if not isinstance(values, Mapping) or not isinstance(values.get("policy_name"), str):
-        raise InputError("the run's configuration has no policy_name")
-    if "seed" not in values:
-        raise InputError("the run's configuration has no seed")
-    tables = {name: values[name] for name in values if name not in ("policy_name", "seed")}
-    settings = _from_mapping(tables, "the run's configuration")
-    return _build(values["policy_name"], settings, values["seed"])
+    """Rebuild a configuration from its `dataclasses.asdict`; errors as of `resolve_config`."""
+    if not isinstance(values, Mapping) or not {"policy_name", "seed"} <= values.keys():
+        raise InputError("the run's configuration has no policy_name or no seed")
+    tables = {**values}
+    name, seed = tables.pop("policy_name"), tables.pop("seed")
+    return _build(str(name), _from_mapping(tables, "the run's configuration"), seed)
 
 
 class _Setting(NamedTuple):

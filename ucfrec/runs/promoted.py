@@ -33,31 +33,19 @@ class Promoted(Record):
     previous: tuple[Text, ...] = Field(default=(), max_length=_MOST)
 
     def run(self, folder: Path) -> Path:
-        """The folder of the current run.
-
-        Raises:
-            InputError: the name is not that of a folder beside the file.
-        """
+        """The folder of the current run, which must lie beside the file."""
         if self.current in ("", ".", "..") or Path(self.current).name != self.current:
             raise InputError(f"{folder / POINTER} is damaged: it names {self.current!r:.60}")
         return folder / self.current
 
 
 def promoted(folder: Path) -> Promoted | None:
-    """What the pointer file of a folder says; None if there is none.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """What the pointer file of a folder says; None if there is none."""
     return Promoted.read(folder) if (folder / POINTER).is_file() else None
 
 
 def promote(run: Path, force: bool = False) -> Promoted:
     """Make a run the current one of the folder that it lies in.
-
-    Args:
-        run: a finished run, no link, all of whose files are compared with their checksums.
-        force: whatever its verdict against the current run is.
 
     Raises:
         InputError: the run is a link, not finished or damaged, or, without `force`, is not an
@@ -72,16 +60,15 @@ def promote(run: Path, force: bool = False) -> Promoted:
     verify_run(run)
     folder = run.parent
     with claim(folder / POINTER, wait=True):
-        pointer = promoted(folder)
+        pointer, fingerprint = promoted(folder), TrainedPolicy.load(run).fingerprint
         if pointer is None:
-            return _current(run, ()).write(folder)
-        fingerprint = TrainedPolicy.load(run).fingerprint
+            return _write(run, fingerprint, ())
         again = pointer.current == run.name
         if not force and not (again and pointer.fingerprint in ("", fingerprint)):
             _require_verdict(run, pointer.run(folder))
         previous = pointer.previous if again else (*pointer.previous, pointer.current)[-_MOST:]
         # Written again too, so that a server tries again what it could not use.
-        return _current(run, previous).write(folder)
+        return _write(run, fingerprint, previous)
 
 
 def promote_back(folder: Path) -> Promoted:
@@ -94,25 +81,24 @@ def promote_back(folder: Path) -> Promoted:
         pointer = promoted(folder)
         if pointer is None or not pointer.previous:
             raise InputError(f"{folder}: no run was current before; promote one")
-        back = Promoted(files={}, current=pointer.previous[-1]).run(folder)
+        *previous, name = pointer.previous
+        back = pointer.copy_with(current=name).run(folder)
         verify_run(back)
-        return _current(back, pointer.previous[:-1]).write(folder)
+        return _write(back, TrainedPolicy.load(back).fingerprint, tuple(previous))
 
 
-def _current(run: Path, previous: tuple[str, ...]) -> Promoted:
-    fingerprint = TrainedPolicy.load(run).fingerprint
-    return Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
+def _write(run: Path, fingerprint: str, previous: tuple[str, ...]) -> Promoted:
+    pointer = Promoted(files={}, current=run.name, fingerprint=fingerprint, previous=previous)
+    return pointer.write(run.parent)
 
 
 def _require_verdict(run: Path, current: Path) -> None:
-    remedy = "compare them, and add --force to promote it all the same"
-    update = RunRecord.read(run).update
+    update, fault = RunRecord.read(run).update, ""
     if update is None or update.verdict is None:
-        raise InputError(f"{run} has no verdict against the current run {current.name}; {remedy}")
-    if update.run != TrainedPolicy.load(current, split=True).fingerprint:
-        raise InputError(
-            f"{run} was compared with {update.of}, not with the current run {current.name}; "
-            f"{remedy}"
-        )
-    if update.verdict.result == "worse":
-        raise InputError(f"{run} is worse than {current.name} by its verdict; {remedy}")
+        fault = f"has no verdict against the current run {current.name}"
+    elif update.run != TrainedPolicy.load(current, split=True).fingerprint:
+        fault = f"was compared with {update.of}, not with the current run {current.name}"
+    elif update.verdict.result == "worse":
+        fault = f"is worse than {current.name} by its verdict"
+    if fault:
+        raise InputError(f"{run} {fault}; compare them, and add --force to promote it all the same")

@@ -3,9 +3,10 @@
 import math
 import os
 from collections.abc import Container, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -35,6 +36,7 @@ from ucfrec.schema import SessionBy
 from ucfrec.user_model.reward_report import ItemRewardReport
 from ucfrec.user_model.session_end import SessionEndReport
 
+_Report = TypeVar("_Report")
 RUN: Final = RUN_RECORD
 REFIT: Final = "refit"
 """Folder in that of a run, a run of its own, whose weights have learned from all rows."""
@@ -45,10 +47,9 @@ CANDIDATES: Final = "candidates.json"
 
 
 def _complete(sizes: dict[str, int]) -> dict[str, int]:
-    of_items = ("users", "tags") if sizes.get("items") else ()
-    for name in ("state", "action", "items", *of_items):
-        if name not in sizes:
-            raise ValueError(f"there is no size {name!r}")
+    of_items = {"users", "tags"} if sizes.get("items") else set()
+    if missing := {"state", "action", "items", *of_items} - sizes.keys():
+        raise ValueError(f"there is no size {', '.join(sorted(missing))}")
     return sizes
 
 
@@ -62,12 +63,6 @@ def _levels(quantiles: dict[str, float]) -> dict[str, float]:
     if not quantiles or not all(0 <= float(level) <= 1 for level in quantiles):
         raise ValueError("there are none, or one is not of a share")
     return quantiles
-
-
-def _named(value: object) -> object:
-    if not isinstance(value, dict) or not isinstance(value.get("policy_name"), str):
-        raise InputError("its config has no policy_name")
-    return value
 
 
 def _config(value: object) -> Config:
@@ -84,8 +79,8 @@ class TrainingRecord(Record):
     library: Text = "ucfrec"
     """What trained the policy."""
     command: Text
-    config: Annotated[Any, PlainValidator(_named)]
-    """Settings, with the `policy_name`."""
+    config: Any
+    """Settings."""
     policy: Any = None
     """Report of the training; None until it has ended."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)]
@@ -167,10 +162,13 @@ class Difference(Entry):
         return 0 if self.doubt else int(self.low > 0) - int(self.high < 0)
 
 
+UpdateResult: TypeAlias = Literal["better", "no significant difference", "worse"]
+
+
 class UpdateVerdict(Entry):
     """Whether a new run is better than the old one (`ucfrec.updating.verdict`)."""
 
-    result: Literal["better", "no significant difference", "worse"]
+    result: UpdateResult
     decided_by: Text
     """The measure that decides."""
     differences: tuple[Difference, ...]
@@ -238,20 +236,14 @@ class RunRecord(TrainingRecord):
 
     @classmethod
     def of(cls, value: Mapping[str, Any], path: Path) -> Self:
-        """The record of a JSON object; see `Record.of`.
-
-        Raises:
-            InputError: its policy is not installed or cannot be imported, too, which is no damage.
-        """
+        """See `Record.of`; a policy that is not installed or cannot be imported is no damage."""
         config = value.get("config")
         name = config.get("policy_name") if isinstance(config, Mapping) else None
         if isinstance(name, str) and name not in BUILT_IN:
             if name not in policy_names():
-                package, numbers = value.get("policy_package"), value.get("versions")
-                source = "an unknown package"
-                if isinstance(package, str):
-                    number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
-                    source = f"package {package} {number}".rstrip()
+                package, numbers = str(value.get("policy_package") or ""), value.get("versions")
+                number = numbers.get(package, "") if isinstance(numbers, Mapping) else ""
+                source = f"package {package} {number}".rstrip() if package else "an unknown package"
                 raise InputError(
                     f"{path}: trained with policy {name!r} (of {source}), which is not installed: "
                     "install it"
@@ -266,11 +258,10 @@ class RunRecord(TrainingRecord):
         Followed by `-augmented` or `-no-augmentation` if the run's use of augmentation is not the
         method's default.
         """
-        config = self.config
-        augmented = config.augment.augments
-        if augmented == policy_class(config.policy_name).augmented:
-            return config.policy_name
-        return f"{config.policy_name}-{'augmented' if augmented else 'no-augmentation'}"
+        name, augmented = self.config.policy_name, self.config.augment.augments
+        if augmented == policy_class(name).augmented:
+            return name
+        return f"{name}-{'augmented' if augmented else 'no-augmentation'}"
 
     @property
     def summary(self) -> str:
@@ -299,9 +290,9 @@ class RunRecord(TrainingRecord):
 
     def is_of(self, store: StoreRecord) -> bool:
         """Whether the run was trained on a store: on the same steps and item states."""
-        states = [stored.files.get(ITEM_STATES) for stored in (self, store)]
+        own, others = self.files.get(ITEM_STATES), store.files.get(ITEM_STATES)
         # A store whose states a caller made lists no file of them.
-        same_states = None in states or states[0] == states[1]
+        same_states = own is None or others is None or own == others
         return self.fingerprint == store.fingerprint and same_states
 
     def learned_nothing(self, logged: Container[str]) -> str:
@@ -312,8 +303,7 @@ class RunRecord(TrainingRecord):
                 the validation loss is not a log-likelihood of items and cannot be compared.
 
         Returns:
-            What was found and what to do; empty if the policy learned something, has no validation
-            loss (as a refit), or is not trained yet.
+            What was found and what to do; empty if nothing was, or can be compared.
         """
         best = math.nan if self.policy is None else self.policy.best_validation
         popularity = (self.reference_losses or {}).get("popularity")
@@ -345,13 +335,9 @@ class RunRecord(TrainingRecord):
 
 
 def read_record(run: Path) -> RunRecord:
-    """The record of a run, whose small files are compared with their checksums.
-
-    Raises:
-        InputError: `run` is not a run folder, or is damaged.
-    """
+    """The record of a run, whose small files are compared with their checksums."""
     record = RunRecord.read(run)
-    record.checksums(run).require_small()
+    record.checksums(run).require()
     return record
 
 
@@ -368,48 +354,33 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
 
 
 def read_training(run: Path) -> TrainingRecord:
-    """The record of a run of whatever library; its other files are not looked at.
-
-    Raises:
-        InputError: `run` is not a run folder, or its record is damaged.
-    """
+    """The record of a run of whatever library; its other files are not looked at."""
     record = TrainingRecord.read(run)
     return RunRecord.read(run) if record.library == "ucfrec" else record
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:
-    """The decision rules that the choice of a run tried; none if it did not choose.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The decision rules that the choice of a run tried; none if it did not choose."""
     path = run / CANDIDATES
-    if not path.exists():
-        return ()
-    with damage_explained(path, RunRecord.REMEDY):
-        return TypeAdapter(tuple[Candidate, ...]).validate_python(read_json(path))
+    return _read_stage(path, tuple[Candidate, ...]) if path.exists() else ()
 
 
 def read_augmentation(path: Path) -> AugmentationReport:
-    """The report of an augmentation that is made, of a run that may still be in training.
+    """The report of an augmentation that is made, of a run that may still be in training."""
+    return _read_stage(path, AugmentationReport)
 
-    Raises:
-        InputError: the file is damaged.
-    """
+
+def _read_stage(path: Path, kind: type[_Report]) -> _Report:
     with damage_explained(path, RunRecord.REMEDY):
-        return TypeAdapter(AugmentationReport).validate_python(read_json(path))
+        return TypeAdapter(kind).validate_python(read_json(path))
 
 
 def place_of(store: Path, run: Path) -> dict[str, str | None]:
-    """Entries of the record of a run: where its store lies, and as seen from the run.
-
-    There is no path from a run to a store on another drive of Windows.
-    """
-    try:
-        seen_from_run = os.path.relpath(store.resolve(), run.resolve())
-    except ValueError:
-        seen_from_run = None
-    return {"store": str(store.resolve()), "store_from_run": seen_from_run}
+    """Entries of the record of a run: where its store lies, and as seen from the run."""
+    store, seen_from_run = store.resolve(), None
+    with suppress(ValueError):  # there is no path to another drive of Windows
+        seen_from_run = os.path.relpath(store, run.resolve())
+    return {"store": str(store), "store_from_run": seen_from_run}
 
 
 def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
@@ -417,14 +388,9 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
 
     It is looked for where it lies as seen from the run, so that both can be moved or copied
     together, and where it lay when the run was trained.
-
-    Raises:
-        InputError: it is damaged.
     """
-    places = [Path(record.store)]
-    if record.store_from_run:
-        places.insert(0, Path(os.path.normpath(run.resolve() / record.store_from_run)))
-    for path in places:
+    seen_from_run = os.path.normpath(run.resolve() / (record.store_from_run or record.store))
+    for path in (Path(seen_from_run), Path(record.store)):
         if (path / StoreRecord.FILE).is_file():
             store = EpisodeStore.open(path)
             if record.is_of(store.record):
@@ -433,11 +399,7 @@ def store_of(run: Path, record: RunRecord) -> EpisodeStore | None:
 
 
 def verify_run(run: Path) -> None:
-    """Read every file of a run and compare it with its checksum.
-
-    Raises:
-        InputError: `run` is not a finished run, or a file has another content.
-    """
+    """Read every file of a finished run and compare it with its checksum."""
     record = read_record(run)
     if record.policy is None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")
@@ -451,7 +413,7 @@ def _describe_augmentation(report: AugmentationReport) -> list[str]:
     crm, moves, actions = report.reward_model, report.moves, report.actions
     lines = [
         f"reward model  R² {crm.r2:.3f} with the disturbance z, {crm.r2_without_z:.3f} without; "
-        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active",
+        f"{crm.active_dimensions} of {crm.latent_dim} latent dimensions active"
     ]
     if report.proposals:
         lines.append(

@@ -21,7 +21,7 @@ SHARE: Final = 0.25
 
 
 def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
-    """Go on training the policy of the run `first`, on its validation and test episodes too.
+    """Go on training the policy of the finished run `first`, on all episodes of its store.
 
     Nothing is chosen again: the settings, the augmented episodes, the strength of the reward
     model's effects and the decision rule are those of `first`. The best weights are trained for
@@ -30,8 +30,6 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
     split. There is nothing left to evaluate the policy on but later logs.
 
     Args:
-        store: the store of `first`.
-        first: a finished run.
         out: run folder, new or interrupted; `first / REFIT` for the weights that `first` acts by.
 
     Raises:
@@ -66,11 +64,9 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         refit_item_reward_model(first / REWARD_MODEL, store, out / REWARD_MODEL, record.seed)
         if (first / REWARD_MODEL / SESSIONS).exists():
             shutil.copyfile(first / REWARD_MODEL / SESSIONS, out / REWARD_MODEL / SESSIONS)
-    chosen = {
-        name: getattr(trained.record, name)
-        for name in ("rule", "reward_model", "screening", "update")
-    }
-    return record.copy_with(**chosen).seal(out)
+    chosen = trained.record
+    record = record.copy_with(rule=chosen.rule, reward_model=chosen.reward_model)
+    return record.copy_with(screening=chosen.screening, update=chosen.update).seal(out)
 
 
 def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
@@ -93,8 +89,5 @@ def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
 
 def _identity(trained: TrainedPolicy) -> dict[str, Any]:
     """Settings, rule and weights of a run."""
-    return {
-        **trained.record.settings,
-        "rule": trained.rule.as_dict(),
-        "weights": trained.fingerprint,
-    }
+    rule, weights = trained.rule.as_dict(), trained.fingerprint
+    return {**trained.record.settings, "rule": rule, "weights": weights}

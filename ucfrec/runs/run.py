@@ -1,10 +1,11 @@
 """Train a policy (Algorithm 1) and keep everything it produces in a run folder."""
 
+import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -39,6 +40,7 @@ from ucfrec.policies.registry import note_ignored
 from ucfrec.processes import phase, random_state_kept
 from ucfrec.provenance import config_hash
 from ucfrec.runs.config import Config
+from ucfrec.runs.policy_fit import fit_policy
 from ucfrec.runs.record import (
     CANDIDATES,
     RUN,
@@ -50,7 +52,6 @@ from ucfrec.runs.record import (
 )
 from ucfrec.runs.start import (
     begin,
-    fit_policy,
     new_policy,
     require_startable,
     rule_to_start_from,
@@ -110,17 +111,13 @@ OWN: Final = SharedStages(None)
 """For a run that makes all its stages itself."""
 
 
-def _copy(source: Path, to: Path, names: Sequence[str]) -> None:
+def _copy(source: Path, to: Path, names: Iterable[str]) -> None:
     for name in names:
         if (source / name).is_dir():
-            shutil.copytree(source / name, to / name, dirs_exist_ok=True, copy_function=_copy_file)
+            _copy(source / name, to / name, os.listdir(source / name))
         elif (source / name).exists():
-            _copy_file(source / name, to / name)
-
-
-def _copy_file(source: str | Path, to: str | Path) -> None:
-    with atomic_file(Path(to)) as scratch:
-        shutil.copyfile(source, scratch)
+            with atomic_file(to / name) as scratch:
+                shutil.copyfile(source / name, scratch)
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,6 @@ class _Inputs:
     out: Path
     config: Config
     shared: SharedStages
-    device: torch.device
     logged: EpisodeStore
     """The training episodes as they were logged."""
     held_out: EpisodeStore
@@ -159,8 +155,7 @@ def train_run(
     """Train a policy on the training episodes of `store`, or resume the run in `out`.
 
     The stages are those of Algorithm 1, then the choice of the decision rule; finished stages are
-    not repeated. `out` is created after all inputs have been checked, so that a rejected run leaves
-    no folder. The global random state is restored on return.
+    not repeated. A run whose inputs are rejected leaves no folder.
 
     Where `torchrun` started several processes, they train the policy together; the leader does
     the rest, and the others return once the policy is trained.
@@ -195,39 +190,33 @@ def train_run(
         with phase("Counterfactual augmentation", 1, PHASES):
             augmented, augmentation = _augment(run, refit_of)
         with phase("Training the policy", 2, PHASES):
-            if more_augmentation is not None:
-                more = more_augmentation
+            if (more := more_augmentation) is not None:
                 augmented = more if augmented is None else augmented.join(more)
-            first: Path | None = None
-            validation: EpisodeStore | None = run.validation
-            updated = run.record.update
+            updated, first = run.record.update, None
             if refit_of is not None:
-                first, validation = refit_of / "policy" / "best.safetensors", None
                 updated = read_record(refit_of).update
+                first = refit_of / "policy" / "best.safetensors"
             newest = None
             if updated is not None:
                 since = run.train.record.n_episodes - updated.episodes
                 newest = np.flatnonzero(run.train.episode_ids >= since)
-            policy, train, settings = run.policy, run.train, run.config
+            policy, train, held_out = run.policy, run.train, None if first else run.validation
             fit = fit_policy(
-                policy, train, validation, out, settings, first, newest, callbacks, augmented
+                policy, train, held_out, out, config, first, newest, callbacks, augmented
             )
         if not distributed.leads():
             return run.record
         chosen = run.record.rule is not None and run.record.policy == fit
         record = run.record.copy_with(augmentation=augmentation, policy=fit)
         if run.logged.has_items:
-            users = None
             if config.rule.choose and not chosen:
                 with phase("Fitting the user model", 3, PHASES):
                     users = _fit_user_model(run, initial)
-            trained = TrainedPolicy.load(out, in_training=True)
-            if users is not None:
                 with phase("Selecting the decision rule", 4, PHASES):
-                    rule = _choose_rule(run, trained, users, initial)
+                    rule = _choose_rule(run, users, initial)
                 record = record.copy_with(reward_model=users.reward_report, rule=rule)
-                trained = replace(trained, rule=rule.rule)
-            write_json(out / SAMPLES, sample_recommendations(trained.scorer(), run.held_out))
+            scorer = TrainedPolicy.load(out, in_training=True).scorer()
+            write_json(out / SAMPLES, sample_recommendations(scorer, run.held_out))
         seconds = record.wall_time_s + time.perf_counter() - start
         return record.copy_with(wall_time_s=seconds).seal(out)
 
@@ -240,7 +229,7 @@ def _prepare_inputs(
     refit_of: Path | None,
     shared: SharedStages,
 ) -> _Inputs:
-    """Check all inputs and begin the run or reopen it; views of the episodes, untrained policy."""
+    """Check all inputs and begin the run, or reopen it."""
     train, validation = logged, held_out = training_views(store)
     if refit_of is not None:
         train = logged = store
@@ -266,20 +255,15 @@ def _prepare_inputs(
         )
     if view is not train:
         policy = new_policy(view, config)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    policy = policy.to(device)
-    return _Inputs(record, out, config, shared, device, logged, held_out, view, validation, policy)
+    policy = policy.to("cuda" if torch.cuda.is_available() else "cpu")
+    return _Inputs(record, out, config, shared, logged, held_out, view, validation, policy)
 
 
 def _augment(
     run: _Inputs, refit_of: Path | None
 ) -> tuple[AugmentedEpisodes | None, AugmentationReport | None]:
-    """Causal reward model, generator and acceptance gate (lines 1 to 3 of Algorithm 1).
-
-    Made once, then read from the run folder, or from that of the run that is refitted; (None, None)
-    for a run without augmentation.
-    """
-    config, out = run.config, run.out
+    """Causal reward model, generator and gate (lines 1 to 3 of Algorithm 1), made once."""
+    config, out, device = run.config, run.out, run.policy.state_mean.device
     if not config.augment.augments:
         return None, run.record.augmentation
     if refit_of is not None:
@@ -291,14 +275,15 @@ def _augment(
 
     def make() -> None:
         augmented, report = augment_episodes(
-            run.train, run.validation, *settings, out, config.seed, run.device
+            run.train, run.validation, *settings, out, config.seed, device
         )
         augmented.save(out / AUGMENTED)
         write_json(out / AUGMENTATION, asdict(report))
 
     with distributed.leader_first():
         if not (out / AUGMENTATION).exists():
-            inputs = _dependencies(run.train, run.validation, config.seed, run.device, *settings)
+            inputs = _dependencies(run.train, run.validation, config.seed, device)
+            inputs["settings"] = [asdict(table) for table in settings]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
             shared.provide(inputs, augment_episodes.__module__, out, files, make)
         augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
@@ -310,17 +295,16 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
     train, validation = run.logged.without_long_sessions(), run.held_out.without_long_sessions()
     simulated, folder = run.record.return_to_go.per_session, run.out / REWARD_MODEL
     inputs = _dependencies(train, validation, run.config.seed, torch.device("cpu"))
-    inputs["simulated"] = simulated
+    inputs |= {"settings": [], "simulated": simulated}
     first = None if initial is None else initial / REWARD_MODEL
     fit = partial(UserModel.fit, train, validation, folder, run.config.seed, simulated, first)
     run.shared.provide(inputs, UserModel.__module__, run.out, (REWARD_MODEL,), fit)
     return fit()  # read from the folder
 
 
-def _choose_rule(
-    run: _Inputs, trained: TrainedPolicy, users: UserModel, initial: Path | None
-) -> RuleRecord:
+def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
     """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
+    trained = TrainedPolicy.load(run.out, in_training=True)
     states, returns, config = trained.item_states, trained.returns, run.config.rule
     problem = Problem(
         Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
@@ -339,13 +323,9 @@ def _choose_rule(
 
 
 def _dependencies(
-    train: EpisodeStore,
-    validation: EpisodeStore,
-    seed: int,
-    device: torch.device,
-    *settings: Any,
+    train: EpisodeStore, validation: EpisodeStore, seed: int, device: torch.device
 ) -> dict[str, Any]:
-    """All that a reward model or copies depend on."""
+    """All that a reward model or copies depend on, but for their settings."""
     return {
         "data": train.record.fingerprint,
         "item_states": train.record.files.get(ITEM_STATES),
@@ -353,16 +333,12 @@ def _dependencies(
         "state_size": train.state_size,
         "seed": seed,
         "device": device.type,
-        "settings": [asdict(table) for table in settings],
     }
 
 
 @torch.no_grad()
 def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str, Any]:
-    """Recommendations of a policy at the last step of a few validation sessions.
-
-    Args:
-        scorer: a policy of items under its rule.
+    """Recommendations of a policy of items at the last step of a few validation sessions.
 
     Returns:
         A JSON object: the `rule` in words, and `sessions` with up to 5 items before the last step
@@ -376,11 +352,9 @@ def sample_recommendations(scorer: Scorer, validation: EpisodeStore) -> dict[str
     scores = logged_scores(scorer, validation, episodes, last)
     best = scores.topk(min(_ITEMS, len(validation.item_states.embeddings)))
     sessions = []
-    for place, episode in enumerate(episodes):
-        steps = np.arange(validation.lengths[episode])
-        of_session = np.full(len(steps), episode)
-        items = validation.step_values(schema.ITEM, of_session, steps)
-        rewards = validation.step_values(schema.REWARD, of_session, steps)
+    for place in range(len(episodes)):
+        session = validation.select(episodes[[place]])
+        items, rewards = session.column(schema.ITEM), session.column(schema.REWARD)
         sessions.append(
             {
                 "history": items[:-1][-_HISTORY:].tolist(),

@@ -27,11 +27,7 @@ SCREENING: Final = "screening"
 
 
 def screen_store(store: EpisodeStore, seed: int) -> ScreeningReport:
-    """Screen the training sessions of a store of items.
-
-    Raises:
-        InputError: as `ucfrec.counterfactual.screening.screen`.
-    """
+    """`ucfrec.counterfactual.screening.screen` on the training sessions of a store."""
     return screen(training_views(store)[0], seed)
 
 
@@ -53,7 +49,6 @@ def train_screened(
         about: entries that a dataset adapter adds to the record.
         shared: as `train_run` has it, and for screening; a run whose columns are dropped has its
             other stages to itself.
-        callbacks: what is told of the training of the policy.
         screen: screens a store, with a seed; None for `screen_store`.
 
     Raises:
@@ -62,20 +57,31 @@ def train_screened(
     """
     if how is not None and how not in SCREENINGS:
         raise InputError(f"screen is {how!r}; use one of {', '.join(SCREENINGS)}")
-    started = read_record(out) if (out / RUN).exists() else None
-    screening = None if started is None else started.screening
-    started_with = None if screening is None else screening.how
-    if started is not None and started_with != how:
-        raise InputError(
-            f"{out} was started with"
-            f"{f' --screen {started_with}' if started_with else 'out --screen'}; name "
-            "another run folder, or give the same options to resume"
-        )
+    screening = None
+    if (out / RUN).exists():
+        screening = read_record(out).screening
+        started_with = None if screening is None else screening.how
+        if started_with != how:
+            option = f" --screen {started_with}" if started_with else "out --screen"
+            raise InputError(
+                f"{out} was started with{option}; name another run folder, or give the same "
+                "options to resume"
+            )
     if how is None:
         return train_run(store, out, config, about, shared=shared, callbacks=callbacks)
     if screening is None:
-        report = _screen_once(store, shared, screen or screen_store)
-        screening = Screening.model_validate({"how": how, **report})
+        inputs = {"screened": store.record.fingerprint, "steps": store.n_steps, "seed": SEED}
+        find = screen or screen_store
+        with TemporaryDirectory() as scratch:  # made once for runs that share stages
+            file = Path(scratch) / "screening.json"
+            shared.provide(
+                inputs,
+                find.__module__,
+                file.parent,
+                (file.name,),
+                lambda: write_json(file, asdict(find(store, SEED))),
+            )
+            screening = Screening.model_validate({"how": how, **read_json(file)})
     flagged = screening.flagged
     if len(flagged) == store.state_size:
         raise InputError(
@@ -92,24 +98,6 @@ def train_screened(
     places = [first + column for column in flagged]
     more = interventions(train, places, config.seed) if places else None
     return train_run(store, out, config, entries, more, shared=shared, callbacks=callbacks)
-
-
-def _screen_once(
-    store: EpisodeStore,
-    shared: SharedStages,
-    screen: Callable[[EpisodeStore, int], ScreeningReport],
-) -> dict[str, Any]:
-    """The report of `screen`, as a record has it; made once for runs that share stages."""
-    inputs = {"screened": store.record.fingerprint, "steps": store.n_steps, "seed": SEED}
-    with TemporaryDirectory() as scratch:
-        file = Path(scratch) / "screening.json"
-
-        def make() -> None:
-            write_json(file, asdict(screen(store, SEED)))
-
-        shared.provide(inputs, screen.__module__, file.parent, (file.name,), make)
-        report: dict[str, Any] = read_json(file)
-        return report
 
 
 def drop_columns(store: EpisodeStore, columns: Sequence[int]) -> EpisodeStore:

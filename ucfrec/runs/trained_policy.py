@@ -1,11 +1,9 @@
 """A trained policy, read back from its run folder."""
 
-import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +17,11 @@ from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
-from ucfrec.errors import InputError, InputNote, damage_explained
+from ucfrec.errors import InputError, damage_explained, warn_user
 from ucfrec.files.atomic import read_json
 from ucfrec.files.parquet import read_ids
 from ucfrec.fitting.checkpoint import REMEDY, load_module, load_tensors
 from ucfrec.fitting.loop import load_trained
-from ucfrec.plugins import load_plugin, plugin_names
 from ucfrec.policies.base import SequencePolicy
 from ucfrec.policies.registry import policy_class, policy_package
 from ucfrec.processes import random_state_kept
@@ -32,10 +29,6 @@ from ucfrec.provenance import config_hash, versions
 from ucfrec.runs.record import REFIT, RUN, RunRecord, read_record, refit_of_run, store_of
 from ucfrec.user_model.reward import FITTED, ItemRewardModel
 from ucfrec.user_model.session_end import SessionEnd, load_session_end
-
-if TYPE_CHECKING:
-    from ucfrec.logs.expressions import Expression
-    from ucfrec.logs.mapping import LogMapping
 
 AUGMENTATION = "augmentation.json"
 ITEMS, USERS = "items.parquet", "users.parquet"
@@ -52,10 +45,8 @@ class TrainedPolicy:
     """A policy loaded from a run folder, with all that acting and recommending need."""
 
     folder: Path
-    """The run folder."""
     policy: SequencePolicy
     record: RunRecord
-    """The content of `run.json`."""
     item_states: ItemStates | None
     """Builds states from items; None if the logged observation is the state."""
     item_ids: Array | None
@@ -66,7 +57,6 @@ class TrainedPolicy:
     """(M,) returns-to-go that targets are set for, sorted, in reward units: those of sessions, or
     of steps if a target is set again at every step (`ReturnToGo.per_session`)."""
     rule: DecisionRule
-    """The decision rule of the run."""
     reward_model: ItemRewardModel | None = None
     """Of the rewards of items, for decision rules with a reward weight; None if the run fitted
     none."""
@@ -95,20 +85,17 @@ class TrainedPolicy:
             InputError: `run` is not a run folder, or has no checkpoint yet.
         """
         record, folder = read_record(run), run
-        refit = None if in_training or split else refit_of_run(run, record)
-        if refit is not None:
+        if not (in_training or split) and (refit := refit_of_run(run, record)) is not None:
             record, folder = refit, run / REFIT
         if record.policy is None and not in_training:
-            warnings.warn(
+            warn_user(
                 f"the training in {run} has not ended: later weights may be better, and its "
-                "decision rule is not chosen yet; train again with the same command",
-                InputNote,
-                stacklevel=2,
+                "decision rule is not chosen yet; train again with the same command"
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
-        for name in (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"):
-            record.checksums(folder).require(name)  # however large
+        however_large = (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}")
+        record.checksums(folder).require(however_large, small=-1)
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
@@ -119,10 +106,9 @@ class TrainedPolicy:
             reward_model = load_module(fitted, build_model, load_tensors(fitted)[0]).eval()
         with damage_explained(folder / RETURNS, REMEDY):
             returns = load_tensors(folder / RETURNS)[0]["returns"]
-            if returns.dim() != 1 or returns.dtype != torch.float32 or not len(returns):
-                raise ValueError("returns are not a vector of numbers")
-            if not bool(torch.isfinite(returns).all()):
-                raise ValueError("returns are not finite")
+            is_vector = returns.dim() == 1 and returns.dtype == torch.float32 and len(returns)
+            if not is_vector or not bool(torch.isfinite(returns).all()):
+                raise ValueError("returns are not a vector of finite numbers")
         trained = cls(
             run,
             policy,
@@ -150,19 +136,17 @@ class TrainedPolicy:
             )
         state = self.record.observation_size + (0 if states is None else states.size)
         sizes_found: dict[str, tuple[Any, Any]] = {}
-        if states is None:
-            sizes_found[RUN] = (sizes["state"], state)
-        else:
-            table = sizes["items"], sizes["action"], sizes["state"]
-            sizes_found[ITEM_STATES] = (table, (*states.embeddings.shape, state))
         # A store that was not made from logs has no tables of items and users.
-        if self.item_ids is not None and (self.folder / ITEMS).exists():
-            sizes_found[ITEMS] = (sizes["items"], len(self.item_ids))
-        if states is not None and len(states.user_features) and (self.folder / USERS).exists():
-            sizes_found[USERS] = (len(states.user_features), len(self.user_ids))
+        if states is not None:
+            sizes_found[ITEM_STATES] = (sizes["items"], sizes["action"]), states.embeddings.shape
+            if self.item_ids is not None and (self.folder / ITEMS).exists():
+                sizes_found[ITEMS] = sizes["items"], len(self.item_ids)
+            if len(states.user_features) and (self.folder / USERS).exists():
+                sizes_found[USERS] = len(states.user_features), len(self.user_ids)
         if self.counts is not None:
-            shapes = tuple(self.counts.shown.shape), tuple(self.counts.liked.shape)
-            sizes_found[COUNTS] = (((sizes["items"],),) * 2, shapes)
+            shapes = self.counts.shown.shape, self.counts.liked.shape
+            sizes_found[COUNTS] = ((sizes["items"],),) * 2, shapes
+        sizes_found[RUN] = sizes["state"], state
         for name, (stated, actual) in sizes_found.items():
             if stated != actual:
                 raise InputError(
@@ -206,7 +190,7 @@ class TrainedPolicy:
     def logged_observation_size(self) -> int:
         """Columns that observations must have; 0 if the policy sees none."""
         size = self.record.observation_size
-        return size + len(self.dropped) if size else 0
+        return size and size + len(self.dropped)
 
     @property
     def returns(self) -> ReturnToGo:
@@ -218,13 +202,10 @@ class TrainedPolicy:
         return store_of(self.folder, self.record)
 
     def require_store(self, remedy: str) -> EpisodeStore:
-        """`training_store`, which must be there.
-
-        Args:
-            remedy: what to do where it is not, for the message.
+        """`training_store`.
 
         Raises:
-            InputError: it is gone, changed or damaged.
+            InputError: it is gone, changed or damaged; the message ends with `remedy`.
         """
         store = self.training_store()
         if store is None:
@@ -234,24 +215,17 @@ class TrainedPolicy:
         return store
 
     def target_return(self, quantile: float) -> float:
-        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units.
-
-        Raises:
-            InputError: the quantile is not between 0 and 1.
-        """
+        """The `quantile` (0 to 1) of `training_returns`, exact, in reward units."""
         if not 0 <= quantile <= 1:
             raise InputError(f"the target quantile is {quantile}; give a number from 0 to 1")
         return float(np.quantile(self.training_returns.astype(np.float64), quantile))
 
     def scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """The policy under `rule`, by default the run's own.
+        """The policy under `rule`, by default the run's own, which it must fit.
 
         What it computes once is kept for the next call with the same weights.
-
-        Raises:
-            InputError: the rule does not fit the policy.
         """
-        models = (self.policy, self.reward_model)
+        rule, models = rule or self.rule, (self.policy, self.reward_model)
         weights = [
             (id(tensor), tensor.data_ptr(), tensor._version)
             for model in models
@@ -261,20 +235,14 @@ class TrainedPolicy:
         if self._kept.get("weights") != weights:
             # The one before goes first, for its memory.
             self._kept.clear()
-            self._kept["scorer"] = Scorer(
-                *(self.policy, rule or self.rule, self.item_states, self.returns),
-                *(self.reward_model, self.session_end),
-            )
-            self._kept["weights"] = weights
+            states, end = self.item_states, self.session_end
+            scorer = Scorer(self.policy, rule, states, self.returns, self.reward_model, end)
+            self._kept.update(scorer=scorer, weights=weights)
         kept: Scorer = self._kept["scorer"]
-        return kept.under(rule or self.rule)
+        return kept.under(rule)
 
     def item_scorer(self, rule: DecisionRule | None = None) -> Scorer:
-        """`scorer` of a policy of items.
-
-        Raises:
-            InputError: the policy's actions are vectors, or the rule does not fit the policy.
-        """
+        """`scorer` of a policy of items; an `InputError` if its actions are vectors."""
         if self.item_states is None:
             raise InputError(
                 "this policy's actions are vectors; recommending needs a policy trained on items"
@@ -313,15 +281,8 @@ class TrainedPolicy:
 
 
 def read_rule(path: Path) -> DecisionRule:
-    """The decision rule in a file of a run.
-
-    Raises:
-        InputError: it is something else.
-    """
-    values = read_json(path)
-    if not isinstance(values, Mapping):
-        raise InputError(f"{path} is not a decision rule; train the policy again")
-    return DecisionRule.from_dict(values, str(path))
+    """The decision rule in a file of a run."""
+    return DecisionRule.from_dict(read_json(path), str(path))
 
 
 def _note_other_version(run: Path, record: RunRecord) -> None:
@@ -332,62 +293,14 @@ def _note_other_version(run: Path, record: RunRecord) -> None:
     now = policy_package(name)
     trained = f"{package} {record.versions.get(package, '')}"
     if trained != (installed := f"{now} {versions([now] if now else []).get(now, '')}"):
-        warnings.warn(
+        warn_user(
             f"{run} was trained with {trained}, but {installed} is installed: its policy {name!r} "
-            "may behave differently",
-            InputNote,
-            stacklevel=3,
+            "may behave differently"
         )
 
 
 def _read_ids(path: Path, column: str) -> Array:
-    if not path.exists():
-        return np.empty(0, dtype=np.int64)
-    return read_ids(path, column)
-
-
-def later_logs(
-    trained: TrainedPolicy, paths: Sequence[str | Path], stated: "LogMapping"
-) -> "tuple[tuple[Path, ...], LogMapping]":
-    """Log files of the dataset that a policy was trained on, whose columns may have plain names.
-
-    Args:
-        paths: files, folders and globs.
-        stated: what the caller says of the columns.
-
-    Raises:
-        InputError: a path is missing, or holds no log of the dataset.
-    """
-    from ucfrec.logs.mapping import Dataset, LogMapping  # training reads no logs
-
-    source = trained.record.data
-    # A record may also name a dataset that is not read by an adapter.
-    has_adapter = source.dataset in plugin_names("datasets")
-    dataset: Dataset = load_plugin("datasets", str(source.dataset) if has_adapter else "generic")
-    remembered = LogMapping.of_source(source, str(trained.folder)).remembered or LogMapping()
-    try:
-        files, mapping = dataset.resolve(paths, stated)
-    except InputError:
-        files, mapping = dataset.resolve(paths, stated.over(LogMapping(remembered.columns)))
-    columns = {name: text for name, text in mapping.columns.items() if name not in stated.columns}
-    return files, replace(stated, remembered=LogMapping(columns))
-
-
-def columns_used(trained: TrainedPolicy, mapping: "LogMapping") -> "LogMapping":
-    """The mapping with what the run remembers of its training log."""
-    from ucfrec.logs.mapping import LogMapping
-
-    mapping = mapping.over(LogMapping.of_source(trained.record.data, str(trained.folder / RUN)))
-    if trained.record.observation_size:
-        return mapping
-    return LogMapping({schema.OBSERVATION: ""}).over(mapping)
-
-
-def reward_of(trained: TrainedPolicy) -> "Expression":
-    """The run's reward, an SQL expression over the columns of its logs."""
-    from ucfrec.logs.expressions import Expression
-
-    return Expression(trained.record.reward, str(trained.folder / RUN))
+    return read_ids(path, column) if path.exists() else np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -395,9 +308,7 @@ class RunOnWorkers:
     """Which policy the workers load; small, as it is sent to them with each task."""
 
     folder: Path
-    """The run folder, which every worker sees."""
     checkpoint: str
-    """`best` or `last` weights."""
     fingerprint: str
 
     @classmethod
@@ -405,23 +316,15 @@ class RunOnWorkers:
         """The policy that was loaded with this checkpoint."""
         return cls(trained.folder.absolute(), checkpoint, trained.fingerprint)
 
+    @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:
-        """The policy; kept for the next task of this worker.
-
-        Raises:
-            InputError: the folder is missing there, or holds another run.
-        """
-        return _loaded(self)
-
-
-@lru_cache(maxsize=1)
-def _loaded(run: RunOnWorkers) -> TrainedPolicy:
-    # A worker has one core; the cluster runs as many workers as it has cores.
-    torch.set_num_threads(1)
-    trained = TrainedPolicy.load(run.folder, run.checkpoint)
-    if trained.fingerprint != run.fingerprint:
-        raise InputError(
-            f"{run.folder} has changed since the command started, or is another folder on a "
-            "worker; run it again once all workers see the same run"
-        )
-    return trained
+        """The policy; kept for the next task of this worker."""
+        # A worker has one core; the cluster runs as many workers as it has cores.
+        torch.set_num_threads(1)
+        trained = TrainedPolicy.load(self.folder, self.checkpoint)
+        if trained.fingerprint != self.fingerprint:
+            raise InputError(
+                f"{self.folder} has changed since the command started, or is another folder on a "
+                "worker; run it again once all workers see the same run"
+            )
+        return trained

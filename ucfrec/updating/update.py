@@ -72,7 +72,6 @@ def update_run(
         out: folder of the new run, new or interrupted.
         store: folder of the grown store; None for one beside `out`, with `-store` added.
         mapping: as of `ucfrec.logs.append.append_logs`.
-        options: None for the defaults.
 
     Returns:
         The record of the new run; `update` has the drift of the new rows and the verdict.
@@ -87,12 +86,10 @@ def update_run(
         raise InputError(f"{run} is not finished; train it to its end first")
     remedy = "move the run together with its store, or prepare all logs and train again"
     store_before = trained.require_store(remedy)
-    if (out / RUN).is_file():
-        earlier_update = RunRecord.read(out).update
-        if earlier_update is None or earlier_update.run != trained.fingerprint:
-            raise InputError(f"{out} is not an update of {run}; name another run folder")
-    elif os.path.lexists(out):
-        raise InputError(f"{out} exists already and is no run; name another run folder")
+    if os.path.lexists(out):
+        before = RunRecord.read(out).update if (out / RUN).is_file() else None
+        if before is None or before.run != trained.fingerprint:
+            raise InputError(f"{out} exists and is not an update of {run}; name another run folder")
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
@@ -104,18 +101,15 @@ def update_run(
         # In place of the settings of the rule's choice, it has the rule.
         settings = {k: v for k, v in repeated.items() if k not in ("rule", "weights")}
         full = replace(config_from_dict(settings), rule=replace(full.rule, choose=True))
-    config = warm_settings(full, options.share)
-    if options.seed is not None:
-        config = replace(config, seed=options.seed)
+    config, seed = warm_settings(full, options.share), options.seed
+    config = replace(config, seed=config.seed if seed is None else seed)
     update = Update(
         of=run.resolve().name,
         run=trained.fingerprint,
         settings_from_nothing=asdict(full),
         episodes=counts["episodes"],
-        appended={
-            **{name: counts[name] for name in _COUNTS},
-            "not_newer": counts["dropped"]["clock_out_of_range"],
-        },
+        appended={name: counts[name] for name in _COUNTS}
+        | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
     entries = {"update": update, "dropped_observations": trained.dropped}
     record = train_run(opened, out, config, entries, initial=run)
@@ -124,14 +118,13 @@ def update_run(
         # The drift of the new rows and the verdict.
         first = opened.n_episodes - record.update.episodes
         added = opened.select(np.arange(first, opened.n_episodes))
-        seed, training = record.config.seed, store_before.split("train")
+        training, seed = store_before.split("train"), config.seed
         changes = measure_drift(trained, training, added, counts, seed)
         is_newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
         newest = opened.select(np.flatnonzero(is_newest))
         earlier = opened.select(np.flatnonzero(~is_newest))
-        seen = None
-        if options.filter_seen:
-            seen = UserRows.of(newest, newest.episode_values(schema.USER), earlier)
+        users = newest.episode_values(schema.USER)
+        seen = UserRows.of(newest, users, earlier) if options.filter_seen else None
         new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)
         verdict = compare_runs(new, acting, newest, seed, seen)
         update = record.update.model_copy(update={"drift": changes, "verdict": verdict})

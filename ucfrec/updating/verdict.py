@@ -1,6 +1,6 @@
 """Whether an updated run is better than the one before, on rows that neither was trained on."""
 
-from typing import Any, Final, Literal
+from typing import Any, Final, get_args
 
 import numpy as np
 import torch
@@ -13,9 +13,15 @@ from ucfrec.off_policy.estimators import FEWEST_USERS, cluster_intervals
 from ucfrec.off_policy.score import score_steps
 from ucfrec.off_policy.verdict import OTHERS_REMOVED, check_mean_weight
 from ucfrec.results.statistics import effective_number
-from ucfrec.runs.record import Difference, UpdateVerdict
+from ucfrec.runs.record import Difference, UpdateResult, UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec.user_model.reward_report import RewardRows, calibration, fit_line, score_rows
+from ucfrec.user_model.reward_report import (
+    RewardRows,
+    calibration,
+    draw_steps,
+    fit_line,
+    score_rows,
+)
 
 RANKING: Final = "ndcg_liked"
 VALUE: Final = "reward per step"
@@ -67,11 +73,8 @@ def compare_runs(
             doubt = _doubt(weights, owner, seen is not None)
             differences.append(_compare(VALUE, lift, np.ones(len(lift)), owner, seed, doubt))
     decisive = differences[-1]
-    results: dict[int, Literal["better", "no significant difference", "worse"]] = {
-        1: "better", 0: "no significant difference", -1: "worse"
-    }  # fmt: skip
     return UpdateVerdict(
-        result=results[decisive.sign],
+        result=get_args(UpdateResult)[1 - decisive.sign],
         decided_by=decisive.measure,
         differences=tuple(differences),
         steps=rows.n_steps,
@@ -86,7 +89,7 @@ def describe(verdict: UpdateVerdict) -> str:
         f"rows of {verdict.users:,} users"
     ]
     for row in verdict.differences:
-        side = {1: "for", 0: "open", -1: "against"}[row.sign]
+        side = ("open", "for", "against")[row.sign]
         doubt = f"; not reliable: {row.doubt}" if row.doubt else ""
         interval = f"{row.value:+.4g} [{row.low:+.4g}, {row.high:+.4g}]"
         lines.append(f"  {side:<11} {row.measure} {interval}{doubt}")
@@ -201,11 +204,9 @@ def measure_drift(
     counts: dict[str, Any],
     seed: int,
 ) -> dict[str, Any]:
-    """What is different in new rows.
+    """What is different in the rows `added` to the `training` episodes of a run.
 
     Args:
-        training: the run's training episodes.
-        added: the new episodes of the grown store.
         counts: of `ucfrec.logs.append.append_logs`.
         seed: of the rows that are drawn from many.
 
@@ -223,29 +224,19 @@ def measure_drift(
     times_shown = old.counts.shown.numpy()
     times_shown_now = np.bincount(items[items >= 0], None, len(times_shown))
     rows = np.sort(np.random.default_rng(seed).integers(training.n_steps, size=_MOST_STEPS))
-    where, steps = training.locate(rows), max(counts["steps"], 1)
-    rewards = training.step_values(schema.REWARD, *where).astype(np.float64)
+    episodes, steps = training.locate(rows)
+    rewards = training.step_values(schema.REWARD, episodes, steps).astype(np.float64)
     measures = {
-        "unknown_items": counts["new_item_steps"] / steps,
-        "unknown_users": counts["new_user_steps"] / steps,
+        "unknown_items": counts["new_item_steps"] / max(counts["steps"], 1),
+        "unknown_users": counts["new_user_steps"] / max(counts["steps"], 1),
         "item_popularity": popularity_index(times_shown, times_shown_now),
         "rewards": reward_index(rewards, sample.column(schema.REWARD).astype(np.float64)),
     }
-    model = old.reward_model
-    if model is None:
+    model, (episodes, steps) = old.reward_model, draw_steps(sample, _MOST_STEPS, seed)
+    known = sample.step_values(schema.ITEM, episodes, steps) >= 0
+    if model is None or not known.any():
         return measures
-    reward_rows = RewardRows.of(sample, model.reach, _MOST_STEPS, seed)
-    keep = (reward_rows.items >= 0).nonzero()[:, 0]
-    if not len(keep):
-        return measures
-    reward_rows = RewardRows(
-        reward_rows.items[keep],
-        reward_rows.users[keep],
-        reward_rows.history.at(keep),
-        reward_rows.states[keep],
-        reward_rows.rewards[keep],
-        reward_rows.observations,
-    )
+    reward_rows = RewardRows.at(sample, episodes[known], steps[known], model.reach)
     scores = score_rows(model, reward_rows)[0]
     predicted = model.expect(scores).double().numpy()
     observed = reward_rows.rewards.double().numpy()
@@ -275,11 +266,9 @@ def describe_drift(drift: dict[str, Any]) -> str:
 
 
 def restrict_to_run(view: EpisodeStore, trained: TrainedPolicy) -> EpisodeStore:
-    """The episodes of a view, in memory, with the item states of a run.
+    """The episodes of a view of a store that was grown from a run's, in memory.
 
-    Args:
-        view: of a store that was grown from the run's.
-        trained: the run; users and items that it does not know become −1.
+    They have the run's item states; users and items that it does not know become −1.
     """
     assert trained.item_states is not None
     steps = {name: view.column(name) for name in view.record.columns}

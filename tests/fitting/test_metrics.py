@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tensorboardX.proto.event_pb2 import Event
 
 from ucfrec.errors import InputError
-from ucfrec.fitting.checkpoint import METRICS, MetricsLog, read_metrics
+from ucfrec.fitting.metrics import METRICS, MetricsLog, read_metrics
 
 
 def logged(folder: Path, start: int, rows: dict[int, dict[str, float]]) -> None:
@@ -28,31 +28,16 @@ def test_what_is_logged_is_read_and_each_line_is_json(tmp_path: Path) -> None:
     found = read_metrics(tmp_path)
     assert found["loss"] == {5: 1.5, 10: 0.1 + 0.2}
     assert math.isnan(found["entropy"][5])
-
-    def refuse(name: str) -> float:
-        raise AssertionError(f"{name} is no JSON")
-
     lines = (tmp_path / METRICS).read_text().splitlines()
-    rows = [json.loads(line, parse_constant=refuse) for line in lines]
+    rows = [json.loads(line, parse_constant=pytest.fail) for line in lines]
     assert rows == [{"step": 5, "loss": 1.5, "entropy": None}, {"step": 10, "loss": 0.1 + 0.2}]
-
-
-def test_lines_are_on_disk_before_the_log_is_closed(tmp_path: Path) -> None:
-    log = MetricsLog(tmp_path, 0)
-    log.add(1, {"loss": 2.0})
-    assert read_metrics(tmp_path) == {"loss": {1: 2.0}}
-    log.close()
 
 
 def test_steps_that_a_resumed_training_logs_again_override(tmp_path: Path) -> None:
     logged(tmp_path, 0, {5: {"loss": 3.0}, 10: {"loss": 2.0}, 15: {"loss": 9.0}})
     logged(tmp_path, 10, {15: {"loss": 1.0}, 20: {"loss": 0.5}})
-    assert list(read_metrics(tmp_path)["loss"].items()) == [
-        (5, 3.0),
-        (10, 2.0),
-        (15, 1.0),
-        (20, 0.5),
-    ]
+    found = read_metrics(tmp_path)["loss"]
+    assert [*found.items()] == [(5, 3.0), (10, 2.0), (15, 1.0), (20, 0.5)]
 
 
 def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Path) -> None:
@@ -69,14 +54,11 @@ def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Pat
     ("line", "says"),
     [
         ("", "is not JSON"),
-        ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
         ('{"step": 1, "loss": ' + "1" * 5000 + "}", "is not JSON"),
         ("[1]", "is not a JSON object"),
-        ("null", "is not a JSON object"),
         ('{"loss": 1}', "no whole number of 0 or more as 'step'"),
         ('{"step": -1}', "no whole number"),
-        ('{"step": 1.5}', "no whole number"),
         ('{"step": true}', "no whole number"),
         ('{"step": 1' + "0" * 30 + "}", "no whole number"),
         ('{"step": 1, "loss": "low"}', "no number as 'loss'"),
@@ -139,6 +121,7 @@ def test_tensorboard_gets_the_same(tmp_path: Path) -> None:
     log.add(5, {"loss": 1.5})
     (file,) = tmp_path.glob("events.out.tfevents.*")
     assert events(file) == {5: {"loss": 1.5}}  # on disk while the training runs
+    assert read_metrics(tmp_path) == {"loss": {5: 1.5}}
     log.close()
     logged(tmp_path, 5, {10: {"loss": 0.25}})
     (resumed,) = set(tmp_path.glob("events.out.tfevents.*")) - {file}

@@ -190,13 +190,12 @@ def env() -> gymnasium.Env[Any, Any]:
     return gymnasium.make(ID)
 
 
-def test_an_attribute_is_found_through_wrappers(env: gymnasium.Env[Any, Any]) -> None:
+def test_features_are_read_from_attributes_arrays_and_tables(
+    env: gymnasium.Env[Any, Any], tmp_path: Path
+) -> None:
     expected = {"item_id": [0, 1, 2, 3], "features": [[0, 1], [2, 3], [4, 5], [6, 7]]}
     for source in ("vectors", "unwrapped.vectors", "unwrapped.vectors.T.T"):
         assert item_table(source, env, ITEMS).to_pydict() == expected
-
-
-def test_arrays_are_read_from_files(env: gymnasium.Env[Any, Any], tmp_path: Path) -> None:
     path = tmp_path / "items.npy"
     np.save(path, np.array([3, 1, 4, 1]))
     assert item_table(str(path), env, ITEMS)["features"].to_pylist() == [3, 1, 4, 1]
@@ -204,11 +203,6 @@ def test_arrays_are_read_from_files(env: gymnasium.Env[Any, Any], tmp_path: Path
     tags = item_table(str(path), env, ITEMS)["tags"]
     assert tags.to_pylist() == [[0, 2], [], [1], [0, 1, 2]]
     assert pa.types.is_integer(tags.type.value_type)
-
-
-def test_rows_of_a_parquet_file_are_put_in_order(
-    env: gymnasium.Env[Any, Any], tmp_path: Path
-) -> None:
     path = tmp_path / "items.parquet"
     pq.write_table(pa.table({"kind": ["c", "a", "d", "b"], "item_id": [2, 0, 3, 1]}), path)
     table = item_table(str(path), env, ITEMS)

@@ -88,99 +88,47 @@ def with_text(frame: pd.DataFrame, column: str = "item_id") -> pd.DataFrame:
 
 
 SHOWN = pd.DataFrame({"user_id": [1, 1], "score": [1.0, 2.0], "liked": [0, 1]})
-WRONG: dict[str, tuple[Callable[[], float], str]] = {
-    "no rank": (
-        lambda: metrics.recall(RECOMMENDED.drop(columns="rank"), RELEVANT),
-        "recommended has no column rank",
-    ),
-    "nothing relevant": (
-        lambda: metrics.mrr(RECOMMENDED, RELEVANT.head(0)),
-        "relevant has no rows",
-    ),
-    "k of 0": (lambda: metrics.hit_rate(RECOMMENDED, RELEVANT, 0), "k is 0; give a whole number"),
-    "part of an item": (lambda: metrics.precision(RECOMMENDED, RELEVANT, k=2.5), "k is 2.5"),
-    "k as float": (lambda: metrics.ndcg(RECOMMENDED, RELEVANT, k=2.0), "k is 2.0; give a whole"),
-    "ranks from 0": (
-        lambda: metrics.ndcg(RECOMMENDED.assign(rank=RECOMMENDED["rank"] - 1), RELEVANT),
-        "rank is 0 in a row; ranks count from 1",
-    ),
-    "equal ranks": (
-        lambda: metrics.precision(RECOMMENDED.assign(rank=1), RELEVANT),
-        r"in \d+ rows rank is no whole number, or that of another row of the user",
-    ),
-    "halves of ranks": (
-        lambda: metrics.ndcg(RECOMMENDED.assign(rank=RECOMMENDED["rank"] + 0.5), RELEVANT),
-        "rank is no whole number",
-    ),
-    "no score": (
-        lambda: metrics.gauc(SHOWN.assign(score=[np.nan, 1.0])),
-        "score is missing in 1 rows",
-    ),
-    "no ranks": (lambda: metrics.mrr(RECOMMENDED.assign(rank=np.nan), RELEVANT), "rank is nan"),
-    "text as rank": (lambda: metrics.mrr(RECOMMENDED.assign(rank="1"), RELEVANT), "rank is 1 in"),
-    "relevant text": (
-        lambda: metrics.hit_rate(RECOMMENDED, with_text(RELEVANT)),
-        "item_id holds numbers in recommended, but text in relevant; convert one of them",
-    ),
-    "categories of text": (
-        lambda: metrics.recall(with_text(RECOMMENDED).astype({"item_id": "category"}), RELEVANT),
-        "item_id holds text in recommended, but numbers in relevant",
-    ),
-    "users as text": (
-        lambda: metrics.hit_rate(RECOMMENDED, with_text(RELEVANT, "user_id")),
-        "user_id holds numbers in recommended, but text in relevant",
-    ),
-    "history of text": (
-        lambda: metrics.novelty(RECOMMENDED, with_text(HISTORY)),
-        "item_id holds numbers in recommended, but text in history",
-    ),
-    "popularity of text": (
-        lambda: metrics.serendipity(RECOMMENDED, RELEVANT, with_text(HISTORY), CATALOGUE),
-        "item_id holds numbers in recommended, but text in history",
-    ),
-    "serendipity of text": (
-        lambda: metrics.serendipity(RECOMMENDED, with_text(RELEVANT), HISTORY, CATALOGUE),
-        "item_id holds numbers in recommended, but text in relevant",
-    ),
-    "catalogue of text": (
-        lambda: metrics.coverage(RECOMMENDED, [*map(str, CATALOGUE)]),
-        "item_id holds numbers in recommended, but text in catalogue",
-    ),
-    "no catalogue": (lambda: metrics.coverage(RECOMMENDED, []), "catalogue is empty"),
-    "small catalogue": (
-        lambda: metrics.serendipity(RECOMMENDED, RELEVANT, HISTORY, CATALOGUE[:1]),
-        "catalogue lacks .* recommended items, such as",
-    ),
-    "liked unknown": (
-        lambda: metrics.gauc(SHOWN.assign(liked=[1.0, np.nan])),
-        "liked is neither true nor false in 1 rows",
-    ),
-    "liked as text": (
-        lambda: metrics.gauc(with_text(SHOWN, "liked")),
-        "liked is neither true nor false in 2 rows",
-    ),
-    "an item without features": (
-        lambda: metrics.diversity(RECOMMENDED, FEATURES.drop(index=100)),
-        "1 recommended items have no row, such as 100",
-    ),
-    "features twice": (
-        lambda: metrics.diversity(RECOMMENDED, pd.concat([FEATURES, FEATURES])),
-        "features has several rows of item .*; give one row per item",
-    ),
-    "features as lists": (
-        lambda: metrics.diversity(RECOMMENDED, FEATURES.assign(tags=[["a"]] * len(FEATURES))),
-        "features: tags holds lists",
-    ),
-    "no features": (
-        lambda: metrics.diversity(RECOMMENDED, FEATURES[[]]),
-        "features has no columns",
-    ),
-}
-"""Measurements, and why they are refused."""
+CATEGORIES = with_text(RECOMMENDED).astype({"item_id": "category"})
+LISTS = FEATURES.assign(tags=[["a"]] * len(FEATURES))
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_cannot_be_measured(case: str) -> None:
-    use, message = WRONG[case]
-    with pytest.raises(InputError, match=message):
-        use()
+def ranked(change: Callable[[pd.Series], Any]) -> pd.DataFrame:
+    return RECOMMENDED.assign(rank=change(RECOMMENDED["rank"]))
+
+
+NUMBERS = "item_id holds numbers in recommended, but text in"
+WRONG: list[tuple[str, tuple[Any, ...], str]] = [
+    ("recall", (RECOMMENDED.drop(columns="rank"), RELEVANT), "recommended has no column rank"),
+    ("mrr", (RECOMMENDED, RELEVANT.head(0)), "relevant has no rows"),
+    ("hit_rate", (RECOMMENDED, RELEVANT, 0), "k is 0; give a whole number"),
+    ("precision", (RECOMMENDED, RELEVANT, 2.5), "k is 2.5"),
+    ("ndcg", (RECOMMENDED, RELEVANT, 2.0), "k is 2.0; give a whole"),
+    ("ndcg", (ranked(lambda rank: rank - 1), RELEVANT), "rank is 0 in a row; ranks count from 1"),
+    ("precision", (ranked(lambda _: 1), RELEVANT), r"in \d+ rows .* or that of another row of the"),
+    ("ndcg", (ranked(lambda rank: rank + 0.5), RELEVANT), "rank is no whole number"),
+    ("mrr", (ranked(lambda _: np.nan), RELEVANT), "rank is nan"),
+    ("mrr", (ranked(lambda _: "1"), RELEVANT), "rank is 1 in"),
+    ("gauc", (SHOWN.assign(score=[np.nan, 1.0]),), "score is missing in 1 rows"),
+    ("gauc", (SHOWN.assign(liked=[1.0, np.nan]),), "liked is neither true nor false in 1 rows"),
+    ("gauc", (with_text(SHOWN, "liked"),), "liked is neither true nor false in 2 rows"),
+    ("hit_rate", (RECOMMENDED, with_text(RELEVANT)), f"{NUMBERS} relevant; convert one of them"),
+    ("recall", (CATEGORIES, RELEVANT), "holds text in recommended, but numbers in relevant"),
+    ("hit_rate", (RECOMMENDED, with_text(RELEVANT, "user_id")), "user_id holds numbers in rec"),
+    ("novelty", (RECOMMENDED, with_text(HISTORY)), f"{NUMBERS} history"),
+    ("serendipity", (RECOMMENDED, RELEVANT, with_text(HISTORY), CATALOGUE), f"{NUMBERS} history"),
+    ("serendipity", (RECOMMENDED, with_text(RELEVANT), HISTORY, CATALOGUE), f"{NUMBERS} relevant"),
+    ("coverage", (RECOMMENDED, [*map(str, CATALOGUE)]), f"{NUMBERS} catalogue"),
+    ("coverage", (RECOMMENDED, []), "catalogue is empty"),
+    ("serendipity", (RECOMMENDED, RELEVANT, HISTORY, CATALOGUE[:1]), "catalogue lacks .* such as"),
+    ("diversity", (RECOMMENDED, FEATURES.drop(index=100)), "1 .* have no row, such as 100"),
+    ("diversity", (RECOMMENDED, pd.concat([FEATURES] * 2)), "features has several rows of item"),
+    ("diversity", (RECOMMENDED, LISTS), "features: tags holds lists"),
+    ("diversity", (RECOMMENDED, FEATURES[[]]), "features has no columns"),
+]
+"""Metric, what it is asked about, and why that is refused."""
+
+
+@pytest.mark.parametrize(("metric", "arguments", "says"), WRONG)
+def test_what_cannot_be_measured(metric: str, arguments: tuple[Any, ...], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        getattr(metrics, metric)(*arguments)

@@ -64,24 +64,6 @@ def test_users_that_do_not_differ_or_are_few_decide_nothing(
     assert "nothing can be said yet" in said
 
 
-def test_rows_of_one_user_count_as_one(tmp_path: Path) -> None:
-    log(500, 0.0).to_parquet(tmp_path / "log.parquet")
-    once = compare_arms([tmp_path / "log.parquet"])
-    frame = log(500, 0.0)
-    pd.concat([frame] * 4).to_parquet(tmp_path / "again.parquet")
-    assert compare_arms([tmp_path / "again.parquet"]).error == pytest.approx(once.error)
-
-
-def test_users_in_several_arms_and_rows_without_one_are_left_out(tmp_path: Path) -> None:
-    frame = log(200, 0.0)
-    both = frame[frame.user_id == "1"].assign(arm="b")
-    pd.concat([frame, both, frame.assign(arm="")]).to_parquet(tmp_path / "log.parquet")
-    found = compare_arms([tmp_path / "log.parquet"])
-    assert (found.in_several, found.users) == (1, (159, 40))
-    named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
-    assert named.difference == pytest.approx(-found.difference)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -138,8 +120,17 @@ def test_rows_without_a_user_or_an_arm_are_counted(tmp_path: Path) -> None:
     found = compare_arms([tmp_path / "log.parquet"])
     assert (found.without_user, found.without_arm, found.in_several) == (11, 5, 0)
     assert "11 rows have no user_id; they are left out\n5 rows have no arm;" in str(found)
-    same = replace(found, without_user=0, without_arm=0)
-    assert same == compare_arms([tmp_path / "kept.parquet"])
+    once = compare_arms([tmp_path / "kept.parquet"])
+    assert replace(found, without_user=0, without_arm=0) == once
+    # Rows of one user count as one, and users of several arms not at all.
+    both = frame[frame.user_id == "1"].assign(arm="b")
+    pd.concat([frame] * 4).to_parquet(tmp_path / "log.parquet")
+    assert compare_arms([tmp_path / "log.parquet"]).error == pytest.approx(once.error)
+    pd.concat([frame, both]).to_parquet(tmp_path / "log.parquet")
+    found = compare_arms([tmp_path / "log.parquet"])
+    assert (found.in_several, found.users) == (1, (159, 40))
+    named = compare_arms([tmp_path / "log.parquet"], arms=("b", "a"))
+    assert named.difference == pytest.approx(-found.difference)
 
 
 def test_users_and_arms_in_csv_files_are_the_text_of_the_file(tmp_path: Path) -> None:

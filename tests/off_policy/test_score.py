@@ -287,21 +287,15 @@ def test_a_refit_has_seen_the_test_split_too(
     assert "100% of the rows were seen in training" in (again / CARD).read_text()
 
 
-def test_without_the_training_store_nothing_is_known(
+def test_a_run_that_was_moved_with_its_store_finds_it(
     folder: Path, trained: TrainedPolicy, logged: LoggedSessions, tmp_path: Path
 ) -> None:
-    shutil.copytree(folder / "store", tmp_path / "store")
+    for name in ("run", "store"):
+        shutil.copytree(folder / name, tmp_path / name)
     for store in (tmp_path / "gone", tmp_path / "store"):
         places = {"store": str(store), "store_from_run": "../gone"}
         moved = replace(trained, record=trained.record.copy_with(**places))
         assert (share_seen(moved, logged.store) is None) is (store.name == "gone")
-
-
-def test_a_run_that_was_moved_with_its_store_finds_it(
-    folder: Path, trained: TrainedPolicy, tmp_path: Path
-) -> None:
-    for name in ("run", "store"):
-        shutil.copytree(folder / name, tmp_path / name)
     record = trained.record.copy_with(store=str(tmp_path / "gone"))
     found = store_of(tmp_path / "run", record)
     assert found is not None

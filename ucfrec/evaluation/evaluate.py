@@ -2,19 +2,17 @@
 novelty and dominance of the items recommended (EasyRL4Rec, DORL)."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
+from ucfrec.acting.rollout import Actor, Episodes, rollout
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.states import TrainingCounts
@@ -34,8 +32,8 @@ TAGS: Final = "tags"
 """Catalogue column with the list of each item's tags."""
 ONE_HOT: Final = "tag_"
 """Prefix of catalogue columns, one per tag, that are above 0 for items with the tag."""
-Similarity = Callable[[IntArray, IntArray], npt.NDArray[np.floating]]
-"""Similarity (M,) of two aligned arrays of items (M,), at most 1; equal items have 1."""
+Recommended = Sequence[tuple[IntArray, IntArray]]
+"""Episode and item of every live episode, step by step."""
 
 
 @random_state_kept()
@@ -101,8 +99,15 @@ def _row(
     numbers: IntArray | None = None,
 ) -> ResultRow:
     start = time.perf_counter()
-    recommended, describe = Recommended(), f"{columns['method']} in {environment.name}"
-    played = rollout(env, actor, episodes, seed, recommended.record, describe)
+    recommended: list[tuple[IntArray, IntArray]] = []
+    played = rollout(
+        env,
+        actor,
+        episodes,
+        seed,
+        lambda step: recommended.append((step.episodes, step.actions)),
+        f"{columns['method']} in {environment.name}",
+    )
     seconds = time.perf_counter() - start
     variety: Mapping[str, float | None] = {}
     if isinstance(env.single_action_space, spaces.Discrete):
@@ -171,37 +176,9 @@ def session_metrics(played: Episodes) -> dict[str, float]:
     }
 
 
-@dataclass
-class Recommended:
-    """The recommended items of all episodes, collected by `rollout(…, on_step=self.record)`."""
-
-    _episodes: list[IntArray] = field(default_factory=list)
-    _items: list[IntArray] = field(default_factory=list)
-
-    def record(self, step: Step) -> None:
-        """Add one step."""
-        self._episodes.append(step.episodes)
-        self._items.append(step.actions)
-
-    def sessions(self) -> tuple[IntArray, IntArray]:
-        """Episode index (M,) and item (M,) of all steps, sorted by episode and then by step."""
-        episodes = np.concatenate(self._episodes)
-        order = np.argsort(episodes, kind="stable")
-        return episodes[order], np.concatenate(self._items)[order]
-
-
-def coverage(items: IntArray, n_items: int) -> float:
-    """CV: share of the `n_items` items of the catalogue that occur in `items` (M,)."""
-    return len(np.unique(items)) / n_items
-
-
-def coverage_per_turn(items: IntArray) -> float:
-    """CV_turn: number of distinct items in `items` (M,), divided by M."""
-    return len(np.unique(items)) / len(items)
-
-
-def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> float:
-    """Mean over episodes of the mean of 1 − similarity over pairs of steps; 1 for a single step.
+def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> float:
+    """Mean over episodes of the mean over pairs of steps of 1 − Jaccard similarity of their items'
+    tags, 0 for equal items; 1 for a single step.
 
     `episodes` (M,) are sorted indices, `items` (M,) the items of these steps; M is at least 1.
     """
@@ -211,36 +188,18 @@ def diversity(episodes: IntArray, items: IntArray, similarity: Similarity) -> fl
     later = last - np.arange(len(items)) - 1
     first = np.repeat(np.arange(len(items)), later)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    distances = 1.0 - similarity(items[first], items[second])
+    one, other = items[first], items[second]
+    shared = (incidence[one] & incidence[other]).sum(axis=1)
+    either = (incidence[one] | incidence[other]).sum(axis=1)
+    distances = np.where(one == other, 0.0, 1.0 - shared / np.maximum(either, 1))
     owner = np.searchsorted(starts, first, side="right") - 1
     total = np.bincount(owner, weights=distances, minlength=len(starts))
     pairs = lengths * (lengths - 1) / 2
     return float(np.where(lengths > 1, total / np.maximum(pairs, 1), 1.0).mean())
 
 
-def tag_jaccard(incidence: BoolArray) -> Similarity:
-    """Jaccard similarity of two items' tags, from `incidence` (n_items, n_tags); 0 without tags."""
-
-    def similarity(first: IntArray, second: IntArray) -> npt.NDArray[np.floating]:
-        shared = (incidence[first] & incidence[second]).sum(axis=1)
-        either = (incidence[first] | incidence[second]).sum(axis=1)
-        return np.where(first == second, 1.0, shared / np.maximum(either, 1))
-
-    return similarity
-
-
-def novelty(items: IntArray, popularity: npt.NDArray[np.floating]) -> float:
-    """Mean of −ln(popularity) over recommended items (M,), in nats.
-
-    Popularity (n_items,) is interactions divided by users, at least one above 0; an item with 0
-    counts as the least popular item above 0.
-    """
-    lowest = popularity[popularity > 0].min()
-    return float(-np.log(np.maximum(popularity, lowest))[items].mean())
-
-
-def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8) -> BoolArray:
-    """Dominant tags (n_tags,): the most frequent ones that together cover at most `share`.
+def dominant_tags(incidence: BoolArray, positives: IntArray) -> BoolArray:
+    """Dominant tags (n_tags,): the most frequent ones that together cover at most 80%.
 
     The most frequent one is always dominant, if it counts at all.
 
@@ -251,18 +210,10 @@ def dominant_tags(incidence: BoolArray, positives: IntArray, share: float = 0.8)
     """
     counts = positives @ incidence.astype(np.int64)
     order = np.argsort(-counts, kind="stable")
-    covered = np.cumsum(counts[order]) / max(counts.sum(), 1)
-    frequent = covered <= share
-    frequent[:1] = True
-    dominant = np.zeros(len(counts), dtype=np.bool_)
-    dominant[order[frequent]] = True
+    dominant = np.empty(len(counts), dtype=np.bool_)
+    dominant[order] = np.cumsum(counts[order]) / max(counts.sum(), 1) <= 0.8
+    dominant[order[:1]] = True
     return dominant & (counts > 0)
-
-
-def dominance(items: IntArray, incidence: BoolArray, dominant: BoolArray) -> float:
-    """MCD: share of recommended items (M,) that have a tag of `dominant_tags` (n_tags,), given the
-    incidence (n_items, n_tags)."""
-    return float(incidence[items][:, dominant].any(axis=1).mean())
 
 
 def variety_columns(
@@ -280,14 +231,15 @@ def variety_columns(
         numbers: (items of the log,) the environment's index of each item, −1 for items that it
             lacks.
     """
-    episodes, items = recommended.sessions()
-    n_items = len(environment_items(env))
+    sessions = np.hstack(recommended)
+    episodes, items = sessions[:, np.argsort(sessions[0], kind="stable")]
+    n_items, distinct = len(environment_items(env)), len(np.unique(items))
     row: dict[str, float | None] = dict.fromkeys(COLUMNS)
-    row["coverage"] = coverage(items, n_items)
-    row["coverage_per_turn"] = coverage_per_turn(items)
+    row["coverage"] = distinct / n_items
+    row["coverage_per_turn"] = distinct / len(items)
     incidence = _read_incidence(env)
     if incidence is not None:
-        row["diversity"] = diversity(episodes, items, tag_jaccard(incidence))
+        row["diversity"] = diversity(episodes, items, incidence)
     if counts is None or numbers is None:
         return row
     shown, liked = (
@@ -295,10 +247,14 @@ def variety_columns(
         for counted in (counts.shown, counts.liked)
     )
     if shown.any():
-        row["novelty"] = novelty(items, shown / counts.episodes)
+        # In nats; an item that was never shown counts as the rarest.
+        popularity = shown / counts.episodes
+        popularity = np.maximum(popularity, popularity[popularity > 0].min())
+        row["novelty"] = float(-np.log(popularity[items]).mean())
     if incidence is not None and liked.any():
         dominant = dominant_tags(incidence, liked.astype(np.int64))
-        row["majority_category_dominance"] = dominance(items, incidence, dominant)
+        of_dominant = incidence[items][:, dominant].any(axis=1)
+        row["majority_category_dominance"] = float(of_dominant.mean())
     return row
 
 

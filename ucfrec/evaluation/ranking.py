@@ -1,11 +1,11 @@
 """Ranking metrics on a later period: the rank of the items that users were shown or clicked.
 
 At every step, the whole catalogue is ranked from what was known before the step; no negatives are
-sampled (Krichene & Rendle, KDD 2020). `Liked` says what counts as liked (a click).
+sampled (Krichene & Rendle, KDD 2020). What counts as liked (a click) can be said.
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,29 +32,14 @@ _STEPS_AT_ONCE = 1024
 _ROWS: Final = "steps"
 
 
-class Liked(Protocol):
-    """Says by their rewards whether steps were liked; `str` of it states by what."""
-
-    def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        """(N,) of N steps of `store`, given their rewards (N,)."""
-
-
-class LikedByRange:
-    """A step is liked if its reward lies at least `LIKED` of the way up the training rewards."""
-
-    def __init__(self, states: ItemStates) -> None:
-        self._low, self._high = float(states.reward_low), float(states.reward_high)
-
-    def __call__(self, store: EpisodeStore, rewards: Array) -> BoolArray:
-        return liked_rewards(store, rewards)
-
-    def __str__(self) -> str:
-        least = least_liked(self._low, self._high)
-        return (
-            f"reward >= {least:.4g} ({LIKED:.0%} of the way from {self._low:.4g}, the lowest "
-            f"training reward, to {self._high:.4g}, the highest or two standard deviations above "
-            "the mean, if that is less)"
-        )
+def describe_liked(states: ItemStates) -> str:
+    """States which steps `liked_rewards` takes to be liked."""
+    low, high = float(states.reward_low), float(states.reward_high)
+    return (
+        f"reward >= {least_liked(low, high):.4g} ({LIKED:.0%} of the way from {low:.4g}, the "
+        f"lowest training reward, to {high:.4g}, the highest or two standard deviations above the "
+        "mean, if that is less)"
+    )
 
 
 class LikedExpression:
@@ -232,21 +217,17 @@ class Period:
     n_items: int
 
     @classmethod
-    def of(cls, store: EpisodeStore, users: Array, liked: Liked = liked_rewards) -> "Period":
+    def of(
+        cls,
+        store: EpisodeStore,
+        users: Array,
+        liked: Callable[[EpisodeStore, Array], BoolArray] = liked_rewards,
+    ) -> "Period":
         """The steps of `store`; `users` (E,) are the user identifiers of its E episodes, and
-        `liked` says of steps whether they were liked."""
+        `liked` says of steps, by their rewards, whether they were liked."""
         n_items, episodes = len(store.item_states.embeddings), store.all_steps()[0]
         items = store.column(schema.ITEM).astype(np.int64)
         return cls(users[episodes], items, liked(store, store.column(schema.REWARD)), n_items)
-
-    @property
-    def item_rates(self) -> Float64Array:
-        """Share (n_items,) of each item's impressions in the period that were liked; NaN for items
-        that were never shown."""
-        shown = np.bincount(self.items, minlength=self.n_items)
-        liked = np.bincount(self.items, self.liked, minlength=self.n_items)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(liked / np.where(shown > 0, shown, np.nan))
 
 
 MEASURES: Mapping[str, str] = {
@@ -278,33 +259,27 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
         return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
 
     every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
-    rates = np.append(period.item_rates, np.nan)[ranked.top]  # −1: no item
-    listed_items = ~np.isnan(rates)
+    counted = np.bincount(period.items, minlength=period.n_items)
+    rates = np.bincount(period.items, liked, period.n_items)
+    with np.errstate(invalid="ignore"):
+        rates = np.append(rates / counted, np.nan)[ranked.top]  # −1: no item
+    known = sum_by_user((~np.isnan(rates)).sum(1))
+    # Of each item that a user liked: whether it is recommended at the user's first step.
+    wanted = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
+    first = np.unique(owner, return_index=True)[1]
+    found = (ranked.top[first[wanted[0]]] == wanted[1][:, None]).any(axis=1)
+    n_liked = np.bincount(wanted[0], minlength=len(users))
+    recalled = np.bincount(wanted[0], found, len(users)) / np.maximum(n_liked, 1)
     return {
         "hit_rate_shown": (sum_by_user(hit), sum_by_user(every)),
         "ndcg_shown": (sum_by_user(gain), sum_by_user(every)),
         "hit_rate_liked": (sum_by_user(hit * liked), sum_by_user(liked)),
         "ndcg_liked": (sum_by_user(gain * liked), sum_by_user(liked)),
-        "recall_liked": _recall(period, ranked, owner, len(users)),
+        "recall_liked": (recalled, (n_liked > 0).astype(np.float64)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
-        "item_rate": (sum_by_user(np.nansum(rates, axis=1)), sum_by_user(listed_items.sum(1))),
-        "known": (sum_by_user(listed_items.sum(1)), sum_by_user((ranked.top >= 0).sum(1))),
+        "item_rate": (sum_by_user(np.nansum(rates, axis=1)), known),
+        "known": (known, sum_by_user((ranked.top >= 0).sum(1))),
     }
-
-
-def _recall(
-    period: Period, ranked: Ranked, owner: IntArray, n_users: int
-) -> tuple[Float64Array, Float64Array]:
-    """Per user: the share of liked items recommended at the first step, and 1; 0 and 0 if none."""
-    pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
-    # Steps are sorted by time within a user, so the first row of a user is the first step.
-    first = np.full(n_users, len(owner))
-    np.minimum.at(first, owner, np.arange(len(owner)))
-    hits = (ranked.top[first[pairs[0]]] == pairs[1][:, None]).any(1)
-    n_liked = np.bincount(pairs[0], minlength=n_users)
-    with np.errstate(invalid="ignore"):
-        share = np.nan_to_num(np.bincount(pairs[0], hits, minlength=n_users) / n_liked)
-    return share, (n_liked > 0).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -327,17 +302,12 @@ def compare(
     """Measures of every ranker (name: results), with intervals over users and differences from
     `reference`, by a bootstrap that draws the same users for all rankers.
     """
-    measured = [measure(period, entry) for entry in ranked.values()]
+    measured = [[*measure(period, entry).values()] for entry in ranked.values()]
     # (U, rankers, measures), so that one draw of users serves all rankers.
-    above, below = (
-        np.stack(
-            [np.stack([entry[m][part] for m in MEASURES], axis=1) for entry in measured], axis=1
-        )
-        for part in (0, 1)
-    )
-    n_users, n_rankers, n_measures = above.shape
+    above, below = np.ascontiguousarray(np.transpose(measured, (2, 3, 0, 1)))
+    n_users, size = len(above), (-1, len(ranked), len(MEASURES))
     ratios = resampled_ratios(above.reshape(n_users, -1), below.reshape(n_users, -1), seed)
-    resampled = ratios.reshape(-1, n_rankers, n_measures)
+    resampled = ratios.reshape(size)
     with np.errstate(invalid="ignore"):
         values = above.sum(0) / below.sum(0)
     column = list(ranked).index(reference)

@@ -24,12 +24,12 @@ from ucfrec.evaluation.ranking import (
     MEASURES,
     Compared,
     Later,
-    Liked,
-    LikedByRange,
+    LikedExpression,
     Period,
     Ranker,
     Steps,
     compare,
+    describe_liked,
     name_rankers,
     rank_steps,
 )
@@ -38,6 +38,7 @@ from ucfrec.policies.baselines import (
     BoostedPolicy,
     ItemKNNConfig,
     ItemKNNPolicy,
+    LikedOf,
     RecentClicksPolicy,
     RecentRatePolicy,
     count_decayed,
@@ -97,14 +98,6 @@ def same_for_all(name: str, items: Tensor) -> NamedRanker:
     return NamedRanker(name, lambda _: items.unsqueeze(0))
 
 
-def random_ranker(n_items: int, seed: int) -> NamedRanker:
-    """Ranks items by scores that are uniform in [0, 1)."""
-    drawn = torch.Generator().manual_seed(seed)
-    return NamedRanker(
-        "random", lambda steps: torch.rand(len(steps.steps), n_items, generator=drawn)
-    )
-
-
 def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> NamedRanker:
     """Ranks items by their cosine to the user's latest rewarded items, of all sessions, also before
     the log; ties go to the popular ones. See `ItemKNNPolicy`."""
@@ -127,50 +120,41 @@ def boosted_ranker(train: EpisodeStore, seed: int) -> NamedRanker:
     return NamedRanker("boosted clicks", lambda steps: policy.act(steps.windows(_KNN_HISTORY + 1)))
 
 
-class MatrixFactorisation:
-    """Factors of users and items from the users' liked items: ALS (Hu et al., 2008) or BPR (Rendle
-    et al., 2009); needs the package `implicit`."""
+def factor_ranker(
+    name: _Factors, train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
+) -> NamedRanker:
+    """Ranks items by factors of users and items from the users' liked items: ALS (Hu et al., 2008)
+    or BPR (Rendle et al., 2009); needs the package `implicit`."""
+    from implicit.als import AlternatingLeastSquares
+    from implicit.bpr import BayesianPersonalizedRanking
+    from threadpoolctl import threadpool_limits
 
-    def __init__(
-        self,
-        name: _Factors,
-        train: EpisodeStore,
-        popularity: Tensor,
-        seed: int,
-        liked_of: Liked = liked_rewards,
-    ) -> None:
-        from implicit.als import AlternatingLeastSquares
-        from implicit.bpr import BayesianPersonalizedRanking
-        from threadpoolctl import threadpool_limits
+    users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
+    items = train.column(schema.ITEM)
+    liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
+    shape = (int(users.max()) + 1, len(popularity))
+    matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
+    matrix.eliminate_zeros()
+    kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
+    model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
+    with threadpool_limits(1, "blas"):
+        model.fit(matrix, show_progress=False)
+    # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
+    factors = np.pad(np.asarray(model.user_factors), ((0, 1), (0, 0)))
+    factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
+    of_users = torch.from_numpy(factors.astype(np.float32))
+    of_items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
+    tie_break = 1e-6 * popularity / popularity.max()
 
-        self.name = name
+    def scores(steps: Steps) -> Tensor:
+        rows = np.where(steps.users < len(of_users) - 1, steps.users, -1)
+        return of_users[torch.from_numpy(rows)] @ of_items.T + tie_break
 
-        users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
-        items = train.column(schema.ITEM)
-        liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
-        shape = (int(users.max()) + 1, len(popularity))
-        matrix = sparse.csr_matrix((liked, (users, items)), shape=shape)
-        matrix.eliminate_zeros()
-        kinds = {"als": AlternatingLeastSquares, "bpr": BayesianPersonalizedRanking}
-        model = kinds[name](factors=_ALS_FACTORS, random_state=seed, num_threads=1, use_gpu=False)
-        with threadpool_limits(1, "blas"):
-            model.fit(matrix, show_progress=False)
-        # The last row, zeros, is for unknown users; zeros leave only the popularity tie-break.
-        of_users = np.asarray(model.user_factors)
-        factors = np.vstack([of_users, np.zeros(of_users.shape[1])])
-        factors[:-1][np.diff(matrix.indptr) == 0] = 0.0
-        self._users = torch.from_numpy(factors.astype(np.float32))
-        self._items = torch.from_numpy(np.array(model.item_factors, dtype=np.float32))
-        self._tie_break = 1e-6 * popularity / popularity.max()
-
-    def scores(self, steps: Steps) -> Tensor:
-        """Scores (B, n_items)."""
-        rows = np.where(steps.users < len(self._users) - 1, steps.users, -1)
-        return self._users[torch.from_numpy(rows)] @ self._items.T + self._tie_break
+    return NamedRanker(name, scores)
 
 
 def recent_rankers(
-    train: EpisodeStore, store: EpisodeStore, liked_of: Liked = liked_rewards
+    train: EpisodeStore, store: EpisodeStore, liked_of: LikedOf = liked_rewards
 ) -> list[Ranker]:
     """Clicks and click rate with half-lives, which the validation split of the store chooses."""
     first, validation = store.split("train"), store.split("validation")
@@ -185,7 +169,7 @@ def recent_rankers(
 
 
 def baselines(
-    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: Liked = liked_rewards
+    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: LikedOf = liked_rewards
 ) -> list[Ranker]:
     """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
     clicks, ALS and BPR.
@@ -200,8 +184,11 @@ def baselines(
             boosted clicks those of the run.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
+    drawn = torch.Generator().manual_seed(seed)
     rankers: list[Ranker] = [
-        random_ranker(len(shown), seed),
+        NamedRanker(
+            "random", lambda steps: torch.rand(len(steps.steps), len(shown), generator=drawn)
+        ),
         same_for_all("most shown", shown),
         same_for_all("most clicked", liked),
         same_for_all("item click rate", shrink_rates(counts)),
@@ -211,7 +198,7 @@ def baselines(
         rankers.append(boosted_ranker(train, seed))
         if find_spec("implicit") is not None:
             rankers += [
-                MatrixFactorisation(name, train, shown.float(), seed, liked_of)
+                factor_ranker(name, train, shown.float(), seed, liked_of)
                 for name in get_args(_Factors)
             ]
     return rankers
@@ -237,7 +224,7 @@ def ranking_rows(
     users: Array,
     k: int,
     seed: int,
-    liked: Liked | None = None,
+    liked: LikedExpression | None = None,
 ) -> list[ResultRow]:
     """One row for every policy and baseline.
 
@@ -255,10 +242,22 @@ def ranking_rows(
         liked: which steps were liked; None for the run's own definition. Without `train`, "most
             clicked" and "item click rate" keep the run's own.
     """
-    rankers, liked = _rankers(policies, trained, train, seed, liked)
-    assert trained.counts is not None
-    k = min(k, len(trained.counts.shown))
-    period = Period.of(later.store, np.asarray(users), liked)
+    counts, fitted_on, liked_of = trained.counts, train, liked or liked_rewards
+    assert counts is not None
+    assert trained.item_states is not None
+    if train is not None and trained.record.refit_of is None:
+        fitted_on = train.split("train")
+    if liked is not None and fitted_on is not None:
+        counts = TrainingCounts.of(fitted_on, liked)
+    unnamed: list[Ranker] = [*policies]
+    if trained.reward_model is not None:
+        unnamed.append(reward_ranker(trained.scorer()))
+    unnamed += baselines(counts, fitted_on, seed, liked_of)
+    if train is not None and fitted_on is not None:
+        unnamed += recent_rankers(fitted_on, train, liked_of)
+    rankers = name_rankers(unnamed)
+    k = min(k, len(counts.shown))
+    period = Period.of(later.store, np.asarray(users), liked_of)
     ranked = {name: rank_steps(ranker, later, k) for name, ranker in rankers.items()}
     reference = next(iter(rankers))
     policy_rankers = dict(zip(rankers, policies, strict=False))
@@ -277,7 +276,7 @@ def ranking_rows(
             "reference": reference,
             "filter_seen": later.filter_seen,
             "out_of_reach": later.share_out_of_reach(),
-            "liked": str(liked),
+            "liked": str(liked or describe_liked(trained.item_states)),
             "liked_share": float(period.liked.mean()),
         },
         "details": {"train_fingerprint": trained.record.fingerprint},
@@ -287,29 +286,6 @@ def ranking_rows(
         _row(compared, policy_rankers.get(compared.name), shared)
         for compared in compare(period, ranked, reference, seed)
     ]
-
-
-def _rankers(
-    policies: Sequence[PolicyRanker],
-    trained: TrainedPolicy,
-    train: EpisodeStore | None,
-    seed: int,
-    liked: Liked | None,
-) -> tuple[dict[str, Ranker], Liked]:
-    """The policies, the reward model and the baselines by name; and which steps were liked."""
-    counts = trained.counts
-    assert counts is not None
-    assert trained.item_states is not None
-    whole = trained.record.refit_of is not None
-    fitted_on = train if train is None or whole else train.split("train")
-    if liked is not None and fitted_on is not None:
-        counts = TrainingCounts.of(fitted_on, liked)
-    liked = liked or LikedByRange(trained.item_states)
-    model = [] if trained.reward_model is None else [reward_ranker(trained.scorer())]
-    rankers = baselines(counts, fitted_on, seed, liked)
-    if train is not None and fitted_on is not None:
-        rankers += recent_rankers(fitted_on, train, liked)
-    return name_rankers([*policies, *model, *rankers]), liked
 
 
 def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, Any]) -> ResultRow:

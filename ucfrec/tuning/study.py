@@ -18,7 +18,7 @@ import torch
 from ucfrec import schema
 from ucfrec.episodes.store import EpisodeStore, UserRows
 from ucfrec.errors import InputError
-from ucfrec.evaluation.ranking import Later, LikedByRange, Period, measure, rank_steps
+from ucfrec.evaluation.ranking import Later, Period, measure, rank_steps
 from ucfrec.evaluation.ranking_table import PolicyRanker
 from ucfrec.files.atomic import atomic_file, lock_path
 from ucfrec.fitting.loop import Callbacks
@@ -69,9 +69,8 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
             )
         return rule.simulated[0]
     validation = store.split("validation")
-    assert trained.item_states is not None
     users = validation.episode_values(schema.USER)
-    period = Period.of(validation, users, LikedByRange(trained.item_states))
+    period = Period.of(validation, users)
     ranker, k = PolicyRanker(trained), min(k, period.n_items)
     rows = UserRows.of(validation, users, store.split("train"))
     ranked = rank_steps(ranker, Later(validation, rows, filter_seen=True), k)

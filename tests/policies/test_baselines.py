@@ -13,7 +13,6 @@ from tests.support.tagged import tagged_store
 from ucfrec.commands.cli import main
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
 from ucfrec.policies.baselines import (
     HALF_LIVES,
     BoostedPolicy,
@@ -98,17 +97,6 @@ def test_the_best_item_is_shown_first_and_tags_are_left_out(tmp_path: Path) -> N
     seen = [set(tags[item].tolist()) - {-1} for item in shown]
     assert not seen[0] & seen[1]
     assert not seen[2] & (seen[0] | seen[1])
-
-
-def test_vectors_have_no_rate(tmp_path: Path) -> None:
-    columns = {
-        "observation": np.zeros((8, 2), dtype=np.float32),
-        "action": np.zeros((8, 1), dtype=np.float32),
-        "reward": np.arange(8, dtype=np.float32),
-    }
-    store = EpisodeStore.write(tmp_path / "store", columns, np.array([4, 4]))
-    with pytest.raises(InputError, match="store of items"):
-        train_run(store, tmp_path / "run", resolve_config("item-rate", None, []))
 
 
 PEERS = ("bpr", "gsasrec", "boosted")

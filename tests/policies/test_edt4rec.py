@@ -18,7 +18,7 @@ from tests.policies.test_ucf import (
     random_windows,
     trained,
 )
-from tests.support.episodes import lengths_of, random_episodes, some_states, write_store
+from tests.support.episodes import random_episodes, some_states, write_store
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
@@ -173,14 +173,14 @@ def test_relabelling_is_a_store_that_promises_no_less(tmp_path: Path, items: boo
     view = store.select(np.array([0, 2, 4]))
     new = relabel(view, 20, 1.0, tmp_path / "q", seed=0)
     assert new.n_episodes == 3
-    before = view.step_values("return_to_go", *view.all_steps())
-    after = new.step_values("return_to_go", *new.all_steps())
+    before = view.column("return_to_go")
+    after = new.column("return_to_go")
     assert (after >= before - 1e-4).all()
     assert (after > before + 1e-3).any()
     others = np.array([1, 3])
     np.testing.assert_array_equal(store.select(others).returns, store.returns[others])
     again = relabel(view, 20, 1.0, tmp_path / "q", seed=0)
-    np.testing.assert_array_equal(again.step_values("return_to_go", *new.all_steps()), after)
+    np.testing.assert_array_equal(again.column("return_to_go"), after)
 
 
 def test_cql_values_the_better_action_and_presses_unseen_ones_down(tmp_path: Path) -> None:
@@ -227,25 +227,14 @@ def test_a_share_learns_from_the_best_sessions(name: str, tmp_path: Path) -> Non
         view(0.0)
 
 
-def test_popular_recommends_what_is_popular(tmp_path: Path) -> None:
-    episodes = random_episodes([30] * 6)
-    store = write_store(tmp_path / "store", episodes, some_states())
-    policy = new_policy(store, resolve_config("popular"))
-    scores = policy.act(store.windows(np.array([0, 1]), np.array([3, 9]), 4))
-    counts = np.bincount(np.concatenate([e.items for e in episodes]), minlength=11)
-    assert lengths_of(episodes).sum() == counts.sum()
-    torch.testing.assert_close(scores[0].softmax(-1), scores[1].softmax(-1))
-    np.testing.assert_array_equal(scores[0].argsort().numpy()[-1], counts.argmax())
-
-
 def test_buckets_and_reward_scale_come_from_the_training_data(tmp_path: Path) -> None:
     store = write_store(tmp_path / "store", random_episodes([6] * 9), some_states())
     prompted = new_policy(store, resolve_config("dt4rec"))
     assert isinstance(prompted, DT4RecPolicy)
-    returns = store.step_values("return_to_go", *store.all_steps()) / float(prompted.return_scale)
+    returns = store.column("return_to_go") / float(prompted.return_scale)
     centres = prompted.embed.embed_return.centres
     assert (float(centres[0]), float(centres[-1])) == pytest.approx((returns.min(), returns.max()))
     estimating = new_policy(store, resolve_config("cdt4rec"))
     assert isinstance(estimating, CDT4RecPolicy)
-    rewards = store.step_values("reward", *store.all_steps())
+    rewards = store.column("reward")
     assert float(estimating.reward_std) == pytest.approx(rewards.std(), rel=1e-5)

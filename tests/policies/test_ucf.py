@@ -423,16 +423,17 @@ def test_dropout_follows_the_seed_and_rests_in_evaluation() -> None:
 
 def test_attention_drops_weights_and_keeps_the_mean() -> None:
     torch.manual_seed(0)
-    query, key, value = (torch.randn(3, 2, 5, 4) for _ in range(3))
+    query, key, value = (torch.randn(3, 5, 8) for _ in range(3))
     visible = torch.ones(5, 5, dtype=torch.bool).tril().expand(3, 1, 5, 5)
-    right = F.scaled_dot_product_attention(query, key, value, visible)
-    torch.testing.assert_close(attend(query, key, value, visible, 0.0), right)
+    heads = (each.view(3, 5, 2, 4).transpose(1, 2) for each in (query, key, value))
+    right = F.scaled_dot_product_attention(*heads, visible).transpose(1, 2).flatten(2)
+    torch.testing.assert_close(attend(query, key, value, visible, 2, 0.0), right)
     # A share too small to drop anything here is the same computation.
-    torch.testing.assert_close(attend(query, key, value, visible, 1e-6), right)
-    drawn = torch.stack([attend(query, key, value, visible, 0.3) for _ in range(4000)])
+    torch.testing.assert_close(attend(query, key, value, visible, 2, 1e-6), right)
+    drawn = torch.stack([attend(query, key, value, visible, 2, 0.3) for _ in range(4000)])
     torch.testing.assert_close(drawn.mean(0), right, rtol=0, atol=0.06)
     # The first row sees one column, whose weight is 1: dropped, or divided by 0.7.
-    first = drawn[:, 0, 0, 0] / value[0, 0, 0]
+    first = drawn[:, 0, 0, :4] / value[0, 0, :4]
     assert float((first == 0).float().mean()) == pytest.approx(0.3, abs=0.03)
     torch.testing.assert_close(
         first[first != 0], torch.full_like(first[first != 0], 1 / 0.7), rtol=1e-3, atol=0

@@ -18,7 +18,7 @@ from ucfrec.processes import random_state_kept
 
 RESERVED: Final = frozenset(
     {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "values", "head"}
-    | {"normalize", "imitation", "act_and_features", "max_return", "exposed", "_exposed_last"}
+    | {"normalize", "imitation", "act_and_features", "max_return", "exposed"}
 )
 """Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
 by another with the same methods."""

@@ -18,6 +18,7 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
+    embed_time,
     embedding,
     require_heads,
     some_padding,
@@ -277,9 +278,8 @@ class TokenEmbedding(nn.Module):
 
     def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Embedded time, returns-to-go and states, (B, K, d) each."""
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        time = embed_time(self.embed_timestep, windows)
         return time, returns, self.embed_state(windows.states)
 
 
@@ -306,16 +306,21 @@ class CausalDepthwise(nn.Conv1d):
         return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
 
 
+def shift_products(steps: Tensor, taps: Tensor, bias: Tensor) -> Tensor:
+    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from steps x (..., K, d), taps w (3, ...) and bias b."""
+    out = torch.addcmul(bias, steps, taps[2])
+    for back in (1, 2):
+        out[..., back:, :].addcmul_(steps[..., :-back, :], taps[2 - back])
+    return out
+
+
 class _ShiftedProducts(torch.autograd.Function):
-    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from x (B, K, d), w (3, d) and b (d,)."""
+    """`shift_products` of steps (B, K, d), taps (3, d) and a bias (d,), with its gradient."""
 
     @staticmethod
     def forward(ctx: Any, steps: Tensor, taps: Tensor, bias: Tensor) -> Any:
         ctx.save_for_backward(steps, taps)
-        out = torch.addcmul(bias, steps, taps[2])
-        for back in (1, 2):
-            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
-        return out
+        return shift_products(steps, taps, bias)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
@@ -440,9 +445,7 @@ class StackedStreams:
         shape, dim = tokens.shape, tokens.shape[-1]
         for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
             steps = tokens if mask is None else tokens.masked_fill(~mask.unsqueeze(-1), 0.0)
-            local = torch.addcmul(bias, steps, taps[2])
-            for back in (1, 2):
-                local[:, :, back:].addcmul_(steps[:, :, :-back], taps[2 - back])
+            local = shift_products(steps, taps, bias)
             rows = torch.baddbmm(pointwise_bias, local.view(3, -1, dim), pointwise)
             normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,), eps=self._eps)
             tokens = torch.addcmul(shift, normed, scale)

@@ -14,7 +14,7 @@ from ucfrec.episodes.states import ItemStates
 def test_both_write_the_same_bytes(tmp_path: Path, tags: np.ndarray | None) -> None:
     embeddings = np.random.default_rng(0).normal(size=(3, 2)).astype(np.float32)
     users = np.ones((4, 0), dtype=np.float32)
-    write_item_table(tmp_path / "a", embeddings, users, 0.0, 1.5, tags)
+    write_item_table(tmp_path / "a", embeddings, users, tags, 0.0, 1.5)
     states = ItemStates(torch.from_numpy(embeddings), torch.from_numpy(users), 0.0, 1.5)
     if tags is not None:
         numbers = torch.from_numpy(tags)

@@ -188,7 +188,7 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"tags": torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64)}, "more than 16 tags"),
+        ({"tags": torch.zeros(N_ITEMS, TAGS_PER_ITEM + 1, dtype=torch.int64)}, "of at most 16"),
         ({"tags": torch.zeros(N_ITEMS, 2)}, "integers"),
         ({"tags": torch.full((N_ITEMS, 1), N_ITEMS)}, "are not numbers from -1 to"),
         ({"tags": torch.full((N_ITEMS, 1), -2)}, "are not numbers from -1 to"),
@@ -196,10 +196,10 @@ def test_states_come_back_from_their_file(tmp_path: Path, users: int) -> None:
         ({"tags": torch.zeros(N_ITEMS, dtype=torch.int64)}, "one row per item"),
         ({"reward_low": 3.0}, "reward_low must be below reward_high"),
         ({"reward_high": float("nan")}, "reward_low must be below reward_high"),
-        ({"window": 2.0}, "window of item states is"),
-        ({"window": 10**9}, "window of item states is"),
-        ({"decay": "x"}, "decay of item states is"),
-        ({"decay": float("nan")}, "decay of item states is"),
+        ({"window": 2.0}, "have window 2.0"),
+        ({"window": 10**9}, "have window 1000000000"),
+        ({"decay": "x"}, "decay 'x'; give 1 to 10,000 and 0 to 1"),
+        ({"decay": float("nan")}, "decay nan"),
     ],
 )
 def test_what_strangers_wrote_is_checked(

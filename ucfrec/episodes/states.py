@@ -17,7 +17,13 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
+from ucfrec.episodes.item_table import (
+    DECAY,
+    DISTINCT_TAGS,
+    TAGS_PER_ITEM,
+    WINDOW,
+    write_item_table,
+)
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
@@ -61,22 +67,27 @@ class ItemStates:
     none. States do not contain them: they show which items are alike."""
 
     def __post_init__(self) -> None:
-        tables, tags = (self.embeddings, self.user_features), self.tags
-        if any(table.dim() != 2 or not table.is_floating_point() for table in tables):
+        if any(
+            table.dim() != 2 or not table.is_floating_point()
+            for table in (self.embeddings, self.user_features)
+        ):
             raise InputError("embeddings and user features of item states must be real matrices")
-        fits = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
-        if tags.dtype != torch.int64 or not fits:
-            raise InputError("tags of item states must be a matrix of integers, one row per item")
         # Tags are numbered without gaps, so that no number exceeds their count.
-        most = min(tags.numel(), DISTINCT_TAGS) - 1
+        tags, most = self.tags, min(self.tags.numel(), DISTINCT_TAGS) - 1
+        shaped = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
+        if tags.dtype != torch.int64 or not shaped or tags.shape[1] > TAGS_PER_ITEM:
+            raise InputError(
+                f"tags of item states must be integers, one row per item, of at most "
+                f"{TAGS_PER_ITEM}"
+            )
         if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
             raise InputError(f"tags of item states are not numbers from -1 to {most}")
-        if tags.shape[1] > TAGS_PER_ITEM:
-            raise InputError(f"item states have more than {TAGS_PER_ITEM} tags an item")
-        if type(self.window) is not int or not 1 <= self.window <= 10_000:
-            raise InputError(f"window of item states is {self.window!r:.60}; give 1 to 10,000")
-        if not _is_real(self.decay) or not 0 <= self.decay <= 1:
-            raise InputError(f"decay of item states is {self.decay!r:.60}; give 0 to 1")
+        whole = type(self.window) is int and 1 <= self.window <= 10_000
+        if not (whole and _is_real(self.decay) and 0 <= self.decay <= 1):
+            raise InputError(
+                f"item states have window {self.window!r:.60} and decay {self.decay!r:.60}; "
+                "give 1 to 10,000 and 0 to 1"
+            )
         low, high = self.reward_low, self.reward_high
         if not (_is_real(low) and _is_real(high) and low < high):
             raise InputError(
@@ -136,13 +147,9 @@ class ItemStates:
         )
 
     def save(self, path: Path) -> None:
-        """Write to one safetensors file, atomically."""
-        numbers = {"window": self.window, "decay": self.decay}
-        numbers |= {"reward_low": self.reward_low, "reward_high": self.reward_high}
-        tensors = {"embeddings": self.embeddings, "user_features": self.user_features}
-        if self.tags.shape[1]:
-            tensors["tags"] = self.tags
-        save_tensors(path, tensors, numbers)
+        """Write to one safetensors file, atomically; see `write_item_table`."""
+        tables = self.embeddings.numpy(), self.user_features.numpy(), self.tags.numpy()
+        write_item_table(path, *tables, self.reward_low, self.reward_high, self.window, self.decay)
 
     @classmethod
     def load(cls, path: Path) -> "ItemStates":

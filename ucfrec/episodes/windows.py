@@ -316,9 +316,7 @@ class Sessions:
 
     def latest_states(self, states: ItemStates, observations: Tensor) -> Tensor:
         """States (B, S) before the steps to decide, whose observations are (B, O)."""
-        recent = self.actions[:, -states.window :], self.rewards[:, -states.window :]
-        steps = self.steps.unsqueeze(1)
-        return states.build(*recent, steps, self.users, observations.unsqueeze(1))[:, 0]
+        return self._build_states(states, self.steps.unsqueeze(1), observations.unsqueeze(1))[:, 0]
 
     def windows(self, states: ItemStates | None, context: int) -> Windows:
         """What policies read: windows of at most `context` = K steps that end with the step to
@@ -334,11 +332,15 @@ class Sessions:
             # No policy's outputs depend on how much padding is before a session.
             context = min(context, int(self.steps.max()) + 1)
         numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
-        if self.states is None:
-            assert states is not None
-            window_states = self._build_states(states, numbers.clamp(min=0))
-        else:
+        if self.states is not None:
             window_states = self.states[:, -context:]
+        else:
+            assert states is not None
+            if self.observations is None:
+                observations = self.rewards.new_zeros(len(self.steps), context, 0)
+            else:
+                observations = self.observations[:, -context:]
+            window_states = self._build_states(states, numbers.clamp(min=0), observations)
         first = self.actions.shape[1] - context + 1
         return Windows.of(
             numbers,
@@ -347,15 +349,10 @@ class Sessions:
             nn.functional.pad(self.rewards[:, first:], (0, 1)),
         )
 
-    def _build_states(self, states: ItemStates, steps: Tensor) -> Tensor:
-        """States (B, K, S) of steps (B, K), the last ones."""
-        context = steps.shape[1]
-        reach = context - 1 + states.window
+    def _build_states(self, states: ItemStates, steps: Tensor, observations: Tensor) -> Tensor:
+        """States (B, K, S) of steps (B, K), the last ones, with observations (B, K, O)."""
+        reach = steps.shape[1] - 1 + states.window
         items, rewards = self.actions[:, -reach:], self.rewards[:, -reach:]
-        if self.observations is None:
-            observations = rewards.new_zeros(items.shape[0], context, 0)
-        else:
-            observations = self.observations[:, -context:]
         return states.build(items, rewards, steps, self.users, observations)
 
 
@@ -483,17 +480,14 @@ class TrainingEpisodes:
         lengths[self._first_action_copy :] = augmented.action_step + 1
         counts[self._first_action_copy :] = 1
         self._ends = np.cumsum(counts)
+        self.n_steps = int(self._ends[-1])
+        """Number of steps that are drawn."""
         # The step at which an episode ends, less the number of its last drawn step.
         self._begins = self._ends - lengths
         self._stride = int(augmented.edit_step.max(initial=0)) + 1
         keys = augmented.edit_copy * self._stride + augmented.edit_step
         # A sentinel, so that every search ends inside.
         self._keys = np.append(keys, np.iinfo(np.int64).max)
-
-    @property
-    def n_steps(self) -> int:
-        """Number of steps that are drawn."""
-        return int(self._ends[-1])
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""

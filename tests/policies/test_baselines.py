@@ -18,7 +18,6 @@ from ucfrec.policies.baselines import (
     BoostedPolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
-    count_decayed,
     shrink_rates,
 )
 from ucfrec.results.rows import read_results
@@ -46,14 +45,13 @@ def drifting_store(folder: Path, drifts: bool) -> EpisodeStore:
 
 def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
     train = drifting_store(tmp_path, drifts=False).split("train")
-    whole, half = count_decayed(train, math.inf), count_decayed(train, 24.0)
-    exact = TrainingCounts.of(train)
-    torch.testing.assert_close(whole.shown, exact.shown.double())
-    torch.testing.assert_close(whole.liked, exact.liked.double())
-    times = train.column("timestamp")
-    weights = 0.5 ** ((times.max() - times) / 86_400_000)
-    expected = np.bincount(train.column("item"), weights, ITEMS)
-    np.testing.assert_allclose(half.shown, expected, rtol=1e-9)
+    times, items = train.column("timestamp"), train.column("item")
+    for half_life in (math.inf, 24.0):
+        counts = TrainingCounts.of(train, half_life=half_life)
+        weights = 0.5 ** ((times.max() - times) / 3_600_000 / half_life)
+        np.testing.assert_allclose(counts.shown, np.bincount(items, weights, ITEMS), rtol=1e-9)
+        weights *= train.column("reward")
+        np.testing.assert_allclose(counts.liked, np.bincount(items, weights, ITEMS), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])

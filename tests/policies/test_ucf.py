@@ -197,10 +197,12 @@ def test_only_the_predicting_rows_are_computed_and_they_are_the_full_ones() -> N
         )
     )
     nothing = torch.zeros_like(returns)
+    known = [returns, nothing, nothing], [returns, states, nothing], [returns, states, actions]
     fused = interleave(
-        policy.fuse_norm(returns + policy.fuse(torch.cat([returns, nothing, nothing], -1))),
-        policy.fuse_norm(states + policy.fuse(torch.cat([returns, states, nothing], -1))),
-        policy.fuse_norm(actions + policy.fuse(torch.cat([returns, states, actions], -1))),
+        [
+            policy.fuse_norm(own + policy.fuse(torch.cat(parts, -1)))
+            for own, parts in zip((returns, states, actions), known, strict=True)
+        ]
     )
     block = policy.attention
     weights = torch.cat([block.query.weight, block.key_value.weight])

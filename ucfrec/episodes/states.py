@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 LIKED = 0.6
 """A step counts as liked if its reward, scaled to [0, 1] as in item states, is at least this: the
 threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
+_HOUR_MS = 3_600_000
 _Reward = TypeVar("_Reward", float, Tensor)
 
 
@@ -199,12 +200,28 @@ class TrainingCounts:
         cls,
         train: "EpisodeStore",
         liked_of: Callable[["EpisodeStore", Array], BoolArray] = liked_rewards,
+        half_life: float = math.inf,
     ) -> "TrainingCounts":
-        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`."""
-        impressions, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
-        for items, rewards in train.column_batches(schema.ITEM, schema.REWARD):
-            impressions += np.bincount(items, minlength=len(impressions))
-            liked += np.bincount(items[liked_of(train, rewards)], minlength=len(liked))
+        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`.
+
+        Steps halve with every half-life (hours) of their age, float64, unless it is infinite or the
+        store has no times.
+        """
+        names, n_items = [schema.ITEM, schema.REWARD], len(train.item_states.embeddings)
+        timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
+        impressions, liked = np.zeros((2, n_items), dtype=np.float64 if timed else np.int64)
+        if timed:
+            names.append(schema.TIMESTAMP)
+            last = int(train.column(schema.TIMESTAMP).max())
+        for items, rewards, *times in train.column_batches(*names):
+            weights = None
+            if timed:
+                age = last - times[0].astype(np.int64)
+                weights = np.exp2(-age / (half_life * _HOUR_MS))
+            impressions += np.bincount(items, weights, n_items)
+            is_liked = liked_of(train, rewards)
+            weights = weights if weights is None else weights[is_liked]
+            liked += np.bincount(items[is_liked], weights, n_items)
         return cls(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:

@@ -12,16 +12,19 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ucfrec.episodes.exposure import ExposureTerm, Likeness
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
 from ucfrec.fitting.distributed import joint_moments
-from ucfrec.policies.heads import Head, head_from
+from ucfrec.policies.heads import Head, ItemHead, VectorHead
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
 """Standardised states beyond this many standard deviations are clipped."""
+_KNOTS = 6
+"""Returns-to-go at which an exposure term has weights of its own."""
 BEST: float = 0.99
 """τ of the expectile that stands for the best return within the logs (Reinformer)."""
 _ADVANTAGES = (-5.0, 3.0)
@@ -126,9 +129,7 @@ class SequencePolicy(nn.Module, ABC):
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        lags = min(config.exposure_window, config.context - 1) if config.exposure else 0
-        samples = config.sampled_items if sizes["items"] > config.sampled_above else 0
-        self.head = head_from(sizes, config.dim, lags, samples)
+        self.head = _new_head(config, sizes)
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 
@@ -249,6 +250,19 @@ class SequencePolicy(nn.Module, ABC):
         if last:
             return Exposed.before_last(windows, lags)
         return Exposed.before(windows, lags, steps)
+
+
+def _new_head(config: PolicyConfig, sizes: Mapping[str, int]) -> Head:
+    items, size = sizes["items"], sizes["action"]
+    if not items:
+        return VectorHead(config.dim, size)
+    exposure = None
+    lags = min(config.exposure_window, config.context - 1)
+    if config.exposure and lags:
+        likeness = Likeness(items, size, sizes.get("tags", 0))
+        exposure = ExposureTerm(lags, _KNOTS, likeness)
+    samples = config.sampled_items if items > config.sampled_above else 0
+    return ItemHead(config.dim, items, size, exposure, samples)
 
 
 def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -32,7 +32,6 @@ PRIOR: Final = 10.0
 """Steps at the mean rate that are added to every item's own."""
 HALF_LIVES: Final = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
 """Hours after which a row counts half; those that are tried."""
-_HOUR_MS: Final = 3_600_000
 _SMOOTHING: Final = 1.0
 """Likes that are added to all items together."""
 _WITHIN = 0.999
@@ -121,12 +120,12 @@ class PopularPolicy(SequencePolicy):
 
     @torch.no_grad()
     def _set_scores(self, train: EpisodeStore, validation: EpisodeStore | None) -> None:
-        if not isinstance(self.config, RecentConfig):
-            counts = TrainingCounts.of(train)
-        else:
+        half_life = math.inf
+        if isinstance(self.config, RecentConfig):
             if validation is not None and not self.config.half_life:
                 self.half_life.fill_(self.best_half_life(train, validation))
-            counts = count_decayed(train, float(self.half_life))
+            half_life = float(self.half_life)
+        counts = TrainingCounts.of(train, half_life=half_life)
         self.head.get_parameter("bias").copy_(self.scores_of(counts))
 
     def features(self, windows: Windows) -> Tensor:
@@ -150,7 +149,7 @@ class PopularPolicy(SequencePolicy):
         held_out, losses = TrainingCounts.of(validation, liked_of), list[float]()
         likes = held_out.liked.double()
         for hours in HALF_LIVES:
-            scores = cls.scores_of(count_decayed(train, hours, liked_of))
+            scores = cls.scores_of(TrainingCounts.of(train, liked_of, hours))
             if cls.scored_by == "rate":
                 rates = torch.sigmoid(scores.double())
                 nats = likes * rates.log() + (held_out.shown - likes) * torch.log1p(-rates)
@@ -199,25 +198,6 @@ def shrink_rates(counts: TrainingCounts) -> Tensor:
     mean = (liked.sum() + 0.5) / (impressions.sum() + 1)
     rates: Tensor = (liked + PRIOR * mean) / (impressions + PRIOR)
     return rates.float()
-
-
-def count_decayed(
-    train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_rewards
-) -> TrainingCounts:
-    """Counts of shown and liked steps, float64, that halve with every half-life (hours) of their
-    age; if it is infinite, or the store has no times, all steps count alike."""
-    n_items = len(train.item_states.embeddings)
-    impressions, liked = np.zeros(n_items), np.zeros(n_items)
-    timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
-    last = int(train.column(schema.TIMESTAMP).max()) if timed else 0
-    names = (schema.ITEM, schema.REWARD, *([schema.TIMESTAMP] if timed else []))
-    for items, rewards, *times in train.column_batches(*names):
-        weights = np.ones(len(items))
-        if timed:
-            weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
-        impressions += np.bincount(items, weights, n_items)
-        liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
-    return TrainingCounts(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
 
 @settings_table("policy")

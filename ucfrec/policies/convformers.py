@@ -56,7 +56,7 @@ class DCPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        hidden = self.dropout(interleave(*self.embed(windows, self.head.embed(windows.actions))))
+        hidden = self.dropout(interleave(self.embed(windows, self.head.embed(windows.actions))))
         valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
         for block in self.blocks:
             hidden = block(hidden, valid)
@@ -82,7 +82,7 @@ class _ConvBlock(nn.Module):
         padded = F.pad(normed, (self.reach, 0))
         # Each modality has its own filter; stride 3 computes only the outputs of that modality.
         mixed = [conv(padded[..., i:]).transpose(1, 2) for i, conv in enumerate(self.mixers)]
-        hidden = hidden + interleave(*mixed)
+        hidden = hidden + interleave(mixed)
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]
 
 
@@ -141,7 +141,7 @@ class LSDTPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        hidden = interleave(*self.embed(windows, self.head.embed(windows.actions)))
+        hidden = interleave(self.embed(windows, self.head.embed(windows.actions)))
         valid = windows.mask.repeat_interleave(3, dim=1)
         for block in self.blocks:
             hidden = block(hidden, valid)

@@ -82,7 +82,7 @@ class DTPolicy(SequencePolicy):
     ) -> Tensor:
         """Outputs (B, 3K, d) at tokens of `tokens`, or the `rows` of them alone; `mask` (B, K) is
         false at padding."""
-        hidden = self.dropout(interleave(*tokens))
+        hidden = self.dropout(interleave(tokens))
         visible = visible_tokens(mask.repeat_interleave(3, dim=1))
         return self.final_norm(pass_rows(self.blocks, hidden, visible, rows))  # type: ignore[no-any-return]
 

@@ -1,17 +1,14 @@
 """Action heads, which embed and predict actions, vectors or items."""
 
-from collections.abc import Mapping
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import ExposureTerm, Likeness, columns_of
+from ucfrec.episodes.exposure import ExposureTerm, columns_of
 from ucfrec.episodes.windows import Exposed
 
-EXPOSURE_KNOTS = 6
-"""Returns-to-go at which an exposure term has weights of its own."""
 _AT_ONCE = 2**24
 """Largest number of logits that a loss over all items of a large catalogue keeps at once."""
 
@@ -245,15 +242,3 @@ class ItemHead(nn.Module):
 
 
 Head = VectorHead | ItemHead
-
-
-def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 0) -> Head:
-    """The head for a store's actions, items if `sizes["items"]` is above 0, with an exposure term
-    of `lags` earlier steps unless these are 0."""
-    if not sizes["items"]:
-        return VectorHead(dim, sizes["action"])
-    exposure = None
-    if lags:
-        likeness = Likeness(sizes["items"], sizes["action"], sizes.get("tags", 0))
-        exposure = ExposureTerm(lags, EXPOSURE_KNOTS, likeness)
-    return ItemHead(dim, sizes["items"], sizes["action"], exposure, samples)

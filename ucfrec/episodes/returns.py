@@ -83,7 +83,9 @@ class ReturnToGo:
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
         """Target returns (B,) float64 at the next step, in reward units, of a `target` of the
         session if `per_session`, otherwise of every step; `collected` (B,) before it."""
-        whole = collected.double().new_full(collected.shape, target)
+        import torch  # checking a log needs this module, but not the seconds that importing takes
+
+        whole = torch.full_like(collected, target, dtype=torch.float64)
         return whole - collected if self.per_session else whole
 
     def before(self, targets: "Tensor", rewards: "Tensor") -> "Tensor":
@@ -93,7 +95,6 @@ class ReturnToGo:
         training would show if the rest of the session returned exactly that. The last column of the
         rewards (B, K), 0 at padding, is not used.
         """
-        # Checking a log needs this module, but not the seconds that importing torch takes.
         import torch
 
         earlier, last = rewards[:, :-1].double(), targets.double().unsqueeze(1)

@@ -337,7 +337,7 @@ class Sessions:
         else:
             assert states is not None
             if self.observations is None:
-                observations = self.rewards.new_zeros(len(self.steps), context, 0)
+                observations = self.rewards.new_zeros(self.steps.shape[0], context, 0)
             else:
                 observations = self.observations[:, -context:]
             window_states = self._build_states(states, numbers.clamp(min=0), observations)

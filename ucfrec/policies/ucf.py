@@ -414,7 +414,7 @@ class StackedStreams:
     @torch.no_grad()
     def __call__(self, windows: Windows) -> Tensor:
         """Features (B, d) from normalised windows."""
-        policy, batch = self._policy, len(windows.mask)
+        policy, batch = self._policy, windows.mask.shape[0]
         # A graph that is exported may be for any batch.
         if not isinstance(batch, int) or batch > _FEW:
             return policy.last_features(windows)

@@ -12,14 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.support.episodes import (
-    DIM,
-    N_ITEMS,
-    Logged,
-    random_episodes,
-    some_states,
-    write_store,
-)
+from tests.support.episodes import DIM, N_ITEMS, Logged, random_episodes, some_states, write_store
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions

@@ -133,7 +133,8 @@ class Likeness(nn.Module):
         """
         if self._sets is None:
             # Padding reads a place of its own, which is 0.
-            places = np.where(self.tags.cpu().numpy() < 0, self._count(), self.tags.cpu().numpy())
+            tags = self.tags.cpu().numpy()
+            places = np.where(tags < 0, self._count(), tags)
             distinct, sets = np.unique(places, axis=0, return_inverse=True)
             numbers = torch.from_numpy(sets.reshape(-1).astype(np.int32))
             self._sets = torch.from_numpy(distinct), numbers

@@ -17,13 +17,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_table import (
-    DECAY,
-    DISTINCT_TAGS,
-    TAGS_PER_ITEM,
-    WINDOW,
-    write_item_table,
-)
+from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW, write_item_table
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
@@ -154,11 +148,7 @@ class ItemStates:
 
     @classmethod
     def load(cls, path: Path) -> "ItemStates":
-        """Read a file that `save` wrote.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
             states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
@@ -230,11 +220,7 @@ class TrainingCounts:
 
     @classmethod
     def load(cls, path: Path) -> "TrainingCounts":
-        """Read a file that `save` wrote.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
             for name in ("shown", "liked"):

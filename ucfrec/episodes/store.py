@@ -102,12 +102,7 @@ class EpisodeStore(EpisodeView):
     ) -> "EpisodeStore":
         """Make a store in memory, without files.
 
-        Args:
-            steps, lengths, episodes: as of `write`.
-            item_states: builds states from items; required if actions are items.
-
-        Raises:
-            InputError: as `write`.
+        Args and errors are those of `write`; `item_states` are required if actions are items.
         """
         lengths = require_steps("a store in memory", lengths)
         require_finite(steps[schema.REWARD])
@@ -136,8 +131,6 @@ class EpisodeStore(EpisodeView):
         arrays[schema.OFFSETS] = offsets
         arrays[schema.RETURN_TO_GO] = ReturnToGo().of_logs(arrays[schema.REWARD], offsets)
         return cls(Columns(Path("<memory>"), record, arrays, item_states))
-
-    # For notebooks.
 
     def to_frame(self) -> "pd.DataFrame":
         """One row per step, session by session: `user_id`, `session_id` (the number of the session
@@ -171,9 +164,9 @@ class EpisodeStore(EpisodeView):
         numbers = self.episode_ids
         if not self.has_users or not len(self):
             return numbers
-        users, splits = self.episode_values(schema.USER), self.episode_values(schema.SPLIT)
-        goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & ~self.terminated[:-1]
-        first = np.append(True, ~(goes_on & (np.diff(numbers) == 1)))
+        users, splits = (self.episode_values(n).astype(int) for n in (schema.USER, schema.SPLIT))
+        goes_on = (np.diff(users) == 0) & (np.diff(splits) > 0) & (np.diff(numbers) == 1)
+        first = np.append(True, ~goes_on | self.terminated[:-1])
         return np.asarray(numbers[first][np.cumsum(first) - 1])
 
     def _read_ids(self, column: str, numbers: IntArray) -> Array:
@@ -192,31 +185,22 @@ class EpisodeStore(EpisodeView):
         return axes
 
     def _repr_html_(self) -> str:
-        heads = ("", "episodes", "steps", "mean return")
-        views = {name: self.split(name) for name in schema.SPLITS}
-        lines = [
-            (name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}")
-            for name, view in {"all": self, **views}.items()
-            if len(view)
-        ]
-        head = "".join(f"<th>{text}</th>" for text in heads)
-        body = "".join(f"<tr><td>{'</td><td>'.join(line)}</td></tr>" for line in lines)
-        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{body}</table>"
-
-    # Views.
+        table = "<tr><th></th><th>episodes</th><th>steps</th><th>mean return</th></tr>"
+        for name, view in (("all", self), *((name, self.split(name)) for name in schema.SPLITS)):
+            if len(view):
+                cells = name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}"
+                table += f"<tr><td>{'</td><td>'.join(cells)}</td></tr>"
+        return f"<p>{escape(repr(self))}</p><table>{table}</table>"
 
     def select(self, episodes: IntArray) -> "EpisodeStore":
         """A view of the episodes at the given positions of this view, in the given order."""
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
-        """A view of the episodes in one split.
-
-        Args:
-            name: "train", "validation" or "test"; the split may be empty.
+        """A view of the episodes in one split, which may be empty.
 
         Raises:
-            InputError: `name` is none of these.
+            InputError: `name` is not "train", "validation" or "test".
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
@@ -229,7 +213,9 @@ class EpisodeStore(EpisodeView):
         One session of thousands of steps would otherwise set the largest target return, be a good
         part of the rows that the user model is fitted to, and let simulated sessions go on as long.
         """
-        usual = self.lengths <= LONG * np.median(self.lengths) if len(self) else np.array([True])
+        if not len(self):
+            return self
+        usual = self.lengths <= LONG * np.median(self.lengths)
         return self if usual.all() else self.select(np.flatnonzero(usual))
 
     @cached_property
@@ -287,9 +273,6 @@ class EpisodeStore(EpisodeView):
         return mean.float(), variance.sqrt().float()
 
 
-# Two stores.
-
-
 @dataclass(frozen=True)
 class UserRows:
     """R rows of the users of a later log, earlier rows too, by user and time."""
@@ -310,9 +293,9 @@ class UserRows:
         """Collect the rows.
 
         Args:
-            users: (E,) identifier of the user of each of its episodes.
-            earlier: a store with the same numbers of users and items; rows that are not before the
-                user's first later row are left out. None for none.
+            users: (E,) identifier of the user of each later episode.
+            earlier: a store with the same numbers of users and items, of which only rows before the
+                user's first later row count.
         """
         owners = np.unique(users, return_inverse=True)[1]
         episodes, steps = later.all_steps()
@@ -343,11 +326,7 @@ class UserRows:
         first = np.searchsorted(owner[order], owner[order][place])
         return cls(later, earlier, source, first, place)
 
-    def values(self, name: str, rows: IntArray) -> Array:
-        """Values of a step column at rows of any shape."""
-        return self.join(name, self.source[rows])
-
-    def join(self, name: str, source: IntArray) -> Array:
+    def values(self, name: str, source: IntArray) -> Array:
         """Values of a step column at sources of any shape; see `source`."""
         later, earlier = self.later, self.earlier
         values = later.step_values(name, *later.locate(np.maximum(source, 0)))
@@ -361,9 +340,9 @@ class UserRows:
         most recent first; −1 and 0 where there are fewer."""
         rows = self.place[steps][:, None] - np.arange(1, count + 1)
         missing = rows < self.first[steps][:, None]
-        rows = np.maximum(rows, 0)
-        items = np.where(missing, -1, self.values(schema.ITEM, rows)).astype(np.int64)
-        rewards = np.where(missing, 0, self.values(schema.REWARD, rows)).astype(np.float32)
+        source = self.source[np.maximum(rows, 0)]
+        items = np.where(missing, -1, self.values(schema.ITEM, source)).astype(np.int64)
+        rewards = np.where(missing, 0, self.values(schema.REWARD, source)).astype(np.float32)
         return items, rewards
 
     def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
@@ -371,17 +350,13 @@ class UserRows:
         (B,); `rows` are indices into the B."""
         first = self.first[steps]
         owner, inside = list_earlier(self.place[steps] - first)
-        items = self.values(schema.ITEM, first[owner] + inside).astype(np.int64)
+        source = self.source[first[owner] + inside]
+        items = self.values(schema.ITEM, source).astype(np.int64)
         return owner[items >= 0], items[items >= 0]
 
     def continue_sessions(self, gap_ms: float | None) -> EpisodeStore:
-        """The later log, with the rows before it in the sessions that go on in it.
-
-        These rows are known but are not steps of the view: `all_steps` leaves them out.
-
-        Args:
-            gap_ms: pause (ms) that ends a session; None if a session is all of a user.
-        """
+        """The later log, with the rows before it in the sessions that go on in it; a pause of more
+        than `gap_ms` ends one, None none. Earlier rows are known but `all_steps` excludes them."""
         if self.earlier is None:
             return self.later
         begin = self.place[np.cumsum(self.later.lengths) - self.later.lengths]
@@ -398,10 +373,10 @@ class UserRows:
         numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
         before = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
         source = np.where(inside >= 0, numbers, before)
-        names = [name for name in schema.EPISODE_DTYPES if later.has_episode_values(name)]
+        names = [name for name in schema.EPISODE_DTYPES if later._columns.has_episode_column(name)]
         arrays = {name: later.episode_values(name) for name in names}
         arrays[schema.OFFSETS] = offsets
-        rewards = self.join(schema.REWARD, source)
+        rewards = self.values(schema.REWARD, source)
         arrays[schema.RETURN_TO_GO] = ReturnToGo().of_logs(rewards, offsets)
         record = later.record.copy_with(
             files={}, n_steps=len(source), n_episodes=len(lengths), n_shards=0
@@ -415,12 +390,10 @@ class UserRows:
     def _begins(self, begin: IntArray, gap_ms: float | None) -> IntArray:
         """(E,) row at which the session of each later episode begins, whose first row is `begin`:
         an earlier row, or the same."""
-        breaks = np.ones(len(self.source), dtype=bool)
-        inside = np.arange(1, len(self.source))
-        times = self.values(schema.TIMESTAMP, np.arange(len(self.source))).astype(np.int64)
+        times = self.values(schema.TIMESTAMP, self.source).astype(np.int64)
         pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
-        breaks[1:] = pause | (self.source[inside - 1] >= 0)
-        breaks[np.unique(self.first)] = True
+        breaks = np.append(True, pause | (self.source[:-1] >= 0))
+        breaks[self.first] = True
         starts = np.flatnonzero(breaks)
         return np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
 
@@ -441,7 +414,7 @@ class _JoinedRows:
         return len(self._source)
 
     def __getitem__(self, index: IntArray | slice) -> Array:
-        return self._rows.join(self._name, self._source[index])
+        return self._rows.values(self._name, self._source[index])
 
 
 def _offsets(lengths: IntArray) -> IntArray:

@@ -72,10 +72,7 @@ class StepColumn:
 
 
 class Columns:
-    """The columns of all E episodes of a store, with N steps in total.
-
-    Episodes are numbered 0 to E − 1 in the order of the store, independently of any view.
-    """
+    """The columns of all E episodes of a store, numbered in its order, with N steps in total."""
 
     def __init__(
         self,
@@ -84,14 +81,8 @@ class Columns:
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
     ) -> None:
-        """
-        Args:
-            arrays: columns in memory, by name, used instead of the files of the folder.
-            item_states: used instead of the file of the folder.
-
-        Raises:
-            InputError: a file of the folder is missing or has another size than when written.
-        """
+        """Arrays are columns in memory, by name; they and `item_states` are used instead of the
+        folder's files, of which none may be missing or have another size than when written."""
         self.path, self.record, self._sealed = path, record, record.checksums(path)
         self._sealed.require_sizes()
         self._arrays, self._given_states = dict(arrays or {}), item_states
@@ -132,11 +123,7 @@ class Columns:
 
     @cached_property
     def item_states(self) -> ItemStates:
-        """Builds states from items; for stores of items only.
-
-        Raises:
-            InputError: the file of item states is missing or damaged.
-        """
+        """See `EpisodeView.item_states`."""
         if self._given_states is not None:
             return self._given_states
         self._sealed.require(ITEM_STATES)
@@ -156,15 +143,12 @@ class Columns:
 
     def has_episode_column(self, name: str) -> bool:
         """Whether the store has the episode column `name`."""
-        files = [shard / f"{name}.npy" for shard in self._shards]
-        return name in self._arrays or (bool(files) and all(file.is_file() for file in files))
+        if not self._shards:
+            return name in self._arrays
+        return all((shard / f"{name}.npy").is_file() for shard in self._shards)
 
     def episode_column(self, name: str) -> Array:
-        """The whole episode column `name`, (E,).
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """The whole episode column `name`, (E,); see `EpisodeView.episode_values`."""
         parts = self._parts(name)
         if not parts:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
@@ -177,11 +161,7 @@ class Columns:
         return values
 
     def step_column(self, name: str) -> StepColumn:
-        """The step column `name`.
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """The step column `name`; see `EpisodeView.step_values`."""
         if name not in self._steps:
             if name not in (*self.record.columns, schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
@@ -200,11 +180,7 @@ class Columns:
         return self._steps[name]
 
     def _parts(self, name: str, mmap: bool = False) -> list[Array]:
-        """A column as one array per shard; a column in memory is a single array.
-
-        Raises:
-            InputError: a file is missing or damaged, or holds something else.
-        """
+        """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
         shape, parts = tuple(self.record.columns.get(name, ())), []
@@ -322,7 +298,7 @@ class EpisodeView:
     @property
     def has_users(self) -> bool:
         """Whether the store names the user of every episode."""
-        return self.has_episode_values(schema.USER)
+        return self._columns.has_episode_column(schema.USER)
 
     @cached_property
     def item_states(self) -> ItemStates:
@@ -338,10 +314,6 @@ class EpisodeView:
         """S, size of a state: that of the item state, if actions are items, plus O."""
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
-    def has_episode_values(self, name: str) -> bool:
-        """Whether the store has an episode column."""
-        return self._columns.has_episode_column(name)
-
     def episode_values(self, name: str) -> Array:
         """An episode column, (E,).
 
@@ -353,7 +325,7 @@ class EpisodeView:
     @property
     def terminated(self) -> BoolArray:
         """(E,) whether each session is known to have ended with its last step."""
-        if not self.has_episode_values(schema.TERMINATED):
+        if not self._columns.has_episode_column(schema.TERMINATED):
             return np.ones(self.n_episodes, dtype=bool)
         return self.episode_values(schema.TERMINATED).astype(bool)
 
@@ -452,10 +424,7 @@ class EpisodeView:
         Args:
             episodes: (B,) positions in the view.
             ends: (B,) last step of each window, from 0.
-            length: K, at least 1.
-
-        Returns:
-            B windows of K steps, padded on the left.
+            length: K, at least 1; shorter episodes are padded on the left.
 
         Raises:
             InputError: an episode or step does not exist, or the arguments have other shapes.
@@ -475,11 +444,7 @@ class EpisodeView:
         return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps (M,) of episodes (M,), with their next states.
-
-        Raises:
-            InputError: as `windows`.
-        """
+        """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1
         next_steps = np.where(last, steps, steps + 1)

@@ -26,13 +26,6 @@ class StoreWriter:
 
     `folder` should be a scratch folder of `ucfrec.files.atomic.atomic_folder`, so that a store
     appears complete or not at all.
-
-    Example: three steps, two episodes::
-
-        writer = StoreWriter(folder)
-        writer.append({"item": items, "reward": rewards}, first=[True, False, True],
-                      episodes={"user": [7, 7, 9], "split": [0, 0, 0]})
-        writer.finish(reward="is_click", source={})
     """
 
     def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
@@ -138,10 +131,9 @@ class StoreWriter:
         """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
         Args:
-            reward: the expression that computed the rewards, for the record.
-            source: what the store was made from and which rows were dropped, for the record.
-            ids: original identifiers (of items, of users) in the order in which the columns number
-                them, by name; they enter the fingerprint.
+            reward, source: the expression of the rewards, and what the store was made from.
+            ids: original identifiers (of items, of users) by name, in the order in which columns
+                number them; they enter the fingerprint.
 
         Raises:
             InputError: no step was appended.
@@ -211,17 +203,14 @@ def reward_bit(
 
 
 def write_observations(
-    store: "EpisodeStore",
-    out: Path,
-    observations: Float32Array,
-    source: Mapping[str, Any],
+    store: "EpisodeStore", out: Path, observations: Float32Array, source: Mapping[str, Any]
 ) -> "EpisodeStore":
     """Write a copy of `store` with other observations, atomically.
 
     Args:
         store: a whole store in a folder, not a view of some episodes.
         observations: (n_steps, O) in the order of `all_steps`.
-        source: added to `source` in `meta.json`, the record of what the store was made from.
+        source: added to the record of what the store was made from.
 
     Raises:
         InputError: `out` exists already.
@@ -254,11 +243,7 @@ def read_observations(store: "EpisodeStore") -> Float32Array:
 
 
 def require_steps(path: Path | str, lengths: Array) -> IntArray:
-    """The numbers of steps (E,) of episodes as an array.
-
-    Raises:
-        InputError: an episode has no steps.
-    """
+    """The numbers of steps (E,) of episodes as an array; an InputError if one has none."""
     lengths = np.asarray(lengths)
     if np.any(lengths < 1):
         raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
@@ -266,11 +251,8 @@ def require_steps(path: Path | str, lengths: Array) -> IntArray:
 
 
 def require_finite(rewards: Array) -> None:
-    """Check that rewards (N,) are finite, because one that is not would spoil a shard's returns.
-
-    Raises:
-        InputError: some rewards are NaN or infinite, or so large that training would overflow.
-    """
+    """Raise an InputError for rewards (N,) that are NaN, infinite, or so large that training would
+    overflow: one of them would spoil a shard's returns."""
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
     not_finite = int(np.count_nonzero(~np.isfinite(stored)))

@@ -16,13 +16,7 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import (
-    Context,
-    PolicyConfig,
-    SequencePolicy,
-    draw_normal,
-    embedding,
-)
+from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, draw_normal, embedding
 from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
@@ -385,12 +379,10 @@ class BoostedConfig(PolicyConfig):
 class BoostedPolicy(LikedPolicy):
     """Scores items by the log-odds of a like, predicted by gradient-boosted trees.
 
-    The trees (scikit-learn's histogram boosting) see the item's rate of likes and its count in the
-    training rows, the session's rate, its length and whether its last item was liked, the likeness
-    of the item to those that were liked, to all and to the last one, and the rate of likes among
-    the session's items with the same first tag. In training, an item's rate is that of other folds
-    of the episodes, because its own row would tell the trees what they predict. States and returns
-    are not used.
+    The trees (scikit-learn's histogram boosting) see the columns of `_inputs`: rates, counts, and
+    the likeness of the item to the session's. In training, an item's rate is that of other folds of
+    the episodes, because its own row would tell the trees what they predict. States and returns are
+    not used.
     """
 
     Config = BoostedConfig

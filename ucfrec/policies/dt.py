@@ -26,13 +26,7 @@ from ucfrec.policies.base import (
     recurrent,
     require_heads,
 )
-from ucfrec.policies.ucf import (
-    Dropout,
-    TokenEmbedding,
-    draw_mask,
-    interleave,
-    visible_tokens,
-)
+from ucfrec.policies.ucf import Dropout, TokenEmbedding, draw_mask, interleave, visible_tokens
 from ucfrec.settings import Weight, settings_table
 
 

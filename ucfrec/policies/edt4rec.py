@@ -153,9 +153,7 @@ def relabel(
 
 
 def optimistic_returns(
-    rewards: npt.NDArray[np.floating],
-    values: Float64Array,
-    lengths: IntArray,
+    rewards: npt.NDArray[np.floating], values: Float64Array, lengths: IntArray
 ) -> Float32Array:
     """R_t = r_t + max(R_{t+1}, V_{t+1}) (N,) within each episode, R = V = 0 after its end, from
     rewards (N,) and values (N,) before each step of episodes of some lengths (E,).

@@ -74,11 +74,9 @@ class ItemHead(nn.Module):
     """Items: dot products with item vectors, trained by negative log-likelihood (Algorithm 6).
 
     An item's vector is a learned projection of its fixed embedding, which items without training
-    steps have too, plus a correction learned per item. The bias is initialised to the log of the
-    item's share of the training steps, so that an untrained policy recommends popular items.
-
-    With an exposure term, what the session was shown lately moves the logits too; a dot product
-    cannot say "unlike what was just shown".
+    steps have too, plus a correction learned per item. The bias begins as the log of the item's
+    share of the training steps. With an exposure term, what the session was shown lately moves the
+    logits too; a dot product cannot say "unlike what was just shown".
 
     With `samples`, training takes the softmax over items drawn for the batch (`Proposal`) instead
     of all, subtracting the log of their expected number of draws from their logits (Bengio &

@@ -95,15 +95,9 @@ def slowly(made: ExposureTerm, states: ItemStates, shown: Exposed) -> Tensor:
     return added.float()
 
 
-def to_all(made: ExposureTerm, shown: Exposed) -> Tensor:
-    """What the term adds to the logits of all items."""
-    zeros = torch.zeros(len(shown.items), ITEMS, dtype=made.common.dtype)
-    return made.added_to(zeros, shown)
-
-
-def to_some(made: ExposureTerm, shown: Exposed, items: Tensor) -> Tensor:
-    """What the term adds to the logits of `items`."""
-    zeros = torch.zeros(len(shown.items), len(items), dtype=made.common.dtype)
+def added(made: ExposureTerm, shown: Exposed, items: Tensor | None = None) -> Tensor:
+    """What the term adds to the logits of `items`, or of all."""
+    zeros = torch.zeros(len(shown.items), ITEMS if items is None else len(items))
     return made.added_to(zeros, shown, items)
 
 
@@ -111,13 +105,12 @@ def to_some(made: ExposureTerm, shown: Exposed, items: Tensor) -> Tensor:
 def test_additions_are_those_of_loops_over_items_and_lags(kind: str, seed: int) -> None:
     made, shown = term(kind, seed), exposed(7, seed)
     expected = slowly(made, item_states(kind, seed), shown)
-    everything = to_all(made, shown).detach()
+    everything = added(made, shown).detach()
     torch.testing.assert_close(everything, expected, rtol=1e-4, atol=1e-4)
     some = torch.tensor([0, 4, ITEMS - 1])
-    torch.testing.assert_close(to_some(made, shown, some).detach(), everything[:, some])
+    torch.testing.assert_close(added(made, shown, some).detach(), everything[:, some])
     own = torch.arange(7) % ITEMS
     one_each = made.to_items(shown, own.unsqueeze(1)).detach()
-    assert one_each.shape == (7,)
     torch.testing.assert_close(one_each, everything[torch.arange(7), own])
 
 
@@ -126,45 +119,22 @@ def test_a_large_catalogue_takes_the_sparse_path_to_the_same_result(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, shown = term(kind, 3), exposed(20, 3)
-    dense = to_all(made, shown)
+    dense = added(made, shown)
     assert kind == "embeddings" or not made.likeness._tag_matrix().is_sparse
     dense.square().sum().backward()
     gradients = [parameter.grad for parameter in made.parameters()]
     some = torch.tensor([1, 2, ITEMS - 2])
-    torch.testing.assert_close(to_some(made, shown, some), dense[:, some])
+    torch.testing.assert_close(added(made, shown, some), dense[:, some])
     monkeypatch.setattr(exposure, "_DENSE", ITEMS * TAGS - 1)
     monkeypatch.setattr(exposure, "_FEW_TAGS", TAGS - 1)
     large = term(kind, 3)
-    found = to_all(large, shown)
+    found = added(large, shown)
     assert kind == "embeddings" or large.likeness._tag_matrix().is_sparse
     torch.testing.assert_close(found, dense)
-    torch.testing.assert_close(to_some(large, shown, some), dense[:, some])
+    torch.testing.assert_close(added(large, shown, some), dense[:, some])
     found.square().sum().backward()
     for parameter, gradient in zip(large.parameters(), gradients, strict=True):
         torch.testing.assert_close(parameter.grad, gradient)
-
-
-@pytest.mark.parametrize("kind", ["tags", "embeddings"])
-def test_gradients_are_those_of_differences(kind: str) -> None:
-    made, shown = term(kind, 5).double(), exposed(5, 5)
-    shown = Exposed(shown.items, shown.rewards.double(), shown.returns.double())
-    items = torch.tensor([2, 7])
-
-    def additions(common: Tensor, by_lag: Tensor) -> tuple[Tensor, ...]:
-        given = {"common": common, "by_lag": by_lag}
-        return tuple(
-            torch.func.functional_call(made, given, arguments)
-            for arguments in ((shown,), (shown, items), (shown, shown.items[:, :1].clamp(min=0)))
-        )
-
-    def forward(shown: Exposed, items: Tensor | None = None) -> Tensor:
-        if items is None:
-            return to_all(made, shown)
-        return to_some(made, shown, items) if items.ndim == 1 else made.to_items(shown, items)
-
-    made.forward = forward  # type: ignore[method-assign]
-    leaves = tuple(p.detach().clone().requires_grad_() for p in (made.common, made.by_lag))
-    assert torch.autograd.gradcheck(additions, leaves)
 
 
 def weights_at(made: ExposureTerm, returns: Tensor, reward: float) -> Tensor:
@@ -222,55 +192,20 @@ def test_steps_before_a_step_are_found_one_by_one(seed: int, lags: int) -> None:
                 if there:
                     reward = found.rewards.view(B, K, lags)[b, t, lag - 1]
                     assert reward == given_windows.rewards[b, t - lag]
-
-
-@given(seeds, st.integers(0, K - 1), kinds)
-def test_neither_the_step_nor_what_follows_is_seen(seed: int, t: int, kind: str) -> None:
-    before, made = windows(seed), term(kind, seed)
-    actions = before.actions.clone()
-    actions[:, t:] = (actions[:, t:] + 1) % ITEMS
-    returns = before.returns_to_go.clone()
-    returns[:, t + 1 :] += 1
-    rewards = before.rewards.clone()
-    rewards[:, t:] = torch.where(rewards[:, t:] < (LOW + HIGH) / 2, HIGH, LOW)
-    after = replace(
-        before, actions=actions, returns_to_go=returns, rewards=rewards, states=before.states + 1
-    )
-    first, second = (
-        to_all(made, Exposed.before(each, LAGS)).view(B, K, ITEMS) for each in (before, after)
-    )
-    assert torch.equal(first[:, : t + 1], second[:, : t + 1])
-
-
-@given(seeds, kinds)
-def test_padding_is_never_shown(seed: int, kind: str) -> None:
-    before, made = windows(seed), term(kind, seed)
-    noisy = replace(
-        before,
-        actions=torch.where(before.mask, before.actions, 3),
-        rewards=torch.where(before.mask, before.rewards, HIGH + LOW - before.rewards),
-    )
-    shown, again = Exposed.before(before, LAGS), Exposed.before(noisy, LAGS)
-    assert torch.equal(shown.items, again.items)
-    assert torch.equal(to_all(made, shown), to_all(made, again))
-    rows = before.mask.flatten()
-    torch.testing.assert_close(
-        to_all(made, Exposed.before(before, LAGS, before.mask)),
-        to_all(made, shown).view(B * K, ITEMS)[rows],
-    )
-    # The first step of a session has been shown nothing.
-    firsts = torch.zeros_like(before.mask)
-    firsts[torch.arange(B), before.mask.int().argmax(1)] = True
-    assert (shown.items.view(B, K, LAGS)[firsts] == -1).all()
+    chosen, rows = Exposed.before(given_windows, lags, given_windows.mask), given_windows.mask
+    for name, values in vars(chosen).items():
+        assert torch.equal(values, getattr(found, name)[rows.flatten()])
+    last = Exposed.before_last(given_windows, lags)
+    assert torch.equal(last.items, found.items[K - 1 :: K])
 
 
 def test_a_term_read_back_is_the_one_saved() -> None:
     made, shown = term("tags", 2), exposed(6, 2)
-    expected = to_all(made, shown)
+    expected = added(made, shown)
     other = ExposureTerm(LAGS, KNOTS, Likeness(ITEMS, 4, 3))
-    to_all(other, shown)  # a matrix of tags has been made before the weights are read
+    added(other, shown)  # a matrix of tags has been made before the weights are read
     other.load_state_dict(made.state_dict())
-    torch.testing.assert_close(to_all(other, shown), expected)
+    torch.testing.assert_close(added(other, shown), expected)
 
 
 @given(

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ucfrec.episodes.returns import ReturnToGo, returns_to_go
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.errors import InputError
 
 eighths = st.integers(-64, 64).map(lambda n: n / 8)
@@ -26,7 +26,7 @@ def test_a_long_store_keeps_its_digits() -> None:
     rng = np.random.default_rng(0)
     rewards = rng.random(2_000_000, dtype=np.float32) + 100
     offsets = np.arange(0, 2_000_001, 20)
-    got = returns_to_go(rewards, offsets).reshape(-1, 20)
+    got = ReturnToGo().of_logs(rewards, offsets).reshape(-1, 20)
     suffixes = rewards.reshape(-1, 20)[:, ::-1].cumsum(1, dtype=np.float64)[:, ::-1]
     np.testing.assert_allclose(got, suffixes, rtol=2e-7)
 
@@ -91,7 +91,8 @@ def test_acting_with_the_logged_return_as_target_gives_the_training_returns_to_g
     episodes: list[list[float]],
 ) -> None:
     """With an episode's return as target return and its rewards, acting repeats its values."""
-    trained, returns = returns_to_go(*flat(episodes)).tolist(), ReturnToGo()
+    returns = ReturnToGo()
+    trained = returns.of_logs(*flat(episodes)).tolist()
     seen: list[float] = []
     for episode in episodes:
         collected = torch.zeros(1).double()

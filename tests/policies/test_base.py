@@ -5,6 +5,9 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
 
 from tests.policies.test_ucf import (
     CATALOG,
@@ -12,6 +15,7 @@ from tests.policies.test_ucf import (
     SMALL,
     VECTORS,
     K,
+    changed_at,
     other,
     random_windows,
     sessions_of,
@@ -23,8 +27,8 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Exposed
 from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW
-from ucfrec.policies.base import SequencePolicy
-from ucfrec.policies.heads import ItemHead, advantage_weights
+from ucfrec.policies.base import BEST, SequencePolicy, ValueHead, advantage_weights
+from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.registry import policy_class
 
 TAGGED = {**CATALOG, "tags": 2}
@@ -164,3 +168,94 @@ def test_the_largest_return_is_in_reward_units() -> None:
     torch.testing.assert_close(policy.max_return(windows), 10 * small)
     asked = replace(windows, returns_to_go=windows.returns_to_go + 7)
     assert torch.equal(policy.max_return(asked), policy.max_return(windows))
+
+
+WIDTH = 16
+
+
+def expectile(returns: Tensor, share: float) -> float:
+    """By bisection: upward and downward deviations balance as share to 1 − share."""
+    low, high = float(returns.min()), float(returns.max())
+    for _ in range(200):
+        middle = (low + high) / 2
+        above = share * (returns - middle).clamp(min=0).sum()
+        below = (1 - share) * (middle - returns).clamp(min=0).sum()
+        low, high = (middle, high) if above > below else (low, middle)
+    return (low + high) / 2
+
+
+@given(st.lists(st.floats(-5, 5), min_size=2, max_size=12))
+def test_the_loss_is_least_at_the_mean_and_the_expectile(sample: list[float]) -> None:
+    returns = torch.tensor(sample, dtype=torch.float64)
+    best = torch.tensor([float(returns.mean()), expectile(returns, BEST)], dtype=torch.float64)
+
+    def loss(values: Tensor) -> float:
+        return float(ValueHead.loss(values.expand(len(returns), 2), returns))
+
+    lowest = loss(best)
+    for step in (-0.1, 0.1):
+        for place in range(2):
+            moved = best.clone()
+            moved[place] += step
+            assert loss(moved) > lowest
+
+
+@pytest.mark.parametrize("t", [0, 3])
+def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
+    torch.manual_seed(0)
+    head, windows = ValueHead(VECTORS["state"], WIDTH), random_windows(VECTORS, padding=(0, 0, 0))
+    actions = torch.randn(len(windows.mask), K, WIDTH, requires_grad=True)
+    before = head(windows, actions)
+    assert not torch.autograd.grad(before.sum(), actions, allow_unused=True)[0]
+    states, played = windows.states.clone(), actions.detach().clone()
+    states[:, t + 1 :] += 1
+    played[:, t:] += 1
+    changed = changed_at(windows, slice(None), ("rewards", "returns_to_go"))
+    after = head(replace(changed, states=states), played)
+    torch.testing.assert_close(before[:, : t + 1], after[:, : t + 1])
+    assert not torch.allclose(before[:, t + 1 :], after[:, t + 1 :])
+    states = windows.states.clone()
+    states[:, 0] += 1
+    assert not torch.allclose(before[:, t], head(replace(windows, states=states), actions)[:, t])
+    later = head(replace(windows, timesteps=windows.timesteps + 5), actions)
+    assert not torch.allclose(before[:, t], later[:, t])
+
+
+def test_padding_does_not_move_a_value() -> None:
+    torch.manual_seed(0)
+    head, windows = ValueHead(VECTORS["state"], WIDTH), random_windows(VECTORS)
+    actions = torch.randn(len(windows.mask), K, WIDTH)
+    values = head(windows, actions)
+    steps = windows.mask.unsqueeze(-1)
+    noisy = replace(windows, states=torch.where(steps, windows.states, 9.0))
+    other = head(noisy, torch.where(steps, actions, 9.0))
+    torch.testing.assert_close(values[windows.mask], other[windows.mask])
+    short = windows.at(slice(2, None)).last(K - 5)
+    torch.testing.assert_close(head(short, actions[2:, 5:]), values[2:, 5:])
+
+
+returns_and_values = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1)
+
+
+@given(returns_and_values)
+def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float, float]]) -> None:
+    returns, means = torch.tensor(pairs, dtype=torch.float64).unbind(1)
+    values = torch.stack([means, torch.full_like(means, 99.0)], dim=1).requires_grad_()
+    weights = advantage_weights(values, returns)
+    assert not weights.requires_grad
+    assert float(weights.mean()) == pytest.approx(1)
+    # e³ : e⁻⁵ is as far as two steps can be apart.
+    assert float(weights.max() / weights.min()) <= torch.e**8 * (1 + 1e-6)
+    advantage = returns - means
+    spread = float(advantage.std(correction=0))
+    if spread > 1e-3:
+        expected = (advantage / spread).clamp(-5, 3).exp()
+        torch.testing.assert_close(weights, expected / expected.mean())
+    order = advantage.argsort()
+    assert (weights[order].diff() >= -1e-12).all()
+
+
+def test_steps_without_advantage_count_alike() -> None:
+    values = torch.tensor([[2.0, 3.0]]).repeat(4, 1)
+    assert advantage_weights(values, torch.full((4,), 2.0)).tolist() == [1, 1, 1, 1]
+    assert advantage_weights(values[:1], torch.tensor([5.0])).tolist() == [1]

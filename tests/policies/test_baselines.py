@@ -13,13 +13,11 @@ from tests.support.tagged import tagged_store
 from ucfrec.commands.cli import main
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.errors import InputError
 from ucfrec.policies.baselines import (
     HALF_LIVES,
     BoostedPolicy,
     RecentClicksPolicy,
     RecentRatePolicy,
-    count_decayed,
     shrink_rates,
 )
 from ucfrec.results.rows import read_results
@@ -47,14 +45,13 @@ def drifting_store(folder: Path, drifts: bool) -> EpisodeStore:
 
 def test_counts_halve_with_every_half_life(tmp_path: Path) -> None:
     train = drifting_store(tmp_path, drifts=False).split("train")
-    whole, half = count_decayed(train, math.inf), count_decayed(train, 24.0)
-    exact = TrainingCounts.of(train)
-    torch.testing.assert_close(whole.shown, exact.shown.double())
-    torch.testing.assert_close(whole.liked, exact.liked.double())
-    times = train.column("timestamp")
-    weights = 0.5 ** ((times.max() - times) / 86_400_000)
-    expected = np.bincount(train.column("item"), weights, ITEMS)
-    np.testing.assert_allclose(half.shown, expected, rtol=1e-9)
+    times, items = train.column("timestamp"), train.column("item")
+    for half_life in (math.inf, 24.0):
+        counts = TrainingCounts.of(train, half_life=half_life)
+        weights = 0.5 ** ((times.max() - times) / 3_600_000 / half_life)
+        np.testing.assert_allclose(counts.shown, np.bincount(items, weights, ITEMS), rtol=1e-9)
+        weights *= train.column("reward")
+        np.testing.assert_allclose(counts.liked, np.bincount(items, weights, ITEMS), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [RecentRatePolicy, RecentClicksPolicy])
@@ -98,17 +95,6 @@ def test_the_best_item_is_shown_first_and_tags_are_left_out(tmp_path: Path) -> N
     seen = [set(tags[item].tolist()) - {-1} for item in shown]
     assert not seen[0] & seen[1]
     assert not seen[2] & (seen[0] | seen[1])
-
-
-def test_vectors_have_no_rate(tmp_path: Path) -> None:
-    columns = {
-        "observation": np.zeros((8, 2), dtype=np.float32),
-        "action": np.zeros((8, 1), dtype=np.float32),
-        "reward": np.arange(8, dtype=np.float32),
-    }
-    store = EpisodeStore.write(tmp_path / "store", columns, np.array([4, 4]))
-    with pytest.raises(InputError, match="store of items"):
-        train_run(store, tmp_path / "run", resolve_config("item-rate", None, []))
 
 
 PEERS = ("bpr", "gsasrec", "boosted")

@@ -32,7 +32,9 @@ def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_our_own_policies_pass(store: EpisodeStore, name: str) -> None:
     if name in ITEMS_ONLY and not store.has_items:
-        pytest.skip("recommends items only")
+        with pytest.raises(InputError, match=f"{name} recommends items"):
+            new_policy(store, resolve_config(name, None, SMALL))
+        return
     for more in ({"policy.context": 1}, {"policy.exposure": store.has_items}):
         more = more | ({"policy.kernel_groups": 4} if name == "lsdt" else {})
         policy = new_policy(store, resolve_config(name, None, SMALL | more))

@@ -1,5 +1,6 @@
 """Known answers, of every policy: planted preferences are learned, and noise teaches nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +19,9 @@ KNOWS_NOBODY = ("popular", "item-rate", "recent-clicks", "recent-rate")
 SEES_NO_STATE = ("sasrec", "gsasrec", "item-knn", "bpr", "boosted")
 ITEMS_ONLY = (*KNOWS_NOBODY[1:], *SEES_NO_STATE[1:])
 SETTINGS = [
-    "train.steps=45",
-    "train.validate_every=45",
-    "train.learning_rate=0.01",
-    "train.warmup_steps=0",
-    "train.batch_size=64",
-    "policy.context=3",
-    "policy.dim=16",
-    "augment.copies=0",
-    "rule.choose=false",
+    *("train.steps=45", "train.validate_every=45", "train.learning_rate=0.01"),
+    *("train.warmup_steps=0", "train.batch_size=64", "policy.context=3", "policy.dim=16"),
+    *("augment.copies=0", "rule.choose=false"),
 ]
 EXTRA = {
     "dt4rec": ["policy.layers=1", "policy.negatives=1"],
@@ -38,21 +33,15 @@ EXTRA = {
 
 
 def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeStore, np.ndarray]:
-    """Sessions of users of four kinds, seen in the observation, and what each prefers.
-
-    Half of what was logged is what the user's kind prefers, which pays 1; the rest is arbitrary and
-    pays nothing. As noise, logged actions and rewards have nothing to do with the user, and the
-    answer is the action that was logged last, which nothing shows first.
-    """
+    """Sessions of users of four kinds, seen in the observation, and what each prefers, which pays
+    1 and is half of what was logged; as noise, random actions and rewards, and the last action."""
     rng = np.random.default_rng([seed, noise, items])
     kinds = rng.integers(KINDS, size=SESSIONS)
     observed = np.eye(KINDS, dtype=np.float32)[kinds].repeat(STEPS, axis=0)
     random = rng.integers(KINDS, size=SESSIONS * STEPS)
     hit = rng.random(SESSIONS * STEPS) < 0.5
     played = random if noise else np.where(hit, kinds.repeat(STEPS), random)
-    pays = (rng.integers(2, size=len(played)) if noise else played == kinds.repeat(STEPS)).astype(
-        np.float32
-    )
+    pays = rng.integers(2, size=len(played)) if noise else played == kinds.repeat(STEPS)
     columns = {"reward": pays, "observation": observed}
     if items:
         columns["item"] = played
@@ -70,15 +59,13 @@ def directions() -> np.ndarray:
 
 
 def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
-    """Which kind's preference every session gets when the largest return is the target, in its
-    last step."""
+    """Which kind's preference every session gets in its last step, at the largest return."""
     trained = TrainedPolicy.load(run)
     episodes = np.arange(given.n_episodes)
     windows = given.windows(episodes, np.full(len(episodes), STEPS - 1), 3)
     asked = torch.arange(STEPS, 0, -1).float().expand(len(episodes), STEPS)
-    windows = type(windows)(**{**windows.__dict__, "returns_to_go": asked})
     with torch.no_grad():
-        answer = trained.policy.act(windows)
+        answer = trained.policy.act(replace(windows, returns_to_go=asked))
     if items:
         return answer.argmax(-1).numpy()
     apart = np.linalg.norm(answer.numpy()[:, None] - directions(), axis=-1)
@@ -104,8 +91,7 @@ def test_planted_preferences_are_learned_and_noise_is_not(
     if noise or name in KNOWS_NOBODY:
         assert abs(right - 1 / KINDS) < 0.1
     elif name in SEES_NO_STATE:
-        # Two actions before tell the kind for certain only where both are what it prefers: the best
-        # answer is right in 0.625 of the sessions, a guess in 0.25.
+        # Two actions before tell the kind only where both are what it prefers: 0.625 at best.
         assert right > 0.45
     else:
         assert right > 0.9

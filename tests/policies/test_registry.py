@@ -87,20 +87,27 @@ nowhere = no_such_learner:Mine
 """
 
 
+def distribution(site: Path, name: str, version: str, entry_points: str) -> Path:
+    """The folder of a distribution as pip leaves it."""
+    info = site / f"{name.replace('-', '_')}.dist-info"
+    info.mkdir(parents=True, exist_ok=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    (info / "entry_points.txt").write_text(entry_points)
+    invalidate_caches()
+    return info
+
+
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A distribution as pip leaves it, on the path."""
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A distribution of plugins, on the path."""
     site = tmp_path / "site"
-    info = site / "my_policy-1.0.dist-info"
-    info.mkdir(parents=True)
+    info = distribution(site, "my-policy", "1.0", ENTRY_POINTS)
     (site / "my_learner.py").write_text(MINE)
     (site / "my_raising.py").write_text("raise ValueError('of my own')")
     (site / "my_nonsense.py").write_text("def (")
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-policy\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.delitem(sys.modules, "my_learner", raising=False)
-    invalidate_caches()
+    return info
 
 
 def small_store(path: Path) -> EpisodeStore:
@@ -148,35 +155,23 @@ def test_a_policy_is_read_back_as_it_was_trained(tmp_path: Path, name: str, aver
             assert torch.equal(weights["one.weight"], policy.one.weight)  # type: ignore[arg-type, union-attr]
 
 
-def metadata(site: Path, name: str, version: str) -> Path:
-    """The folder of a distribution as pip leaves it."""
-    info = site / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir(parents=True, exist_ok=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    return info
-
-
-@pytest.mark.usefixtures("installed")
 def test_a_run_knows_the_package_of_its_policy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, info = tmp_path / "run", tmp_path / "site" / "my_policy-1.0.dist-info"
+    run = tmp_path / "run"
     config = resolve_config("mine", None, ["train.steps=2", "policy.dim=8"])
     record = train_run(small_store(tmp_path / "store"), run, config)
     assert (record.policy_package, record.versions["my-policy"]) == ("my-policy", "1.0")
     TrainedPolicy.load(run)  # the same version is no reason to warn
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-policy\nVersion: 1.1\n")
-    with pytest.warns(
-        InputNote, match=r"trained with my-policy 1.0, but my-policy 1.1 is installed"
-    ):
+    distribution(tmp_path / "site", "my-policy", "1.1", ENTRY_POINTS)
+    with pytest.warns(InputNote, match="trained with my-policy 1.0, but my-policy 1.1 is instal"):
         TrainedPolicy.load(run)
-    learner = tmp_path / "site" / "my_learner.py"
-    learner.rename(tmp_path / "elsewhere.py")
+    (tmp_path / "site" / "my_learner.py").unlink()
     monkeypatch.delitem(sys.modules, "my_learner")
     with pytest.raises(InputError, match=r"my_learner:Mine, which cannot be imported") as caught:
         TrainedPolicy.load(run)
     assert "train it again" not in str(caught.value)
-    shutil.rmtree(info)
+    shutil.rmtree(installed)
     missing = r"policy 'mine' \(of package my-policy 1.0\), which is not installed: install it$"
     with pytest.raises(InputError, match=missing):
         TrainedPolicy.load(run)
@@ -195,9 +190,8 @@ def test_a_built_in_policy_has_no_package_and_a_plugin_of_its_name_is_noted(tmp_
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("target", ["my_learner:Tied", "my_learner:Mine"])
 def test_two_packages_may_not_have_one_name(tmp_path: Path, target: str) -> None:
-    info = metadata(tmp_path / "site", "another-policy", "2.0")
-    (info / "entry_points.txt").write_text(f"[ucfrec.policies]\nmine = {target}\n")
-    invalidate_caches()
+    entry = f"[ucfrec.policies]\nmine = {target}\n"
+    distribution(tmp_path / "site", "another-policy", "2.0", entry)
     if target == "my_learner:Mine":
         assert policy_class("mine").__name__ == "Mine"
         return

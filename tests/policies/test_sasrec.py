@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.support.episodes import random_episodes, write_store
 from tests.support.tagged import tagged_store
-from ucfrec.errors import InputError
 from ucfrec.policies.sasrec import GSASRecPolicy
 from ucfrec.runs.config import resolve_config
 from ucfrec.runs.start import new_policy
@@ -39,10 +37,3 @@ def test_the_loss_is_that_of_the_paper(
         total = beta * math.log(row[item]) + sum(math.log(1 - row[other]) for other in others)
         expected.append(-total / (len(drawn) + 1))
     assert float(found) == pytest.approx(sum(expected) / len(expected), rel=1e-4)
-
-
-def test_vectors_are_refused_in_one_line(tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = tmp_path_factory.mktemp("vectors") / "store"
-    vectors = write_store(folder, random_episodes([4, 9] * 4, items=False))
-    with pytest.raises(InputError, match="gsasrec recommends items"):
-        new_policy(vectors, resolve_config("gsasrec", None, {}))

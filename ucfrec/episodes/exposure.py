@@ -124,7 +124,7 @@ class Likeness(nn.Module):
         tags = self.tags[items]
         places = torch.where(tags < 0, self._count(), tags).flatten(1).unsqueeze(1)
         gathered = nn.functional.pad(profile, (0, 1)).gather(2, places.expand(-1, shape[1], -1))
-        return gathered.view(*shape, tags.shape[2]).sum(3)
+        return gathered.view((*shape, tags.shape[2])).sum(3)
 
     def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
         """Likeness (M, D) by tags to the D different sets of tags, and the set of every item.
@@ -133,7 +133,8 @@ class Likeness(nn.Module):
         """
         if self._sets is None:
             # Padding reads a place of its own, which is 0.
-            places = np.where(self.tags.cpu().numpy() < 0, self._count(), self.tags.cpu().numpy())
+            tags = self.tags.cpu().numpy()
+            places = np.where(tags < 0, self._count(), tags)
             distinct, sets = np.unique(places, axis=0, return_inverse=True)
             numbers = torch.from_numpy(sets.reshape(-1).astype(np.int32))
             self._sets = torch.from_numpy(distinct), numbers
@@ -143,24 +144,24 @@ class Likeness(nn.Module):
 
     def _tags_of(self, items: Tensor) -> Tensor:
         """The rows (L, n_tags) of `_tag_matrix`; sparse if a product with them is then cheaper."""
-        tags, n_tags = self.tags[items], self._count()
-        rows, columns = torch.nonzero(tags >= 0, as_tuple=True)
-        places, shape = torch.stack([rows, tags[rows, columns]]), (len(items), n_tags)
-        ones = torch.ones_like(rows, dtype=self.directions.dtype)
-        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=False).coalesce()
-        return matrix if n_tags > _FEW_TAGS else matrix.to_dense()
+        return self._matrix_of(self.tags[items], self._count() <= _FEW_TAGS)
 
     def _tag_matrix(self) -> Tensor:
         """(n_items, n_tags), 1 where the item has the tag; sparse if it has many entries."""
         if self._matrix is None or self._matrix.device != self.tags.device:
-            rows, columns = torch.nonzero(self.tags >= 0, as_tuple=True)
-            places = torch.stack([rows, self.tags[rows, columns]])
-            shape = (len(self.tags), self._count())
-            ones = torch.ones_like(rows, dtype=self.directions.dtype)
-            matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=True).coalesce()
-            small = shape[0] * shape[1] <= _DENSE
-            self._matrix = matrix.to_dense() if small else matrix
+            entries = len(self.tags) * self._count()
+            self._matrix = self._matrix_of(self.tags, entries <= _DENSE)
         return self._matrix
+
+    def _matrix_of(self, tags: Tensor, dense: bool) -> Tensor:
+        rows, columns = torch.nonzero(tags >= 0, as_tuple=True)
+        places = torch.stack([rows, tags[rows, columns]])
+        ones = torch.ones_like(rows, dtype=self.directions.dtype)
+        shape = len(tags), self._count()
+        # Tags of a file are checked once, with all items.
+        checked = tags is self.tags
+        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=checked).coalesce()
+        return matrix.to_dense() if dense else matrix
 
 
 class ExposureTerm(nn.Module):
@@ -215,8 +216,8 @@ class ExposureTerm(nn.Module):
         repeated, repeated_liked, alike, alike_liked = (
             table[:, right - 1] * (1 - share) + table[:, right] * share
         )
-        liked = (exposed.rewards - self.reward_low) / (self.reward_high - self.reward_low)
-        liked = liked.clamp(0, 1)
+        span = self.reward_high - self.reward_low
+        liked = ((exposed.rewards - self.reward_low) / span).clamp(0, 1)
         return repeated + repeated_liked * liked, alike + alike_liked * liked
 
     def added_to(self, logits: Tensor, exposed: Exposed, items: Tensor | None = None) -> Tensor:

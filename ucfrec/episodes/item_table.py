@@ -29,17 +29,19 @@ def write_item_table(
     path: Path,
     embeddings: Float32Array,
     user_features: Float32Array,
+    tags: IntArray | None,
     reward_low: float,
     reward_high: float,
-    tags: IntArray | None,
+    window: int = WINDOW,
+    decay: float = DECAY,
 ) -> None:
-    """Write the file that `ucfrec.episodes.states.ItemStates.save` would, atomically; arguments
-    are its fields, with None for no tags.
+    """Write the file of `ucfrec.episodes.states.ItemStates`, atomically; arguments are its fields,
+    with None for no tags.
 
     Raises:
         InputError: the disk is full, or the folder is not writable.
     """
-    numbers = {"window": WINDOW, "decay": DECAY}
+    numbers = {"window": window, "decay": decay}
     numbers |= {"reward_low": reward_low, "reward_high": reward_high}
     arrays: dict[str, Array] = {"embeddings": embeddings, "user_features": user_features}
     if tags is not None and tags.shape[1]:

@@ -137,11 +137,19 @@ class StoreRecord(Record):
             InputError: the folder is not a store, its record is damaged, or a newer ucfrec wrote
                 it.
         """
-        record, path = super().read(folder), folder / cls.FILE
+        record = super().read(folder)
         shards = [folder / f"shard-{n:05d}" for n in (0, record.n_shards - 1)]
         if not 1 <= record.n_shards <= record.n_episodes or not all(s.is_dir() for s in shards):
-            raise record._bad(path, "n_shards", record.n_shards)
-        record._require_held(folder)
+            raise record._bad(folder, "n_shards", record.n_shards)
+        shards = [folder / f"shard-{n:05d}" for n in range(record.n_shards)]
+        # Before memory for an entry per step is allocated: the files can hold the steps.
+        files = [file for s in shards if (file := s / f"{schema.REWARD}.npy").is_file()]
+        size = np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
+        held = sum(file.stat().st_size for file in files) // size
+        if len(files) == record.n_shards and record.n_steps > held:
+            raise record._bad(folder, "n_steps", record.n_steps)
+        if record.n_episodes > record.n_steps:
+            raise record._bad(folder, "n_episodes", record.n_episodes)
         return record
 
     @classmethod
@@ -155,20 +163,6 @@ class StoreRecord(Record):
             )
         return super().of(value, path)
 
-    def _require_held(self, folder: Path) -> None:
-        """Check that the files can hold the steps, before memory for an entry per step is
-        allocated.
-
-        Raises:
-            InputError: they are too small, or there are fewer steps than episodes.
-        """
-        files = [folder / f"shard-{n:05d}" / f"{schema.REWARD}.npy" for n in range(self.n_shards)]
-        sizes = [file.stat().st_size for file in files if file.is_file()]
-        held = sum(sizes) // np.dtype(schema.STEP_DTYPES[schema.REWARD]).itemsize
-        if len(sizes) == len(files) and self.n_steps > held:
-            raise self._bad(folder / self.FILE, "n_steps", self.n_steps)
-        if self.n_episodes > self.n_steps:
-            raise self._bad(folder / self.FILE, "n_episodes", self.n_episodes)
-
-    def _bad(self, path: Path, name: str, value: object) -> InputError:
-        return InputError(f"{path} is damaged: its {name} is {value!r:.60}; {self.REMEDY}")
+    def _bad(self, folder: Path, name: str, value: int) -> InputError:
+        path = folder / self.FILE
+        return InputError(f"{path} is damaged: its {name} is {value}; {self.REMEDY}")

@@ -83,8 +83,7 @@ class ReturnToGo:
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":
         """Target returns (B,) float64 at the next step, in reward units, of a `target` of the
         session if `per_session`, otherwise of every step; `collected` (B,) before it."""
-        # Checking a log needs this module, but not the seconds that importing torch takes.
-        import torch
+        import torch  # checking a log needs this module, but not the seconds that importing takes
 
         whole = torch.full_like(collected, target, dtype=torch.float64)
         return whole - collected if self.per_session else whole
@@ -98,20 +97,18 @@ class ReturnToGo:
         """
         import torch
 
-        earlier = rewards[:, :-1].double()
-        last = targets.double().unsqueeze(1)
+        earlier, last = rewards[:, :-1].double(), targets.double().unsqueeze(1)
+        length = earlier.shape[1]
         if self.definition == "session":
             returns = last + earlier.flip(1).cumsum(1).flip(1)
         elif self.definition == "discounted":
             # Σ_{j≤k<t} γ^{k−j} r_k: a triangular product, because a recursion would be a loop.
-            length = earlier.shape[1]
             ahead = torch.arange(length).unsqueeze(0) - torch.arange(length).unsqueeze(1)
             weights = torch.where(ahead >= 0, self.discount ** ahead.clamp(min=0).double(), 0.0)
             reach = self.discount ** torch.arange(length, 0, -1, dtype=torch.float64)
             returns = earlier @ weights.T.to(earlier) + reach.to(last) * last
         else:
             sums = torch.nn.functional.pad(earlier.cumsum(1), (1, 0))  # before each step
-            length = earlier.shape[1]
             steps = torch.arange(length)
             ends = (steps + self.horizon).clamp(max=length)
             beyond = (steps + self.horizon - length).clamp(min=0).double() / self.horizon
@@ -119,15 +116,10 @@ class ReturnToGo:
         return torch.cat([returns, last], dim=1).float()
 
 
-def returns_to_go(rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
-    """Returns-to-go of the whole rest of each session; see `ReturnToGo.of_logs`."""
-    return ReturnToGo().of_logs(rewards, offsets)
-
-
 def returns_in_parts(
     rewards: npt.NDArray[np.floating], offsets: IntArray, steps: int
 ) -> Iterator[Float32Array]:
-    """The same numbers as `returns_to_go`, in parts of about `steps` steps, to save memory."""
+    """`ReturnToGo().of_logs` in parts of about `steps` steps, to save memory."""
     begin, total = 0, 0.0
     while begin < len(offsets) - 1:
         end = int(np.searchsorted(offsets, offsets[begin] + steps))

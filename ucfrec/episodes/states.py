@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray
-from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW
+from ucfrec.episodes.item_table import DECAY, DISTINCT_TAGS, TAGS_PER_ITEM, WINDOW, write_item_table
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 LIKED = 0.6
 """A step counts as liked if its reward, scaled to [0, 1] as in item states, is at least this: the
 threshold on the normalised watch ratio in the published dominance metric; a click is liked."""
+_HOUR_MS = 3_600_000
 _Reward = TypeVar("_Reward", float, Tensor)
 
 
@@ -61,22 +62,27 @@ class ItemStates:
     none. States do not contain them: they show which items are alike."""
 
     def __post_init__(self) -> None:
-        tables, tags = (self.embeddings, self.user_features), self.tags
-        if any(table.dim() != 2 or not table.is_floating_point() for table in tables):
+        if any(
+            table.dim() != 2 or not table.is_floating_point()
+            for table in (self.embeddings, self.user_features)
+        ):
             raise InputError("embeddings and user features of item states must be real matrices")
-        fits = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
-        if tags.dtype != torch.int64 or not fits:
-            raise InputError("tags of item states must be a matrix of integers, one row per item")
         # Tags are numbered without gaps, so that no number exceeds their count.
-        most = min(tags.numel(), DISTINCT_TAGS) - 1
+        tags, most = self.tags, min(self.tags.numel(), DISTINCT_TAGS) - 1
+        shaped = tags.dim() == 2 and (len(tags) == len(self.embeddings) or not tags.shape[1])
+        if tags.dtype != torch.int64 or not shaped or tags.shape[1] > TAGS_PER_ITEM:
+            raise InputError(
+                f"tags of item states must be integers, one row per item, of at most "
+                f"{TAGS_PER_ITEM}"
+            )
         if tags.numel() and not -1 <= int(tags.min()) <= int(tags.max()) <= most:
             raise InputError(f"tags of item states are not numbers from -1 to {most}")
-        if tags.shape[1] > TAGS_PER_ITEM:
-            raise InputError(f"item states have more than {TAGS_PER_ITEM} tags an item")
-        if type(self.window) is not int or not 1 <= self.window <= 10_000:
-            raise InputError(f"window of item states is {self.window!r:.60}; give 1 to 10,000")
-        if not _is_real(self.decay) or not 0 <= self.decay <= 1:
-            raise InputError(f"decay of item states is {self.decay!r:.60}; give 0 to 1")
+        whole = type(self.window) is int and 1 <= self.window <= 10_000
+        if not (whole and _is_real(self.decay) and 0 <= self.decay <= 1):
+            raise InputError(
+                f"item states have window {self.window!r:.60} and decay {self.decay!r:.60}; "
+                "give 1 to 10,000 and 0 to 1"
+            )
         low, high = self.reward_low, self.reward_high
         if not (_is_real(low) and _is_real(high) and low < high):
             raise InputError(
@@ -136,21 +142,13 @@ class ItemStates:
         )
 
     def save(self, path: Path) -> None:
-        """Write to one safetensors file, atomically."""
-        numbers = {"window": self.window, "decay": self.decay}
-        numbers |= {"reward_low": self.reward_low, "reward_high": self.reward_high}
-        tensors = {"embeddings": self.embeddings, "user_features": self.user_features}
-        if self.tags.shape[1]:
-            tensors["tags"] = self.tags
-        save_tensors(path, tensors, numbers)
+        """Write to one safetensors file, atomically; see `write_item_table`."""
+        tables = self.embeddings.numpy(), self.user_features.numpy(), self.tags.numpy()
+        write_item_table(path, *tables, self.reward_low, self.reward_high, self.window, self.decay)
 
     @classmethod
     def load(cls, path: Path) -> "ItemStates":
-        """Read a file that `save` wrote.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
             states = cls(tensors["embeddings"], tensors["user_features"], **numbers)
@@ -192,12 +190,28 @@ class TrainingCounts:
         cls,
         train: "EpisodeStore",
         liked_of: Callable[["EpisodeStore", Array], BoolArray] = liked_rewards,
+        half_life: float = math.inf,
     ) -> "TrainingCounts":
-        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`."""
-        impressions, liked = np.zeros((2, len(train.item_states.embeddings)), dtype=np.int64)
-        for items, rewards in train.column_batches(schema.ITEM, schema.REWARD):
-            impressions += np.bincount(items, minlength=len(impressions))
-            liked += np.bincount(items[liked_of(train, rewards)], minlength=len(liked))
+        """Count the items in `train`, a view of a store of items; `liked_of` as `liked_rewards`.
+
+        Steps halve with every half-life (hours) of their age, float64, unless it is infinite or the
+        store has no times.
+        """
+        names, n_items = [schema.ITEM, schema.REWARD], len(train.item_states.embeddings)
+        timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
+        impressions, liked = np.zeros((2, n_items), dtype=np.float64 if timed else np.int64)
+        if timed:
+            names.append(schema.TIMESTAMP)
+            last = int(train.column(schema.TIMESTAMP).max())
+        for items, rewards, *times in train.column_batches(*names):
+            weights = None
+            if timed:
+                age = last - times[0].astype(np.int64)
+                weights = np.exp2(-age / (half_life * _HOUR_MS))
+            impressions += np.bincount(items, weights, n_items)
+            is_liked = liked_of(train, rewards)
+            weights = weights if weights is None else weights[is_liked]
+            liked += np.bincount(items[is_liked], weights, n_items)
         return cls(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
     def save(self, path: Path) -> None:
@@ -206,11 +220,7 @@ class TrainingCounts:
 
     @classmethod
     def load(cls, path: Path) -> "TrainingCounts":
-        """Read a file that `save` wrote.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Read a file that `save` wrote; an InputError if it is missing or damaged."""
         tensors, numbers = load_tensors(path)
         with damage_explained(path, REMEDY):
             for name in ("shown", "liked"):

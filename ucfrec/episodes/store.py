@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
+from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import LONG
-from ucfrec.episodes.returns import ReturnToGo, returns_to_go
+from ucfrec.episodes.record import LONG, Source, StoreRecord
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
-from ucfrec.episodes.view import Columns, EpisodeView, StepColumn
+from ucfrec.episodes.view import Columns, EpisodeView, StepColumn, list_earlier
 from ucfrec.episodes.writer import StoreWriter, require_finite, require_steps
 from ucfrec.errors import InputError
 from ucfrec.files.atomic import atomic_folder
@@ -52,7 +52,8 @@ class EpisodeStore(EpisodeView):
         Raises:
             InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
-        return cls(Columns.open(Path(path)))
+        path = Path(path)
+        return cls(Columns(path, StoreRecord.read(path)))
 
     @classmethod
     def write(
@@ -101,19 +102,35 @@ class EpisodeStore(EpisodeView):
     ) -> "EpisodeStore":
         """Make a store in memory, without files.
 
-        Args:
-            steps, lengths, episodes: as of `write`.
-            item_states: builds states from items; required if actions are items.
-
-        Raises:
-            InputError: as `write`.
+        Args and errors are those of `write`; `item_states` are required if actions are items.
         """
         lengths = require_steps("a store in memory", lengths)
         require_finite(steps[schema.REWARD])
-        columns = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8), **(episodes or {})}
-        return cls(Columns.from_arrays(steps, lengths, columns, item_states))
-
-    # For notebooks.
+        offsets = _offsets(lengths)
+        splits = {schema.SPLIT: np.zeros(len(lengths), dtype=np.uint8)}
+        dtypes, arrays = schema.STEP_DTYPES | schema.EPISODE_DTYPES, dict[str, Array]()
+        for name, values in {**steps, **splits, **(episodes or {})}.items():
+            arrays[name] = np.asarray(values, dtypes[name])
+            what, expected = ("step", offsets[-1]) if name in steps else ("episode", len(lengths))
+            if len(values) != expected:
+                raise InputError(
+                    f"column {name!r} has {len(values)} values instead of {expected}; give one per "
+                    f"{what}"
+                )
+        record = StoreRecord(
+            files={},
+            version=schema.STORE_VERSION,
+            n_steps=int(offsets[-1]),
+            n_episodes=len(lengths),
+            n_shards=0,
+            columns={name: list(arrays[name].shape[1:]) for name in steps},
+            fingerprint="",
+            reward=schema.REWARD,
+            source=Source(),
+        )
+        arrays[schema.OFFSETS] = offsets
+        arrays[schema.RETURN_TO_GO] = ReturnToGo().of_logs(arrays[schema.REWARD], offsets)
+        return cls(Columns(Path("<memory>"), record, arrays, item_states))
 
     def to_frame(self) -> "pd.DataFrame":
         """One row per step, session by session: `user_id`, `session_id` (the number of the session
@@ -145,15 +162,11 @@ class EpisodeStore(EpisodeView):
     def _number_sessions(self) -> IntArray:
         """(E,) number of each episode's session, which is that of its first episode."""
         numbers = self.episode_ids
-        has_ends = self.has_episode_values(schema.TERMINATED)
-        if not (self.has_users and has_ends) or len(self) < 2:
+        if not self.has_users or not len(self):
             return numbers
-        users, splits, ended = (
-            self.episode_values(name) for name in (schema.USER, schema.SPLIT, schema.TERMINATED)
-        )
-        goes_on = (users[1:] == users[:-1]) & (splits[1:] > splits[:-1]) & (ended[:-1] == 0)
-        goes_on &= np.diff(numbers) == 1
-        first = np.concatenate([[True], ~goes_on])
+        users, splits = (self.episode_values(n).astype(int) for n in (schema.USER, schema.SPLIT))
+        goes_on = (np.diff(users) == 0) & (np.diff(splits) > 0) & (np.diff(numbers) == 1)
+        first = np.append(True, ~goes_on | self.terminated[:-1])
         return np.asarray(numbers[first][np.cumsum(first) - 1])
 
     def _read_ids(self, column: str, numbers: IntArray) -> Array:
@@ -172,31 +185,22 @@ class EpisodeStore(EpisodeView):
         return axes
 
     def _repr_html_(self) -> str:
-        heads = ("", "episodes", "steps", "mean return")
-        views = {name: self.split(name) for name in schema.SPLITS}
-        lines = [
-            (name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}")
-            for name, view in {"all": self, **views}.items()
-            if len(view)
-        ]
-        head = "".join(f"<th>{text}</th>" for text in heads)
-        body = "".join(f"<tr><td>{'</td><td>'.join(line)}</td></tr>" for line in lines)
-        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{body}</table>"
-
-    # Views.
+        table = "<tr><th></th><th>episodes</th><th>steps</th><th>mean return</th></tr>"
+        for name, view in (("all", self), *((name, self.split(name)) for name in schema.SPLITS)):
+            if len(view):
+                cells = name, f"{len(view):,}", f"{view.n_steps:,}", f"{view.returns.mean():.4g}"
+                table += f"<tr><td>{'</td><td>'.join(cells)}</td></tr>"
+        return f"<p>{escape(repr(self))}</p><table>{table}</table>"
 
     def select(self, episodes: IntArray) -> "EpisodeStore":
         """A view of the episodes at the given positions of this view, in the given order."""
         return EpisodeStore(self._columns, self.episode_ids[episodes])
 
     def split(self, name: str) -> "EpisodeStore":
-        """A view of the episodes in one split.
-
-        Args:
-            name: "train", "validation" or "test"; the split may be empty.
+        """A view of the episodes in one split, which may be empty.
 
         Raises:
-            InputError: `name` is none of these.
+            InputError: `name` is not "train", "validation" or "test".
         """
         if name not in schema.SPLITS:
             raise InputError(f"no split is called {name!r}; there are {', '.join(schema.SPLITS)}")
@@ -209,7 +213,9 @@ class EpisodeStore(EpisodeView):
         One session of thousands of steps would otherwise set the largest target return, be a good
         part of the rows that the user model is fitted to, and let simulated sessions go on as long.
         """
-        usual = self.lengths <= LONG * np.median(self.lengths) if len(self) else np.array([True])
+        if not len(self):
+            return self
+        usual = self.lengths <= LONG * np.median(self.lengths)
         return self if usual.all() else self.select(np.flatnonzero(usual))
 
     @cached_property
@@ -226,24 +232,26 @@ class EpisodeStore(EpisodeView):
             values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
             definition: what they count; None for what they counted before.
         """
-        name = schema.RETURN_TO_GO
-        returns = self._columns.step_column(name).take(np.arange(self.record.n_steps))
+        name, n_steps = schema.RETURN_TO_GO, self.record.n_steps
+        returns = self._columns.step_column(name).take(np.arange(n_steps))
         episodes, steps = self.all_steps()
         returns[self._columns.starts[self.episode_ids[episodes]] + steps] = values
-        columns = self._columns.replace(name, StepColumn([returns]), (), definition)
+        definition = definition or self.return_to_go
+        columns = self._columns.replace(name, StepColumn([returns]), return_to_go=definition)
         return EpisodeStore(columns, self._selected)
 
     def with_return_to_go(self, definition: ReturnToGo) -> "EpisodeStore":
         """A view of the same episodes whose returns-to-go are counted by `definition`."""
-        rewards = self.step_values(schema.REWARD, *self.all_steps())
-        offsets = np.concatenate([[0], np.cumsum(self.lengths)])
-        return self.with_returns_to_go(definition.of_logs(rewards, offsets), definition)
+        returns = definition.of_logs(self.column(schema.REWARD), _offsets(self.lengths))
+        return self.with_returns_to_go(returns, definition)
 
     def without_observation_dimensions(self, dimensions: Sequence[int]) -> "EpisodeStore":
         """A view of the same episodes without some dimensions of the observations, 0 to O − 1."""
         remaining = np.setdiff1d(np.arange(self.observation_size), dimensions)
-        column = self._columns.step_column(schema.OBSERVATION).select_dimensions(remaining)
-        columns = self._columns.replace(schema.OBSERVATION, column, (len(remaining),), None)
+        name, size = schema.OBSERVATION, len(remaining)
+        record = self.record.copy_with(columns={**self.record.columns, name: [size]})
+        column = self._columns.step_column(name).select_dimensions(remaining)
+        columns = self._columns.replace(name, column, record=record, observation_size=size)
         return EpisodeStore(columns, self._selected)
 
     @cached_property
@@ -263,9 +271,6 @@ class EpisodeStore(EpisodeView):
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0)
         return mean.float(), variance.sqrt().float()
-
-
-# Two stores.
 
 
 @dataclass(frozen=True)
@@ -288,9 +293,9 @@ class UserRows:
         """Collect the rows.
 
         Args:
-            users: (E,) identifier of the user of each of its episodes.
-            earlier: a store with the same numbers of users and items; rows that are not before the
-                user's first later row are left out. None for none.
+            users: (E,) identifier of the user of each later episode.
+            earlier: a store with the same numbers of users and items, of which only rows before the
+                user's first later row count.
         """
         owners = np.unique(users, return_inverse=True)[1]
         episodes, steps = later.all_steps()
@@ -299,66 +304,96 @@ class UserRows:
         if earlier is not None and later.has_users and earlier.has_users:
             begins = np.full(len(users), np.iinfo(np.int64).max)
             np.minimum.at(begins, owner, times)
-            users_earlier = later.episode_values(schema.USER).astype(np.int64)
-            more = _earlier_rows(earlier, users_earlier, owners, begins)
-            owner, times, source = (
-                np.concatenate(pair) for pair in zip(more, (owner, times, source), strict=True)
-            )
+            known = later.episode_values(schema.USER).astype(np.int64)
+            # Owner of each user of the earlier store, and −1 for the user −1, the last.
+            owner_of = np.full(max(int(known.max(initial=-1)), 0) + 2, -1)
+            owner_of[known[known >= 0]] = owners[known >= 0]
+            before = earlier.episode_values(schema.USER).astype(np.int64)
+            before = owner_of[np.where(before < len(owner_of) - 1, before, -1)]
+            parts, taken = [(owner, times, source)], 0
+            for episodes, steps in earlier.step_batches():
+                rows = np.flatnonzero(before[episodes] >= 0)
+                owner, at = before[episodes[rows]], _times(earlier, episodes[rows], steps[rows])
+                kept = at < begins[owner]
+                parts.append((owner[kept], at[kept], -1 - (taken + rows[kept])))
+                taken += len(steps)
+            owner, times, source = (np.concatenate(each) for each in zip(*parts, strict=True))
         order = np.lexsort((times, owner))
-        place = np.empty(len(steps), dtype=np.int64)
-        rows = np.flatnonzero(source[order] >= 0)
-        place[source[order][rows]] = rows
+        source = source[order]
+        rows = np.flatnonzero(source >= 0)
+        place = np.empty(len(rows), dtype=np.int64)
+        place[source[rows]] = rows
         first = np.searchsorted(owner[order], owner[order][place])
-        return cls(later, earlier, source[order], first, place)
+        return cls(later, earlier, source, first, place)
 
-    def values(self, name: str, rows: IntArray) -> Array:
-        """Values of a step column at rows of any shape."""
-        return _join(name, self.later, self.earlier, self.source[rows])
+    def values(self, name: str, source: IntArray) -> Array:
+        """Values of a step column at sources of any shape; see `source`."""
+        later, earlier = self.later, self.earlier
+        values = later.step_values(name, *later.locate(np.maximum(source, 0)))
+        if earlier is not None and (source < 0).any():
+            steps = earlier.locate(-1 - source[source < 0])
+            values[source < 0] = earlier.step_values(name, *steps)
+        return values
 
     def recent(self, steps: IntArray, count: int) -> tuple[IntArray, Float32Array]:
         """The items and rewards (B, count) of the user's latest rows before later steps (B,),
         most recent first; −1 and 0 where there are fewer."""
         rows = self.place[steps][:, None] - np.arange(1, count + 1)
         missing = rows < self.first[steps][:, None]
-        rows = np.maximum(rows, 0)
-        items = np.where(missing, -1, self.values(schema.ITEM, rows)).astype(np.int64)
-        rewards = np.where(missing, 0, self.values(schema.REWARD, rows)).astype(np.float32)
+        source = self.source[np.maximum(rows, 0)]
+        items = np.where(missing, -1, self.values(schema.ITEM, source)).astype(np.int64)
+        rewards = np.where(missing, 0, self.values(schema.REWARD, source)).astype(np.float32)
         return items, rewards
 
     def seen(self, steps: IntArray) -> tuple[IntArray, IntArray]:
         """(rows, items), each (M,): the known items in all rows of the user before later steps
         (B,); `rows` are indices into the B."""
-        first, counts = self.first[steps], self.place[steps] - self.first[steps]
-        owner = np.repeat(np.arange(len(steps)), counts)
-        inside = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-        items = self.values(schema.ITEM, first[owner] + inside).astype(np.int64)
+        first = self.first[steps]
+        owner, inside = list_earlier(self.place[steps] - first)
+        source = self.source[first[owner] + inside]
+        items = self.values(schema.ITEM, source).astype(np.int64)
         return owner[items >= 0], items[items >= 0]
 
     def continue_sessions(self, gap_ms: float | None) -> EpisodeStore:
-        """The later log, with the rows before it in the sessions that go on in it.
-
-        These rows are known but are not steps of the view: `all_steps` leaves them out.
-
-        Args:
-            gap_ms: pause (ms) that ends a session; None if a session is all of a user.
-        """
+        """The later log, with the rows before it in the sessions that go on in it; a pause of more
+        than `gap_ms` ends one, None none. Earlier rows are known but `all_steps` excludes them."""
         if self.earlier is None:
             return self.later
         begin = self.place[np.cumsum(self.later.lengths) - self.later.lengths]
         counts = np.minimum(begin - self._begins(begin, gap_ms), LONGEST_HISTORY)
         if not counts.any():
             return self.later
-        return EpisodeStore(_ContinuedColumns(self, begin, counts))
+        return EpisodeStore(self._continued_columns(begin, counts))
+
+    def _continued_columns(self, begin: IntArray, counts: IntArray) -> Columns:
+        """The columns of the later episodes, with the `counts` (E,) rows before `begin` (E,)."""
+        later, lengths = self.later, self.later.lengths + counts
+        offsets = _offsets(lengths)
+        inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
+        numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
+        before = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
+        source = np.where(inside >= 0, numbers, before)
+        names = [name for name in schema.EPISODE_DTYPES if later._columns.has_episode_column(name)]
+        arrays = {name: later.episode_values(name) for name in names}
+        arrays[schema.OFFSETS] = offsets
+        rewards = self.values(schema.REWARD, source)
+        arrays[schema.RETURN_TO_GO] = ReturnToGo().of_logs(rewards, offsets)
+        record = later.record.copy_with(
+            files={}, n_steps=len(source), n_episodes=len(lengths), n_shards=0
+        )
+        columns = Columns(later.path, record, arrays, later.item_states)
+        columns.skipped = counts
+        for name in record.columns:
+            columns = columns.replace(name, StepColumn([_JoinedRows(self, name, source)]))
+        return columns
 
     def _begins(self, begin: IntArray, gap_ms: float | None) -> IntArray:
         """(E,) row at which the session of each later episode begins, whose first row is `begin`:
         an earlier row, or the same."""
-        breaks = np.ones(len(self.source), dtype=bool)
-        inside = np.arange(1, len(self.source))
-        times = self.values(schema.TIMESTAMP, np.arange(len(self.source))).astype(np.int64)
+        times = self.values(schema.TIMESTAMP, self.source).astype(np.int64)
         pause = np.diff(times) > (np.inf if gap_ms is None else gap_ms)
-        breaks[1:] = pause | (self.source[inside - 1] >= 0)
-        breaks[np.unique(self.first)] = True
+        breaks = np.append(True, pause | (self.source[:-1] >= 0))
+        breaks[self.first] = True
         starts = np.flatnonzero(breaks)
         return np.asarray(starts[np.searchsorted(starts, begin, side="right") - 1])
 
@@ -369,88 +404,18 @@ def _times(store: EpisodeStore, episodes: IntArray, steps: IntArray) -> IntArray
     return store.step_values(schema.TIMESTAMP, episodes, steps).astype(np.int64)
 
 
-def _earlier_rows(
-    earlier: EpisodeStore, users_earlier: IntArray, owners: IntArray, begins: IntArray
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Owner, time (ms) and source of the earlier rows of users, in the order of the store.
-
-    Args:
-        users_earlier: (E,) its number of the user of each later episode; −1 for others.
-        owners: (E,) that user's number among the later ones.
-        begins: (U,) time at which the user's later rows begin.
-    """
-    numbers = np.full(max(int(users_earlier.max(initial=-1)), 0) + 2, -1)
-    numbers[users_earlier[users_earlier >= 0]] = owners[users_earlier >= 0]
-    users = earlier.episode_values(schema.USER).astype(np.int64)
-    owner_of = numbers[np.where((users >= 0) & (users < len(numbers) - 1), users, -1)]
-    parts = []
-    taken = 0
-    for episodes, steps in earlier.step_batches():
-        owner = owner_of[episodes]
-        candidates = np.flatnonzero(owner >= 0)
-        times = _times(earlier, episodes[candidates], steps[candidates])
-        is_earlier = times < begins[owner[candidates]]
-        rows = candidates[is_earlier]
-        parts.append((owner[rows], times[is_earlier], -1 - (taken + rows)))
-        taken += len(steps)
-    owner, times, source = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return owner, times, source
-
-
-def _join(name: str, later: EpisodeStore, earlier: EpisodeStore | None, source: IntArray) -> Array:
-    """Values of a step column at sources of any shape; see `UserRows.source`."""
-    values = later.step_values(name, *later.locate(np.maximum(source, 0)))
-    is_earlier: BoolArray = source < 0
-    if earlier is not None and is_earlier.any():
-        values[is_earlier] = earlier.step_values(name, *earlier.locate(-1 - source[is_earlier]))
-    return values
-
-
-class _JoinedColumn(StepColumn):
-    """A step column of rows that lie in two stores."""
+class _JoinedRows:
+    """Values of rows that lie in two stores, as an array is indexed."""
 
     def __init__(self, rows: UserRows, name: str, source: IntArray) -> None:
-        super().__init__([])
         self._rows, self._name, self._source = rows, name, source
 
     def __len__(self) -> int:
         return len(self._source)
 
-    def take(self, index: IntArray) -> Array:
-        """A copy of the values at the indices `index`, of any shape."""
-        return _join(self._name, self._rows.later, self._rows.earlier, self._source[index])
-
-    def between(self, begin: int, end: int) -> Array:
-        """The values from index `begin` to before `end`."""
-        return self.take(np.arange(begin, end))
+    def __getitem__(self, index: IntArray | slice) -> Array:
+        return self._rows.values(self._name, self._source[index])
 
 
-class _ContinuedColumns(Columns):
-    """The columns of later episodes, each with the earlier rows of its session before it."""
-
-    def __init__(self, rows: UserRows, begin: IntArray, counts: IntArray) -> None:
-        """
-        Args:
-            begin: (E,) row of the first step of each later episode.
-            counts: (E,) rows before it that belong to the session.
-        """
-        later = rows.later
-        lengths = later.lengths + counts
-        offsets = np.concatenate([[0], np.cumsum(lengths)])
-        inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
-        numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
-        source = np.where(
-            inside >= 0, numbers, rows.source[np.repeat(begin, lengths) + inside.clip(max=0)]
-        )
-        rewards = _join(schema.REWARD, later, rows.earlier, source)
-        arrays = {
-            name: later.episode_values(name)
-            for name in schema.EPISODE_DTYPES
-            if later.has_episode_values(name)
-        }
-        arrays |= {schema.OFFSETS: offsets, schema.RETURN_TO_GO: returns_to_go(rewards, offsets)}
-        sizes = {"n_steps": len(source), "n_episodes": len(lengths), "n_shards": 0}
-        record = later.record.copy_with(**sizes)
-        super().__init__(later.path, record, arrays, later.item_states)
-        self.skipped = counts
-        self._steps = {name: _JoinedColumn(rows, name, source) for name in record.columns}
+def _offsets(lengths: IntArray) -> IntArray:
+    return np.append(0, np.cumsum(lengths)).astype(np.int64)

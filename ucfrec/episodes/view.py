@@ -1,9 +1,10 @@
 """Columns of a store, memory-mapped or in memory, and views of its episodes."""
 
 from collections.abc import Iterator, Mapping
+from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -12,8 +13,8 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.episodes.item_table import ITEM_STATES
-from ucfrec.episodes.record import Source, StoreRecord
-from ucfrec.episodes.returns import ReturnToGo, returns_to_go
+from ucfrec.episodes.record import StoreRecord
+from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.windows import Transitions, Windows
 from ucfrec.errors import InputError, one_line
@@ -24,7 +25,6 @@ _DTYPES: Final = {
     **schema.STEP_DTYPES,
     **schema.EPISODE_DTYPES,
 }
-_IN_MEMORY = Path("<memory>")
 _BATCH_STEPS = 2**20
 _LONG_ENOUGH = 1000
 """Mean number of steps from which consecutive steps are read as slices."""
@@ -33,7 +33,7 @@ _LONG_ENOUGH = 1000
 class StepColumn:
     """A step column, indexed across its shards."""
 
-    def __init__(self, parts: list[Array], dimensions: IntArray | None = None) -> None:
+    def __init__(self, parts: list[Any], dimensions: IntArray | None = None) -> None:
         """Parts are one a shard, (M,) or (M, size); values have some `dimensions` of it, or all."""
         self.parts, self._dimensions = parts, dimensions
         self._bounds = np.cumsum([0] + [len(part) for part in parts])
@@ -72,10 +72,7 @@ class StepColumn:
 
 
 class Columns:
-    """The columns of all E episodes of a store, with N steps in total.
-
-    Episodes are numbered 0 to E − 1 in the order of the store, independently of any view.
-    """
+    """The columns of all E episodes of a store, numbered in its order, with N steps in total."""
 
     def __init__(
         self,
@@ -83,86 +80,27 @@ class Columns:
         record: StoreRecord,
         arrays: Mapping[str, Array] | None = None,
         item_states: ItemStates | None = None,
-        return_to_go: ReturnToGo | None = None,
     ) -> None:
-        """
-        Args:
-            arrays: columns in memory, by name, used instead of the files of the folder.
-            item_states: used instead of the file of the folder.
-            return_to_go: what the returns-to-go count; None for the rest of the session.
-        """
-        self.return_to_go = return_to_go or ReturnToGo()
+        """Arrays are columns in memory, by name; they and `item_states` are used instead of the
+        folder's files, of which none may be missing or have another size than when written."""
         self.path, self.record, self._sealed = path, record, record.checksums(path)
+        self._sealed.require(small=-1)
         self._arrays, self._given_states = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
         self.has_items = schema.ITEM in record.columns
         self.observation_size = int((record.columns.get(schema.OBSERVATION) or [0])[0])
+        self.return_to_go = ReturnToGo()
+        """What the returns-to-go count."""
         self.skipped: IntArray | None = None
         """(E,) number of steps at the beginning of each episode that are known but do not count;
         None for none."""
 
-    @classmethod
-    def open(cls, path: Path) -> "Columns":
-        """Open a store folder; only `meta.json` is read, columns are mapped on first use.
-
-        Raises:
-            InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
-        """
-        columns = cls(path, StoreRecord.read(path))
-        columns._sealed.require(small=-1)
-        return columns
-
-    @classmethod
-    def from_arrays(
-        cls,
-        steps: Mapping[str, Array],
-        lengths: IntArray,
-        episodes: Mapping[str, Array],
-        item_states: ItemStates | None,
-    ) -> "Columns":
-        """See `EpisodeStore.from_arrays`; `episodes` must include `split`."""
-        offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-        dtypes = schema.STEP_DTYPES | schema.EPISODE_DTYPES
-        arrays = {
-            name: np.asarray(values, dtypes[name]) for name, values in {**steps, **episodes}.items()
-        }
-        for name, values in arrays.items():
-            what, expected = (
-                ("step", int(offsets[-1])) if name in steps else ("episode", len(lengths))
-            )
-            if len(values) != expected:
-                raise InputError(
-                    f"column {name!r} has {len(values)} values instead of {expected}; give one per "
-                    f"{what}"
-                )
-        record = StoreRecord(
-            files={},
-            version=schema.STORE_VERSION,
-            n_steps=int(offsets[-1]),
-            n_episodes=len(lengths),
-            n_shards=0,
-            columns={name: list(arrays[name].shape[1:]) for name in steps},
-            fingerprint="",
-            reward=schema.REWARD,
-            source=Source(),
-        )
-        arrays[schema.OFFSETS] = offsets
-        arrays[schema.RETURN_TO_GO] = returns_to_go(arrays[schema.REWARD], offsets)
-        return cls(_IN_MEMORY, record, arrays, item_states)
-
-    def replace(
-        self, name: str, column: StepColumn, size: tuple[int, ...], return_to_go: ReturnToGo | None
-    ) -> "Columns":
-        """A copy with another step column of the given size; files stay as they are. None for
-        returns-to-go that count what they counted before."""
-        sizes = dict(self.record.columns)
-        if name in sizes:
-            sizes[name] = list(size)
-        record, definition = self.record.copy_with(columns=sizes), return_to_go or self.return_to_go
-        copy = Columns(self.path, record, self._arrays, self._given_states, definition)
-        copy._steps = {**self._steps, name: column}
-        return copy
+    def replace(self, name: str, column: StepColumn, **changes: Any) -> "Columns":
+        """A copy with another step column and other attributes; files stay as they are."""
+        copied = copy(self)
+        vars(copied).update(changes, _steps={**self._steps, name: column})
+        return copied
 
     @cached_property
     def starts(self) -> IntArray:
@@ -177,19 +115,15 @@ class Columns:
             if len(offsets) < 2 or offsets[0] != 0 or np.any(offsets[1:] <= offsets[:-1]):
                 raise self._explain_damage(schema.OFFSETS, "do not ascend from 0")
         lengths = np.concatenate([np.diff(offsets) for offsets in parts])
-        episodes, steps = len(lengths), int(lengths.sum())
-        if (episodes, steps) != (record.n_episodes, record.n_steps):
-            fault = f"have {episodes} episodes of {steps} steps, not {record.n_episodes} of "
-            raise self._explain_damage(schema.OFFSETS, f"{fault}{record.n_steps}")
+        held, expected = (len(lengths), int(lengths.sum())), (record.n_episodes, record.n_steps)
+        if held != expected:
+            fault = f"have episodes and steps {held}, not {expected}"
+            raise self._explain_damage(schema.OFFSETS, fault)
         return lengths
 
     @cached_property
     def item_states(self) -> ItemStates:
-        """Builds states from items; for stores of items only.
-
-        Raises:
-            InputError: the file of item states is missing or damaged.
-        """
+        """See `EpisodeView.item_states`."""
         if self._given_states is not None:
             return self._given_states
         self._sealed.require(ITEM_STATES)
@@ -209,41 +143,32 @@ class Columns:
 
     def has_episode_column(self, name: str) -> bool:
         """Whether the store has the episode column `name`."""
-        files = [shard / f"{name}.npy" for shard in self._shards]
-        return name in self._arrays or (bool(files) and all(file.is_file() for file in files))
+        if not self._shards:
+            return name in self._arrays
+        return all((shard / f"{name}.npy").is_file() for shard in self._shards)
 
     def episode_column(self, name: str) -> Array:
-        """The whole episode column `name`, (E,).
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """The whole episode column `name`, (E,); see `EpisodeView.episode_values`."""
         parts = self._parts(name)
         if not parts:
             raise InputError(f"{self.path} has no column {name!r}; write the store with it")
         values = np.concatenate(parts)
         if len(values) != self.record.n_episodes:
-            raise self._explain_damage(
-                name, f"has {len(values)} of {self.record.n_episodes} episodes"
-            )
+            fault = f"has {len(values)} of {self.record.n_episodes} episodes"
+            raise self._explain_damage(name, fault)
         if name == schema.SPLIT and np.any(values >= len(schema.SPLITS)):
             raise self._explain_damage(name, "has numbers that are not a split")
         return values
 
     def step_column(self, name: str) -> StepColumn:
-        """The step column `name`.
-
-        Raises:
-            InputError: the store has no such column, or its files are damaged.
-        """
+        """The step column `name`; see `EpisodeView.step_values`."""
         if name not in self._steps:
             if name not in (*self.record.columns, schema.RETURN_TO_GO):
                 raise InputError(f"{self.path} has no column {name!r}; prepare the logs with it")
             column = StepColumn(self._parts(name, mmap=True))
             if len(column) != self.record.n_steps:
-                raise self._explain_damage(
-                    name, f"has {len(column)} of {self.record.n_steps} steps"
-                )
+                fault = f"has {len(column)} of {self.record.n_steps} steps"
+                raise self._explain_damage(name, fault)
             if name == schema.ITEM and name not in self._arrays and self.has_item_states:
                 low = min(part.min() for part in column.parts)
                 high = max(part.max() for part in column.parts)
@@ -255,11 +180,7 @@ class Columns:
         return self._steps[name]
 
     def _parts(self, name: str, mmap: bool = False) -> list[Array]:
-        """A column as one array per shard; a column in memory is a single array.
-
-        Raises:
-            InputError: a file is missing or damaged, or holds something else.
-        """
+        """A column as one array per shard; a column in memory is a single array."""
         if name in self._arrays:
             return [self._arrays[name]]
         shape, parts = tuple(self.record.columns.get(name, ())), []
@@ -335,11 +256,9 @@ class EpisodeView:
         if self.has_items and self._columns.has_item_states:
             facts.append(f"{len(self.item_states.embeddings):,} items")
         facts.append(f"reward={self.record.reward}")
-        splits = (
-            set() if self._selected is None else set(self.episode_values(schema.SPLIT).tolist())
-        )
-        if len(splits) == 1:
-            facts.append(f"split={schema.SPLITS[splits.pop()]}")
+        if self._selected is not None:
+            splits = np.unique(self.episode_values(schema.SPLIT))
+            facts += [f"split={schema.SPLITS[split]}" for split in splits if len(splits) == 1]
         return f"{type(self).__name__}({', '.join(facts)})"
 
     def __len__(self) -> int:
@@ -379,7 +298,7 @@ class EpisodeView:
     @property
     def has_users(self) -> bool:
         """Whether the store names the user of every episode."""
-        return self.has_episode_values(schema.USER)
+        return self._columns.has_episode_column(schema.USER)
 
     @cached_property
     def item_states(self) -> ItemStates:
@@ -395,10 +314,6 @@ class EpisodeView:
         """S, size of a state: that of the item state, if actions are items, plus O."""
         return self.observation_size + (self.item_states.size if self.has_items else 0)
 
-    def has_episode_values(self, name: str) -> bool:
-        """Whether the store has an episode column."""
-        return self._columns.has_episode_column(name)
-
     def episode_values(self, name: str) -> Array:
         """An episode column, (E,).
 
@@ -410,7 +325,7 @@ class EpisodeView:
     @property
     def terminated(self) -> BoolArray:
         """(E,) whether each session is known to have ended with its last step."""
-        if not self.has_episode_values(schema.TERMINATED):
+        if not self._columns.has_episode_column(schema.TERMINATED):
             return np.ones(self.n_episodes, dtype=bool)
         return self.episode_values(schema.TERMINATED).astype(bool)
 
@@ -432,14 +347,14 @@ class EpisodeView:
 
     def rewards_before(self, episodes: IntArray, steps: IntArray) -> Float64Array:
         """(B,) sum of the rewards of sessions (B,) before steps (B,), in reward units."""
-        owner, earlier_steps = _list_earlier(steps)
+        owner, earlier_steps = list_earlier(steps)
         rewards = self.step_values(schema.REWARD, episodes[owner], earlier_steps)
         return np.bincount(owner, rewards, minlength=len(steps)).astype(np.float64)
 
     def items_before(self, episodes: IntArray, steps: IntArray) -> tuple[IntArray, IntArray]:
         """(rows, items), each (M,): the items that sessions (B,) showed before steps (B,); rows are
         indices into the B."""
-        owner, earlier_steps = _list_earlier(steps)
+        owner, earlier_steps = list_earlier(steps)
         return owner, self.step_values(schema.ITEM, episodes[owner], earlier_steps).astype(np.int64)
 
     def all_steps(self) -> tuple[IntArray, IntArray]:
@@ -509,10 +424,7 @@ class EpisodeView:
         Args:
             episodes: (B,) positions in the view.
             ends: (B,) last step of each window, from 0.
-            length: K, at least 1.
-
-        Returns:
-            B windows of K steps, padded on the left.
+            length: K, at least 1; shorter episodes are padded on the left.
 
         Raises:
             InputError: an episode or step does not exist, or the arguments have other shapes.
@@ -532,11 +444,7 @@ class EpisodeView:
         return Windows.of(torch.from_numpy(steps), states, actions, rewards, returns)
 
     def transitions(self, episodes: IntArray, steps: IntArray) -> Transitions:
-        """Single steps (M,) of episodes (M,), with their next states.
-
-        Raises:
-            InputError: as `windows`.
-        """
+        """Single steps (M,) of episodes (M,), with their next states; errors as of `windows`."""
         window = self.windows(episodes, steps, 1)
         last = steps == self.lengths[episodes] - 1
         next_steps = np.where(last, steps, steps + 1)
@@ -556,23 +464,22 @@ class EpisodeView:
                 f"windows of {length} steps, episodes of shape {episodes.shape} and steps of shape "
                 f"{ends.shape}: give two arrays of the same length, and at least 1 step"
             )
-        if len(episodes) == 0:
-            return
-        if not 0 <= episodes.min() <= episodes.max() < self.n_episodes:
+        if not np.all((episodes >= 0) & (episodes < self.n_episodes)):
             raise InputError(
                 f"{self} has no episodes {episodes.min()} to {episodes.max()}; give positions from "
                 f"0 to {self.n_episodes - 1}"
             )
-        outside = (ends < 0) | (ends >= self.lengths[episodes])
-        if outside.any():
-            first = int(outside.argmax())
+        lengths = self.lengths[episodes]
+        outside = np.flatnonzero((ends < 0) | (ends >= lengths))
+        if len(outside):
+            row = outside[0]
             raise InputError(
-                f"episode {episodes[first]} has {self.lengths[episodes[first]]} steps, none "
-                f"numbered {ends[first]}; steps are numbered from 0"
+                f"episode {episodes[row]} has {lengths[row]} steps, none numbered {ends[row]}; "
+                "steps are numbered from 0"
             )
 
 
-def _list_earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
+def list_earlier(steps: IntArray) -> tuple[IntArray, IntArray]:
     """Row and number of every step before the given ones (B,), row by row."""
     owner = np.repeat(np.arange(len(steps)), steps)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps)

@@ -1,10 +1,10 @@
 """What policies read: windows of a store, of running sessions and of augmented episodes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,16 @@ if TYPE_CHECKING:
 
 AUGMENTED: Final = "augmented.safetensors"
 """Name of the file of a run."""
+
+
+_Rows = TypeVar("_Rows", "Windows", "Transitions", "Sessions")
+
+
+def _each(rows: _Rows, change: Callable[[Tensor], Tensor]) -> _Rows:
+    """A copy in which every tensor is changed."""
+    values = {field.name: getattr(rows, field.name) for field in fields(rows)}
+    changed = {name: change(value) for name, value in values.items() if value is not None}
+    return replace(rows, **changed)
 
 
 @dataclass(frozen=True)
@@ -79,16 +89,15 @@ class Windows:
 
     def at(self, rows: slice | Tensor) -> "Windows":
         """The windows with the given numbers."""
-        return Windows(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return _each(self, lambda values: values[rows])
 
     def last(self, steps: int) -> "Windows":
         """The windows of this number of last steps."""
-        return Windows(**{f.name: getattr(self, f.name)[:, -steps:] for f in fields(self)})
+        return _each(self, lambda values: values[:, -steps:])
 
     def to(self, device: torch.device) -> "Windows":
         """A copy of the windows on `device`."""
-        moved = {f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)}
-        return Windows(**moved)
+        return _each(self, lambda values: values.to(device, non_blocking=True))
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,7 @@ class Transitions:
 
     def to(self, device: torch.device) -> "Transitions":
         """The steps on `device`."""
-        return Transitions(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return _each(self, lambda values: values.to(device))
 
     def __repr__(self) -> str:
         (steps, size), action = self.states.shape, self.actions.shape[1]
@@ -166,11 +175,8 @@ class Exposed:
 
     @classmethod
     def before(cls, windows: Windows, lags: int, steps: Tensor | None = None) -> "Exposed":
-        """For every step of B windows of K steps, or those in a mask (B, K), `lags` earlier steps
-        of the same window.
-
-        Row t uses the actions and rewards of steps t − 1 to t − `lags` only.
-        """
+        """For every step t of B windows of K steps, or those in a mask (B, K): steps t − 1 to
+        t − `lags` of the same window."""
         items = windows.actions.masked_fill(~windows.mask, -1)
         parts = [_earlier(items, lags, -1), _earlier(windows.rewards, lags, 0)]
         parts.append(windows.returns_to_go.flatten())
@@ -236,13 +242,8 @@ class Sessions:
         length: int,
         observations: Tensor | None = None,
     ) -> "Sessions":
-        """The sessions with N rows.
-
-        Args:
-            owner: (N,) session of each row, 0 to B − 1; sorted.
-            items, rewards: (N,) what was shown, in order.
-            length: L, items of a session that are kept.
-        """
+        """The sessions (N,) `owner`, 0 to B − 1 and sorted, of N rows with items and rewards (N,),
+        of which the latest `length` = L are kept."""
         counts = np.bincount(owner, minlength=len(users))
         # Places from the end: the latest row is the last column.
         places = np.arange(len(owner)) - np.cumsum(counts)[owner] + length
@@ -267,11 +268,9 @@ class Sessions:
     ) -> "Sessions":
         """What was known before steps (B,) of sessions (B,) of a store of items.
 
-        Args:
-            store: the logs, with the training's items. An item −1 is unknown; any known item can
-                replace it, because steps after it have weight 0 in all estimates.
-            context: K, most states that are read.
-            length: L, items that are read one by one; as many as the context has in any case.
+        The store has the training's items. An item −1 is unknown; any known item can replace it,
+        because steps after it have weight 0 in all estimates. At most `context` = K states are
+        read, and `length` = L items, or as many as the context has.
         """
         context = min(context, int(steps.max(initial=0)) + 1)
         recent = Shown.before(store, episodes, steps, max(length, context - 1))
@@ -289,8 +288,7 @@ class Sessions:
 
     def at(self, rows: slice | IntArray | Tensor) -> "Sessions":
         """The sessions with the given numbers."""
-        values = (getattr(self, part.name) for part in fields(self))
-        return Sessions(*(None if value is None else value[rows] for value in values))  # type: ignore[arg-type]
+        return _each(self, lambda values: values[rows])
 
     def begin(self, rows: IntArray) -> None:
         """Let new sessions begin at the positions `rows`, of whichever users there are."""
@@ -316,29 +314,30 @@ class Sessions:
 
     def latest_states(self, states: ItemStates, observations: Tensor) -> Tensor:
         """States (B, S) before the steps to decide, whose observations are (B, O)."""
-        recent = self.actions[:, -states.window :], self.rewards[:, -states.window :]
-        steps = self.steps.unsqueeze(1)
-        return states.build(*recent, steps, self.users, observations.unsqueeze(1))[:, 0]
+        steps, observations = self.steps.unsqueeze(1), observations.unsqueeze(1)
+        return self._build_states(states, steps, observations)[:, 0]
 
     def windows(self, states: ItemStates | None, context: int) -> Windows:
         """What policies read: windows of at most `context` = K steps that end with the step to
         decide, which has neither an action nor a reward yet, nor returns-to-go.
 
-        Args:
-            states: builds the states of items, where they are not known; L must then be at least
-                K − 1 + its window.
-            context: K; L must be at least K − 1.
+        L must be at least K − 1, and where `states` build the states of items, because they are not
+        known, K − 1 + their window.
         """
         vectors = self.actions.ndim == 3
         if not (vectors or torch.compiler.is_exporting()):
             # No policy's outputs depend on how much padding is before a session.
             context = min(context, int(self.steps.max()) + 1)
         numbers = self.steps.unsqueeze(1) + torch.arange(1 - context, 1)
-        if self.states is None:
-            assert states is not None
-            window_states = self._build_states(states, numbers.clamp(min=0))
-        else:
+        if self.states is not None:
             window_states = self.states[:, -context:]
+        else:
+            assert states is not None
+            if self.observations is None:
+                observations = self.rewards.new_zeros(self.steps.shape[0], context, 0)
+            else:
+                observations = self.observations[:, -context:]
+            window_states = self._build_states(states, numbers.clamp(min=0), observations)
         first = self.actions.shape[1] - context + 1
         return Windows.of(
             numbers,
@@ -347,15 +346,10 @@ class Sessions:
             nn.functional.pad(self.rewards[:, first:], (0, 1)),
         )
 
-    def _build_states(self, states: ItemStates, steps: Tensor) -> Tensor:
-        """States (B, K, S) of steps (B, K), the last ones."""
-        context = steps.shape[1]
-        reach = context - 1 + states.window
+    def _build_states(self, states: ItemStates, steps: Tensor, observations: Tensor) -> Tensor:
+        """States (B, K, S) of steps (B, K), the last ones, with observations (B, K, O)."""
+        reach = steps.shape[1] - 1 + states.window
         items, rewards = self.actions[:, -reach:], self.rewards[:, -reach:]
-        if self.observations is None:
-            observations = rewards.new_zeros(items.shape[0], context, 0)
-        else:
-            observations = self.observations[:, -context:]
         return states.build(items, rewards, steps, self.users, observations)
 
 
@@ -422,11 +416,8 @@ class AugmentedEpisodes:
 
     @classmethod
     def load(cls, path: Path, store: "EpisodeStore") -> "AugmentedEpisodes":
-        """Read a file that `save` wrote, of episodes of `store` or the store that it is a view of.
-
-        Raises:
-            InputError: the file is missing or damaged, or the episodes are of another store.
-        """
+        """Read a file that `save` wrote, of episodes of `store` or the store that it is a view of;
+        an InputError if it is missing, damaged or of another store."""
         tensors, _ = load_tensors(path)
         with damage_explained(path, f"train again with {store.path}, or the store it was made of"):
             episodes = cls(**{name: tensor.numpy() for name, tensor in tensors.items()})
@@ -445,12 +436,15 @@ class AugmentedEpisodes:
             raise ValueError("its action copies differ in number")
         if {self.edit_state.dtype, self.action_reward.dtype} != {np.dtype(np.float32)}:
             raise ValueError("its states or rewards are not float32")
-        _require_below(self.copy_source, store.record.n_episodes, "an episode")
-        _require_below(self.action_source, store.record.n_episodes, "an episode")
         _require_below(self.edit_copy, len(self.copy_source), "a copy")
-        lengths = store.whole.lengths
-        _require_below(self.edit_step, lengths[self.copy_source[self.edit_copy]], "a step")
-        _require_below(self.action_step, lengths[self.action_source], "a step")
+        episodes, lengths = store.record.n_episodes, store.whole.lengths
+        edited = self.copy_source[self.edit_copy]
+        for source, own, step in (
+            (self.copy_source, edited, self.edit_step),
+            (self.action_source, self.action_source, self.action_step),
+        ):
+            _require_below(source, episodes, "an episode")
+            _require_below(step, lengths[own], "a step")
         copy_changes = np.diff(self.edit_copy)
         if (copy_changes < 0).any() or (np.diff(self.edit_step)[copy_changes == 0] <= 0).any():
             raise ValueError("its edits are not in order")
@@ -483,17 +477,14 @@ class TrainingEpisodes:
         lengths[self._first_action_copy :] = augmented.action_step + 1
         counts[self._first_action_copy :] = 1
         self._ends = np.cumsum(counts)
+        self.n_steps = int(self._ends[-1])
+        """Number of steps that are drawn."""
         # The step at which an episode ends, less the number of its last drawn step.
         self._begins = self._ends - lengths
         self._stride = int(augmented.edit_step.max(initial=0)) + 1
         keys = augmented.edit_copy * self._stride + augmented.edit_step
         # A sentinel, so that every search ends inside.
         self._keys = np.append(keys, np.iinfo(np.int64).max)
-
-    @property
-    def n_steps(self) -> int:
-        """Number of steps that are drawn."""
-        return int(self._ends[-1])
 
     def draw_steps(self, generator: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """(episodes, steps), each (count,): steps drawn uniformly, with replacement."""

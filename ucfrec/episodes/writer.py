@@ -26,13 +26,6 @@ class StoreWriter:
 
     `folder` should be a scratch folder of `ucfrec.files.atomic.atomic_folder`, so that a store
     appears complete or not at all.
-
-    Example: three steps, two episodes::
-
-        writer = StoreWriter(folder)
-        writer.append({"item": items, "reward": rewards}, first=[True, False, True],
-                      episodes={"user": [7, 7, 9], "split": [0, 0, 0]})
-        writer.finish(reward="is_click", source={})
     """
 
     def __init__(self, folder: Path, shard_steps: int = 2**24, first_shard: int = 0) -> None:
@@ -44,8 +37,7 @@ class StoreWriter:
         self._offsets: list[IntArray] = []
         self._episode_values: dict[str, list[Array]] = {}
         self._split_counts = np.zeros((len(schema.SPLITS), 2), dtype=np.int64)
-        self._steps_in_shard = self._n_steps = self._n_episodes = 0
-        self._shards = first_shard
+        self._steps_in_shard, self._shards = 0, first_shard
 
     def append(
         self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
@@ -70,47 +62,43 @@ class StoreWriter:
         require_finite(steps[schema.REWARD])
         if len(first) == 0:
             return
-        if self._n_steps == 0 and not first[0]:
+        if not (self._split_counts.any() or first[0]):
             raise ValueError("the first step of a store must begin an episode")
-        starts, begin, end = np.flatnonzero(first), 0, 0
+        starts, begin = np.flatnonzero(first), 0
         while begin < len(first):
             full = begin + self._shard_steps - self._steps_in_shard
             later = starts[np.searchsorted(starts, full) :]
             end = int(later[0]) if len(later) else len(first)
-            rows = slice(begin, end)
-            self._append(
-                {name: values[rows] for name, values in steps.items()},
-                first[rows],
-                {name: values[rows] for name, values in episodes.items()},
-            )
+            self._append(steps, first, episodes, slice(begin, end))
             if len(later):
                 self._close_shard()
             begin = end
 
     def _append(
-        self, steps: Mapping[str, Array], first: BoolArray, episodes: Mapping[str, Array]
+        self,
+        steps: Mapping[str, Array],
+        first: BoolArray,
+        episodes: Mapping[str, Array],
+        rows: slice,
     ) -> None:
-        starts = np.flatnonzero(first)
+        starts = np.flatnonzero(first[rows])
         for name, values in steps.items():
-            column = np.ascontiguousarray(values, dtype=schema.STEP_DTYPES[name])
+            column = np.ascontiguousarray(values[rows], dtype=schema.STEP_DTYPES[name])
             self._shapes.setdefault(name, list(column.shape[1:]))
             if name not in self._files:
-                self._files[name] = _NpyFile(self._shard / f"{name}.npy", column)
+                self._files[name] = _NpyFile(self._shard / f"{name}.npy")
             self._files[name].append(column)
             self._hash(name, column)
         for name, values in episodes.items():
-            column = np.asarray(values)[starts].astype(schema.EPISODE_DTYPES[name])
+            column = np.asarray(values)[rows][starts].astype(schema.EPISODE_DTYPES[name])
             self._episode_values.setdefault(name, []).append(column)
             self._hash(name, column)
-        self._hash("first", first.view(np.uint8))
+        self._hash("first", first[rows].view(np.uint8))
         self._offsets.append(starts + self._steps_in_shard)
-        split = np.asarray(episodes[schema.SPLIT])
-        bins = len(schema.SPLITS)
-        self._split_counts[:, 0] += np.bincount(split[starts], minlength=bins)
-        self._split_counts[:, 1] += np.bincount(split, minlength=bins)
-        self._steps_in_shard += len(first)
-        self._n_steps += len(first)
-        self._n_episodes += len(starts)
+        split = np.asarray(episodes[schema.SPLIT])[rows]
+        for each, counted in enumerate((split[starts], split)):
+            self._split_counts[:, each] += np.bincount(counted, minlength=len(schema.SPLITS))
+        self._steps_in_shard += len(split)
 
     @property
     def _shard(self) -> Path:
@@ -129,12 +117,10 @@ class StoreWriter:
         for name, values in self._episode_values.items():
             np.save(self._shard / f"{name}.npy", np.concatenate(values))
         rewards = np.load(self._shard / f"{schema.REWARD}.npy", mmap_mode="r")
-        returns: _NpyFile | None = None
+        returns = _NpyFile(self._shard / f"{schema.RETURN_TO_GO}.npy")
         for part in returns_in_parts(rewards, offsets, _PART_STEPS):
-            returns = returns or _NpyFile(self._shard / f"{schema.RETURN_TO_GO}.npy", part)
             returns.append(part)
-        if returns is not None:
-            returns.close()
+        returns.close()
         self._files, self._offsets, self._episode_values = {}, [], {}
         self._shards += 1
         self._steps_in_shard = 0
@@ -145,15 +131,15 @@ class StoreWriter:
         """Close the last shard and write `meta.json`, with the checksums of the files so far.
 
         Args:
-            reward: the expression that computed the rewards, for the record.
-            source: what the store was made from and which rows were dropped, for the record.
-            ids: original identifiers (of items, of users) in the order in which the columns number
-                them, by name; they enter the fingerprint.
+            reward, source: the expression of the rewards, and what the store was made from.
+            ids: original identifiers (of items, of users) by name, in the order in which columns
+                number them; they enter the fingerprint.
 
         Raises:
             InputError: no step was appended.
         """
-        if self._n_steps == 0:
+        n_episodes, n_steps = self._split_counts.sum(0).tolist()
+        if not n_steps:
             raise InputError(
                 "no episode is left to store: every row was dropped or none was read; check the "
                 "input and the filters"
@@ -165,15 +151,17 @@ class StoreWriter:
         record = StoreRecord(
             files={},
             version=schema.STORE_VERSION,
-            n_steps=self._n_steps,
-            n_episodes=self._n_episodes,
+            n_steps=n_steps,
+            n_episodes=n_episodes,
             n_shards=self._shards,
             columns=self._shapes,
             fingerprint=hashlib.sha256(digests.encode()).hexdigest(),
             reward=reward,
             splits={
-                name: {"episodes": int(episodes), "steps": int(steps)}
-                for name, (episodes, steps) in zip(schema.SPLITS, self._split_counts, strict=True)
+                name: {"episodes": episodes, "steps": steps}
+                for name, (episodes, steps) in zip(
+                    schema.SPLITS, self._split_counts.tolist(), strict=True
+                )
             },
             source=Source.model_validate(dict(source)),
         )
@@ -215,17 +203,14 @@ def reward_bit(
 
 
 def write_observations(
-    store: "EpisodeStore",
-    out: Path,
-    observations: Float32Array,
-    source: Mapping[str, Any],
+    store: "EpisodeStore", out: Path, observations: Float32Array, source: Mapping[str, Any]
 ) -> "EpisodeStore":
     """Write a copy of `store` with other observations, atomically.
 
     Args:
         store: a whole store in a folder, not a view of some episodes.
         observations: (n_steps, O) in the order of `all_steps`.
-        source: added to `source` in `meta.json`, the record of what the store was made from.
+        source: added to the record of what the store was made from.
 
     Raises:
         InputError: `out` exists already.
@@ -254,15 +239,11 @@ def read_observations(store: "EpisodeStore") -> Float32Array:
     """The observations (n_steps, O) in the order of `all_steps`; O is 0 if none were logged."""
     if not store.observation_size:
         return np.zeros((store.n_steps, 0), dtype=np.float32)
-    return np.asarray(store.step_values(schema.OBSERVATION, *store.all_steps()))
+    return np.asarray(store.column(schema.OBSERVATION))
 
 
 def require_steps(path: Path | str, lengths: Array) -> IntArray:
-    """The numbers of steps (E,) of episodes as an array.
-
-    Raises:
-        InputError: an episode has no steps.
-    """
+    """The numbers of steps (E,) of episodes as an array; an InputError if one has none."""
     lengths = np.asarray(lengths)
     if np.any(lengths < 1):
         raise InputError(f"{path}: an episode without steps cannot be stored; leave it out")
@@ -270,11 +251,8 @@ def require_steps(path: Path | str, lengths: Array) -> IntArray:
 
 
 def require_finite(rewards: Array) -> None:
-    """Check that rewards (N,) are finite, because one that is not would spoil a shard's returns.
-
-    Raises:
-        InputError: some rewards are NaN or infinite, or so large that training would overflow.
-    """
+    """Raise an InputError for rewards (N,) that are NaN, infinite, or so large that training would
+    overflow: one of them would spoil a shard's returns."""
     with np.errstate(over="ignore"):
         stored = np.asarray(rewards, dtype=schema.STEP_DTYPES[schema.REWARD])
     not_finite = int(np.count_nonzero(~np.isfinite(stored)))
@@ -294,12 +272,17 @@ def require_finite(rewards: Array) -> None:
 class _NpyFile:
     """A .npy file of growing length; numpy pads the header so that it can be rewritten in place."""
 
-    def __init__(self, path: Path, template: Array) -> None:
-        """Open `path` for rows of the dtype and shape of the rows of `template`."""
+    def __init__(self, path: Path) -> None:
         self._file: IO[bytes] = path.open("wb")
-        self._dtype, self._shape = template.dtype, template.shape[1:]
         self._rows = 0
-        self._write_header()
+
+    def append(self, rows: Array) -> None:
+        """Append rows, one or more, of the same dtype and shape as all before."""
+        if not self._rows:
+            self._dtype, self._shape = rows.dtype, rows.shape[1:]
+            self._write_header()
+        self._file.write(rows.tobytes())
+        self._rows += len(rows)
 
     def _write_header(self) -> None:
         header = {
@@ -310,10 +293,7 @@ class _NpyFile:
         self._file.seek(0)
         np.lib.format.write_array_header_1_0(self._file, header)
 
-    def append(self, rows: Array) -> None:
-        self._file.write(rows.tobytes())
-        self._rows += len(rows)
-
     def close(self) -> None:
+        """Write the number of rows."""
         self._write_header()
         self._file.close()

@@ -41,7 +41,6 @@ from ucfrec.policies.baselines import (
     LikedOf,
     RecentClicksPolicy,
     RecentRatePolicy,
-    count_decayed,
     shrink_rates,
 )
 from ucfrec.provenance import config_hash, provenance
@@ -163,7 +162,7 @@ def recent_rankers(
     rankers: list[Ranker] = []
     for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
         hours = kind.best_half_life(first, validation, liked_of)
-        scores = kind.scores_of(count_decayed(train, hours, liked_of))
+        scores = kind.scores_of(TrainingCounts.of(train, liked_of, hours))
         rankers.append(same_for_all(f"recent {name}", scores.double()))
     return rankers
 

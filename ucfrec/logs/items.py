@@ -92,7 +92,7 @@ def write_item_states(folder: Path, scratch: Path, encoded: EncodedFeatures, siz
         user_vectors = _reduce(encoded.users, trained_rows, USER_SIZE)
         spread = user_vectors[trained_rows].std(axis=0)
         user_vectors /= np.where(spread > 0, spread, 1)
-    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, low, high, encoded.tags)
+    write_item_table(folder / ITEM_STATES, embeddings, user_vectors, encoded.tags, low, high)
 
 
 class Exposure:
@@ -334,9 +334,9 @@ def write_grown_states(
         folder / ITEM_STATES,
         vectors.astype(np.float32),
         features.astype(np.float32),
+        _number_tags(old.tags.numpy(), encoded.tags, len(vectors)),
         old.reward_low,
         old.reward_high,
-        _number_tags(old.tags.numpy(), encoded.tags, len(vectors)),
     )
 
 

@@ -1,4 +1,4 @@
-"""Base of all sequence policies: configuration, normalisation, action loss."""
+"""Base of all sequence policies: configuration, normalisation, action loss, state values."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -10,17 +10,25 @@ import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional as F
 
+from ucfrec.episodes.exposure import ExposureTerm, Likeness
 from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Exposed, Windows
 from ucfrec.errors import InputError
-from ucfrec.policies.heads import Head, ItemHead, ValueHead, advantage_weights, head_from
+from ucfrec.fitting.distributed import joint_moments
+from ucfrec.policies.heads import Head, ItemHead, VectorHead
 from ucfrec.settings import Dropout, Width, require, settings_table
 
 _CLIP = 10.0
 """Standardised states beyond this many standard deviations are clipped."""
-
+_KNOTS = 6
+"""Returns-to-go at which an exposure term has weights of its own."""
+BEST: float = 0.99
+"""τ of the expectile that stands for the best return within the logs (Reinformer)."""
+_ADVANTAGES = (-5.0, 3.0)
+"""Range of the standardised advantage in the exponent of a weight."""
 
 Context = Annotated[int, Field(ge=1, le=4096)]
 Layers = Annotated[int, Field(ge=1, le=128)]
@@ -92,6 +100,8 @@ class SequencePolicy(nn.Module, ABC):
     """Whether the default of `augment.copies` is above 0 for this policy."""
     chosen: ClassVar[tuple[str, ...]] = ()
     """Buffers that `make_solver` chooses on held-out episodes; a refit keeps them."""
+    items_only: ClassVar[str] = ""
+    """Name of a policy that recommends items and refuses vectors; empty for others."""
     presets: ClassVar[Mapping[str, Any]] = {}
     """Defaults of this policy for settings outside the table `policy`, by `table.field`."""
 
@@ -109,14 +119,17 @@ class SequencePolicy(nn.Module, ABC):
             item, 0 if that is omitted.
         """
         super().__init__()
+        if self.items_only and not sizes["items"]:
+            raise InputError(
+                f"{self.items_only} recommends items; this store's actions are vectors; use "
+                "another policy"
+            )
         self.config = config
         self.register_buffer("state_mean", torch.zeros(sizes["state"]))
         self.register_buffer("state_std", torch.ones(sizes["state"]))
         self.register_buffer("return_scale", torch.ones(()))
         self.register_buffer("lowest_return_to_go", torch.tensor(-torch.inf))
-        lags = min(config.exposure_window, config.context - 1) if config.exposure else 0
-        samples = config.sampled_items if sizes["items"] > config.sampled_above else 0
-        self.head = head_from(sizes, config.dim, lags, samples)
+        self.head = _new_head(config, sizes)
         learns_values = config.advantage_weights or config.max_return
         self.values = ValueHead(sizes["state"], config.dim) if learns_values else None
 
@@ -185,13 +198,13 @@ class SequencePolicy(nn.Module, ABC):
         def steps(values: Tensor) -> Tensor:  # (B, K, …) -> (M, …)
             return values.flatten(0, 1) if padded is None else values[padded]
 
-        inputs = (steps(features), steps(windows.actions), exposed)
+        features, actions = steps(features), steps(windows.actions)
         if self.values is None:
-            value = self.head.loss(*inputs)  # type: ignore[arg-type]
+            value = self.head.loss(features, actions, exposed)
             return value, {"action_loss": value.detach()}
         values = steps(self.values(windows, self.head.embed(windows.actions)))
         returns = steps(windows.returns_to_go)
-        losses = self.head.losses(*inputs)  # type: ignore[arg-type]
+        losses = self.head.losses(features, actions, exposed)
         if self.config.advantage_weights:
             losses = losses * advantage_weights(values, returns)
         action_loss, value_loss = losses.mean(), self.values.loss(values, returns)
@@ -201,8 +214,8 @@ class SequencePolicy(nn.Module, ABC):
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean action loss over the windows' last steps, the validation loss."""
         normalized = self.normalize(windows)
-        features, exposed = self.features(normalized)[:, -1], self._exposed_last(normalized)
-        return self.head.loss(features, windows.actions[:, -1], exposed)  # type: ignore[arg-type]
+        features, exposed = self.features(normalized)[:, -1], self.exposed(normalized, last=True)
+        return self.head.loss(features, windows.actions[:, -1], exposed)
 
     def act(self, windows: Windows) -> Tensor:
         """Predictions at the last step: actions (B, A), or logits over items (B, n_items)."""
@@ -211,8 +224,8 @@ class SequencePolicy(nn.Module, ABC):
     def act_and_features(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Predictions at the last step, and the features (B, d) that they are made from."""
         normalized = self.normalize(windows)
-        features, exposed = self.last_features(normalized), self._exposed_last(normalized)
-        return self.head.predict(features, exposed), features  # type: ignore[arg-type]
+        features, exposed = self.last_features(normalized), self.exposed(normalized, last=True)
+        return self.head.predict(features, exposed), features
 
     def max_return(self, windows: Windows) -> Tensor:
         """The largest return-to-go to expect at the last step, (B,) in reward units; an InputError
@@ -226,30 +239,35 @@ class SequencePolicy(nn.Module, ABC):
         best: Tensor = self.values(normalized, self.head.embed(normalized.actions))[:, -1, 1]
         return best * self.return_scale
 
-    def exposed(self, windows: Windows, steps: Tensor | None = None) -> Exposed | None:
-        """What was shown before each of the (B·K) steps, or of the `steps` of a mask (B, K); None
-        without `policy.exposure`."""
-        if not isinstance(self.head, ItemHead) or self.head.exposure is None:
+    def exposed(
+        self, windows: Windows, steps: Tensor | None = None, last: bool = False
+    ) -> Exposed | None:
+        """What was shown before each of the (B·K) steps, before the `steps` of a mask (B, K), or
+        before the `last` steps (B,) alone; None without `policy.exposure`."""
+        if self.head.exposure is None:
             return None
-        return Exposed.before(windows, self.head.exposure.lags, steps)
+        lags = self.head.exposure.lags
+        if last:
+            return Exposed.before_last(windows, lags)
+        return Exposed.before(windows, lags, steps)
 
-    def _exposed_last(self, windows: Windows) -> Exposed | None:
-        if not isinstance(self.head, ItemHead) or self.head.exposure is None:
-            return None
-        return Exposed.before_last(windows, self.head.exposure.lags)
+
+def _new_head(config: PolicyConfig, sizes: Mapping[str, int]) -> Head:
+    items, size = sizes["items"], sizes["action"]
+    if not items:
+        return VectorHead(config.dim, size)
+    exposure = None
+    lags = min(config.exposure_window, config.context - 1)
+    if config.exposure and lags:
+        likeness = Likeness(items, size, sizes.get("tags", 0))
+        exposure = ExposureTerm(lags, _KNOTS, likeness)
+    samples = config.sampled_items if items > config.sampled_above else 0
+    return ItemHead(config.dim, items, size, exposure, samples)
 
 
 def standardise(states: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """States (..., S) in standard deviations from their mean, clipped."""
     return ((states - mean) / std).clamp(-_CLIP, _CLIP)
-
-
-def require_items(name: str, sizes: Mapping[str, int]) -> None:
-    """Refuse a store whose actions are vectors."""
-    if not sizes["items"]:
-        raise InputError(
-            f"{name} recommends items; this store's actions are vectors; use another policy"
-        )
 
 
 def require_heads(config: PolicyConfig, heads: int) -> None:
@@ -281,6 +299,11 @@ def embedding(rows: int, size: int) -> nn.Embedding:
     return nn.Embedding(rows, size, _weight=draw_normal(torch.empty(rows, size)))
 
 
+def embed_time(table: nn.Embedding, windows: Windows) -> Tensor:
+    """Rows (B, K, d) of the steps' numbers in the table, the last for later ones."""
+    return table(windows.timesteps.clamp(max=table.num_embeddings - 1))  # type: ignore[no-any-return]
+
+
 def init_linear(module: nn.Module) -> None:
     """Initialise all linear layers as GPT-2 does: weights from N(0, 0.02²), biases 0."""
     for layer in module.modules():
@@ -300,3 +323,44 @@ def recurrent(network: nn.GRU, inputs: Tensor, mask: Tensor) -> Tensor:
         return x.gather(1, ((places + by) % length).unsqueeze(-1).expand_as(x))
 
     return roll(network(roll(inputs, padding))[0], -padding)
+
+
+class ValueHead(nn.Module):
+    """V(h_t), the mean of the return-to-go Ĝ_t, and V_τ(h_t), its expectile at τ = `BEST`.
+
+    The history h_t is what the policy sees but the returns-to-go: states and step numbers up to t
+    and actions before t, within the context. The expectile minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²]
+    (Zhuang et al., ICML 2024). Values are in units of the policy's return scale.
+    """
+
+    def __init__(self, state_size: int, dim: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(state_size + 1 + dim, dim)
+        self.history = nn.GRU(dim, dim, batch_first=True)
+        self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
+
+    def forward(self, windows: Windows, actions: Tensor) -> Tensor:
+        """Mean and expectile (B, K, 2), of normalised windows and their embedded actions (B, K, d),
+        into which no gradient goes."""
+        mask = windows.mask
+        time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
+        actions = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
+        earlier = F.pad(actions, (0, 0, 1, 0))[:, :-1]
+        tokens = F.relu(self.embed(torch.cat([windows.states, time, earlier], dim=-1)))
+        return self.out(recurrent(self.history, tokens, mask))  # type: ignore[no-any-return]
+
+    @staticmethod
+    def loss(values: Tensor, returns: Tensor) -> Tensor:
+        """Squared error of the mean plus the expectile's, values (M, 2), to returns-to-go (M,)."""
+        error = returns - values[:, 1]
+        slope = torch.where(error < 0, 1 - BEST, BEST)
+        return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
+
+
+def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
+    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation, from
+    values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over all processes."""
+    advantage = (returns - values[:, 0]).detach()
+    deviation = joint_moments(advantage)[1]
+    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_ADVANTAGES).exp()
+    return weights / joint_moments(weights)[0]

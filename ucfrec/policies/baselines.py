@@ -16,15 +16,7 @@ from ucfrec.arrays import Array, BoolArray, IntArray
 from ucfrec.episodes.states import TrainingCounts, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Windows
-from ucfrec.errors import InputError
-from ucfrec.policies.base import (
-    Context,
-    PolicyConfig,
-    SequencePolicy,
-    draw_normal,
-    embedding,
-    require_items,
-)
+from ucfrec.policies.base import Context, PolicyConfig, SequencePolicy, draw_normal, embedding
 from ucfrec.policies.heads import ItemHead, VectorHead
 from ucfrec.policies.ucf import Dropout
 from ucfrec.settings import settings_table
@@ -34,7 +26,6 @@ PRIOR: Final = 10.0
 """Steps at the mean rate that are added to every item's own."""
 HALF_LIVES: Final = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, math.inf)
 """Hours after which a row counts half; those that are tried."""
-_HOUR_MS: Final = 3_600_000
 _SMOOTHING: Final = 1.0
 """Likes that are added to all items together."""
 _WITHIN = 0.999
@@ -107,11 +98,9 @@ class PopularPolicy(SequencePolicy):
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
     ) -> Callable[[], None] | None:
         """Sets the biases, unless settings add something to learn; likes are of items only."""
-        config, head = self.config, self.head
+        config = self.config
         if self.scored_by != "steps":
-            if isinstance(head, ItemHead):
-                return lambda: self._set_scores(head, train, validation)
-            raise InputError("item rates need a store of items; this store has vector actions")
+            return lambda: self._set_scores(train, validation)
         if config.exposure or config.advantage_weights or config.max_return:
             return None
         return lambda: self._set_mean(train)
@@ -124,19 +113,18 @@ class PopularPolicy(SequencePolicy):
             self.head.out.bias.copy_(torch.atanh(mean.clamp(-_WITHIN, _WITHIN)))
 
     @torch.no_grad()
-    def _set_scores(
-        self, head: ItemHead, train: EpisodeStore, validation: EpisodeStore | None
-    ) -> None:
-        if not isinstance(self.config, RecentConfig):
-            head.bias.copy_(self.scores_of(TrainingCounts.of(train)))
-            return
-        if validation is not None and not self.config.half_life:
-            self.half_life.fill_(self.best_half_life(train, validation))
-        head.bias.copy_(self.scores_of(count_decayed(train, float(self.half_life))))
+    def _set_scores(self, train: EpisodeStore, validation: EpisodeStore | None) -> None:
+        half_life = math.inf
+        if isinstance(self.config, RecentConfig):
+            if validation is not None and not self.config.half_life:
+                self.half_life.fill_(self.best_half_life(train, validation))
+            half_life = float(self.half_life)
+        counts = TrainingCounts.of(train, half_life=half_life)
+        self.head.get_parameter("bias").copy_(self.scores_of(counts))
 
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) of zeros."""
-        return windows.states.new_zeros(*windows.mask.shape, self.config.dim)
+        return windows.states.new_zeros((*windows.mask.shape, self.config.dim))
 
     @classmethod
     def scores_of(cls, counts: TrainingCounts) -> Tensor:
@@ -155,7 +143,7 @@ class PopularPolicy(SequencePolicy):
         held_out, losses = TrainingCounts.of(validation, liked_of), list[float]()
         likes = held_out.liked.double()
         for hours in HALF_LIVES:
-            scores = cls.scores_of(count_decayed(train, hours, liked_of))
+            scores = cls.scores_of(TrainingCounts.of(train, liked_of, hours))
             if cls.scored_by == "rate":
                 rates = torch.sigmoid(scores.double())
                 nats = likes * rates.log() + (held_out.shown - likes) * torch.log1p(-rates)
@@ -169,6 +157,7 @@ class PopularPolicy(SequencePolicy):
 class ItemRatePolicy(PopularPolicy):
     """`PopularPolicy` by the rate of likes; with a tag window, a usual baseline."""
 
+    items_only = "item-rate"
     scored_by = "rate"
 
 
@@ -184,6 +173,7 @@ class RecentRatePolicy(PopularPolicy):
     """`PopularPolicy` by the rate of likes, with the half-life that fits validation rows best."""
 
     Config = RecentConfig
+    items_only = "recent-rate"
     chosen = ("half_life",)
     scored_by: ClassVar[_Scored] = "rate"
 
@@ -191,6 +181,7 @@ class RecentRatePolicy(PopularPolicy):
 class RecentClicksPolicy(RecentRatePolicy):
     """`PopularPolicy` by shares of likes, with the half-life that fits validation rows best."""
 
+    items_only = "recent-clicks"
     scored_by = "likes"
 
 
@@ -201,25 +192,6 @@ def shrink_rates(counts: TrainingCounts) -> Tensor:
     mean = (liked.sum() + 0.5) / (impressions.sum() + 1)
     rates: Tensor = (liked + PRIOR * mean) / (impressions + PRIOR)
     return rates.float()
-
-
-def count_decayed(
-    train: EpisodeStore, half_life: float, liked_of: LikedOf = liked_rewards
-) -> TrainingCounts:
-    """Counts of shown and liked steps, float64, that halve with every half-life (hours) of their
-    age; if it is infinite, or the store has no times, all steps count alike."""
-    n_items = len(train.item_states.embeddings)
-    impressions, liked = np.zeros(n_items), np.zeros(n_items)
-    timed = schema.TIMESTAMP in train.record.columns and math.isfinite(half_life)
-    last = int(train.column(schema.TIMESTAMP).max()) if timed else 0
-    names = (schema.ITEM, schema.REWARD, *([schema.TIMESTAMP] if timed else []))
-    for items, rewards, *times in train.column_batches(*names):
-        weights = np.ones(len(items))
-        if timed:
-            weights = np.exp2(-(last - times[0].astype(np.int64)) / (half_life * _HOUR_MS))
-        impressions += np.bincount(items, weights, n_items)
-        liked += np.bincount(items, weights * liked_of(train, rewards), n_items)
-    return TrainingCounts(torch.from_numpy(impressions), torch.from_numpy(liked), train.n_episodes)
 
 
 @settings_table("policy")
@@ -239,6 +211,7 @@ class ItemKNNPolicy(SequencePolicy):
     """
 
     Config = ItemKNNConfig
+    items_only = "item-knn"
     chosen = ("temperature",)
     config: ItemKNNConfig
     neighbors: Tensor
@@ -247,7 +220,6 @@ class ItemKNNPolicy(SequencePolicy):
     temperature: Tensor
 
     def __init__(self, config: ItemKNNConfig, sizes: Mapping[str, int]) -> None:
-        require_items("item-knn", sizes)
         super().__init__(config, sizes)
         shape = (sizes["items"], min(config.neighbors, sizes["items"]))
         self.register_buffer("neighbors", torch.zeros(shape, dtype=torch.int64))
@@ -300,7 +272,7 @@ class ItemKNNPolicy(SequencePolicy):
         """Cosines to the earlier items, summed by rewards, (B, K, n_items), of raw windows."""
         weights = (windows.rewards - self.reward_low) * windows.mask
         weighted = self.cosines[windows.actions] * weights.unsqueeze(-1)  # (B, K, neighbours)
-        scores = weighted.new_zeros(*windows.mask.shape, len(self.cosines))
+        scores = weighted.new_zeros((*windows.mask.shape, len(self.cosines)))
         scores.scatter_add_(-1, self.neighbors[windows.actions], weighted)
         # Row t sums earlier steps only. Subtracting step t from its sum would round.
         return F.pad(scores.cumsum(1)[:, :-1], (0, 0, 1, 0))
@@ -313,22 +285,36 @@ class ItemKNNPolicy(SequencePolicy):
         scores = weighted.new_zeros(len(items), len(self.cosines))
         return scores.scatter_add_(1, self.neighbors[items].flatten(1), weighted)
 
-    def _logits(self, windows: Windows) -> Tensor:
-        assert isinstance(self.head, ItemHead)
-        return self.temperature * self.features(windows) + self.head.bias
-
-    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean negative log-likelihood (nats) of the logged items, and scalars to log."""
-        value = F.cross_entropy(self._logits(windows)[windows.mask], windows.actions[windows.mask])
-        return value, {"action_loss": value.detach()}
-
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean negative log-likelihood (nats) over the windows' last steps."""
         return F.cross_entropy(self.act(windows), windows.actions[:, -1])
 
     def act(self, windows: Windows) -> Tensor:
         """Logits over items at the last step, (B, n_items)."""
-        return self._logits(windows)[:, -1]
+        return self.temperature * self.features(windows)[:, -1] + self.head.get_parameter("bias")
+
+
+class LikedPolicy(SequencePolicy):
+    """Learns from which items were liked: from rewards of at least `least_liked`."""
+
+    reward_low: Tensor
+    reward_high: Tensor
+
+    def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
+        super().__init__(config, sizes)
+        for name in ("reward_low", "reward_high"):
+            self.register_buffer(name, torch.zeros(()))
+
+    def start_from(self, train: EpisodeStore) -> None:
+        """Set the range of the rewards, by which a step counts as liked."""
+        rewards = train.column(schema.REWARD)
+        self.reward_low.fill_(float(rewards.min()))
+        self.reward_high.fill_(float(rewards.max()))
+
+    def find_liked(self, windows: Windows) -> Tensor:
+        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
+        least = least_liked(self.reward_low, self.reward_high)
+        return ((windows.rewards >= least) & windows.mask).float()
 
 
 @settings_table("policy")
@@ -336,7 +322,7 @@ class BPRConfig(PolicyConfig):
     """Settings of BPR; `dim` is the number of factors, `context` − 1 the items that make a user."""
 
 
-class BPRPolicy(SequencePolicy):
+class BPRPolicy(LikedPolicy):
     """Scores items by the product of their factors with the user's, plus a bias per item.
 
     A user's factors are the mean of factors of the items that the session liked before, as in FISM
@@ -347,40 +333,25 @@ class BPRPolicy(SequencePolicy):
 
     Config = BPRConfig
     config: BPRConfig
-    reward_low: Tensor
-    reward_high: Tensor
+    items_only = "bpr"
 
     def __init__(self, config: BPRConfig, sizes: Mapping[str, int]) -> None:
-        require_items("bpr", sizes)
         super().__init__(config, sizes)
         self.of_history = embedding(sizes["items"], config.dim)
         draw_normal(self.of_history.weight, std=0.1)
-        for name in ("reward_low", "reward_high"):
-            self.register_buffer(name, torch.zeros(()))
-
-    def start_from(self, train: EpisodeStore) -> None:
-        """Set the range of the rewards, by which a step counts as liked."""
-        rewards = train.column(schema.REWARD)
-        self.reward_low.fill_(float(rewards.min()))
-        self.reward_high.fill_(float(rewards.max()))
 
     def features(self, windows: Windows) -> Tensor:
         """Factors (B, K, d) of the user before each step."""
-        liked = self._find_liked(windows).unsqueeze(-1)
+        liked = self.find_liked(windows).unsqueeze(-1)
         sums = (self.of_history(windows.actions) * liked).cumsum(1)
         means = sums / liked.cumsum(1).clamp(min=1)
         return F.pad(means[:, :-1], (0, 0, 1, 0))  # row t is of the steps before t
-
-    def _find_liked(self, windows: Windows) -> Tensor:
-        """(B, K) 1 at liked steps, as of `ucfrec.episodes.states`, otherwise 0."""
-        least = least_liked(self.reward_low, self.reward_high)
-        return ((windows.rewards >= least) & windows.mask).float()
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean loss over the liked steps of the windows, and scalars to log."""
         head = self.head
         assert isinstance(head, ItemHead)
-        normalized, liked = self.normalize(windows), self._find_liked(windows) > 0
+        normalized, liked = self.normalize(windows), self.find_liked(windows) > 0
         features, items = self.features(normalized)[liked], windows.actions[liked]
         exposed = self.exposed(normalized, liked)
         negative = torch.randint(len(head.bias), items.shape, device=items.device)
@@ -390,7 +361,7 @@ class BPRPolicy(SequencePolicy):
 
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean loss over the liked last steps and all items, the validation loss."""
-        liked = self._find_liked(windows)[:, -1] > 0
+        liked = self.find_liked(windows)[:, -1] > 0
         if not bool(liked.any()):
             return windows.rewards.new_zeros(())
         scores, items = self.act(windows)[liked], windows.actions[liked, -1:]
@@ -405,32 +376,28 @@ class BoostedConfig(PolicyConfig):
     """Items that the trees score, those with the highest rates; others have the item's rate."""
 
 
-class BoostedPolicy(SequencePolicy):
+class BoostedPolicy(LikedPolicy):
     """Scores items by the log-odds of a like, predicted by gradient-boosted trees.
 
-    The trees (scikit-learn's histogram boosting) see the item's rate of likes and its count in the
-    training rows, the session's rate, its length and whether its last item was liked, the likeness
-    of the item to those that were liked, to all and to the last one, and the rate of likes among
-    the session's items with the same first tag. In training, an item's rate is that of other folds
-    of the episodes, because its own row would tell the trees what they predict. States and returns
-    are not used.
+    The trees (scikit-learn's histogram boosting) see the columns of `_inputs`: rates, counts, and
+    the likeness of the item to the session's. In training, an item's rate is that of other folds of
+    the episodes, because its own row would tell the trees what they predict. States and returns are
+    not used.
     """
 
     Config = BoostedConfig
     config: BoostedConfig
+    items_only = "boosted"
     impressions: Tensor
     liked: Tensor
     directions: Tensor
     tag: Tensor
-    reward_low: Tensor
-    reward_high: Tensor
     split_inputs: Tensor
     split_thresholds: Tensor
     leaves: Tensor
     base: Tensor
 
     def __init__(self, config: BoostedConfig, sizes: Mapping[str, int]) -> None:
-        require_items("boosted", sizes)
         super().__init__(config, sizes)
         n_items, splits = sizes["items"], (_SPLITS, TREES)
         for name, value in (
@@ -438,8 +405,6 @@ class BoostedPolicy(SequencePolicy):
             ("liked", torch.zeros(n_items)),
             ("directions", torch.zeros(n_items, sizes["action"])),
             ("tag", torch.arange(n_items)),
-            ("reward_low", torch.zeros(())),
-            ("reward_high", torch.zeros(())),
             ("split_inputs", torch.zeros(splits, dtype=torch.int64)),
             ("split_thresholds", torch.zeros(splits)),
             ("leaves", torch.zeros(TREES, 2**_SPLITS)),
@@ -449,15 +414,13 @@ class BoostedPolicy(SequencePolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Set counts, directions and first tags of the items, and the range of the rewards."""
+        super().start_from(train)
         counts, states = TrainingCounts.of(train), train.item_states
         self.impressions.copy_(counts.shown)
         self.liked.copy_(counts.liked)
         self.directions.copy_(F.normalize(states.embeddings, dim=1))
         if states.tags.shape[1]:
             self.tag.copy_(states.tags[:, 0])
-        rewards = train.column(schema.REWARD)
-        self.reward_low.fill_(float(rewards.min()))
-        self.reward_high.fill_(float(rewards.max()))
 
     def make_solver(
         self, train: EpisodeStore, validation: EpisodeStore | None, folder: Path, seed: int
@@ -510,8 +473,7 @@ class BoostedPolicy(SequencePolicy):
         action and reward are not read; counts (2, B, C) of shown and liked ones, or None for all
         rows."""
         valid = windows.mask[:, :-1].float()  # (B, N)
-        earlier, rewards = windows.actions[:, :-1], windows.rewards[:, :-1]
-        liked = valid * (rewards >= least_liked(self.reward_low, self.reward_high))
+        earlier, liked = windows.actions[:, :-1], self.find_liked(windows)[:, :-1]
         if counts is None:
             counts = torch.stack([self.impressions[items], self.liked[items]])
         shown_of, liked_of = counts
@@ -554,7 +516,7 @@ class BoostedPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """(B, K, d) of zeros; the policy scores items in a way of its own."""
-        return windows.states.new_zeros(*windows.mask.shape, self.config.dim)
+        return windows.states.new_zeros((*windows.mask.shape, self.config.dim))
 
     @torch.no_grad()
     def act(self, windows: Windows) -> Tensor:
@@ -566,17 +528,10 @@ class BoostedPolicy(SequencePolicy):
         added = (boosted - rates[best]).mean(1, keepdim=True)
         return (rates + added).index_copy(1, best, boosted)
 
-    def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
-        """See `action_loss`."""
-        value = self.action_loss(windows)
-        return value, {"like_loss": value.detach()}
-
     def action_loss(self, windows: Windows) -> Tensor:
         """Mean log loss (nats) of likes at the windows' last steps."""
-        least = least_liked(self.reward_low, self.reward_high)
-        liked = (windows.rewards[:, -1] >= least).float()
         scores = self._score(windows, windows.actions[:, -1:])[:, 0]
-        return F.binary_cross_entropy_with_logits(scores, liked)
+        return F.binary_cross_entropy_with_logits(scores, self.find_liked(windows)[:, -1])
 
 
 def _round(values: Tensor) -> Tensor:

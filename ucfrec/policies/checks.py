@@ -18,7 +18,7 @@ from ucfrec.processes import random_state_kept
 
 RESERVED: Final = frozenset(
     {"state_mean", "state_std", "return_scale", "lowest_return_to_go", "values", "head"}
-    | {"normalize", "imitation", "act_and_features", "max_return", "exposed", "_exposed_last"}
+    | {"normalize", "imitation", "act_and_features", "max_return", "exposed"}
 )
 """Names that no subclass of `SequencePolicy` may define; of its instances, `head` may be replaced
 by another with the same methods."""
@@ -34,15 +34,10 @@ _ROUNDING = 1e-4
 def check_policy(policy: SequencePolicy, train: EpisodeStore, sizes: Mapping[str, int]) -> None:
     """Check a policy with forward passes that differ in what it must not read.
 
-    Row t of `features` is what predicts a_t. It may depend on what was known before a_t: states and
+    Row t of `features` predicts a_t. It may depend on what was known before: states and
     returns-to-go up to t, actions and rewards before t. The check changes all the rest from some
-    step of each window on, and the padding before the session. It also builds the policy again from
-    its parameters and buffers, as a saved run is read.
-
-    Args:
-        policy: trained or not; put in evaluation mode meanwhile.
-        train: training episodes, of which a few windows are read.
-        sizes: what the policy was built with.
+    step of each window on, and the padding. It also builds the policy again, with the `sizes` that
+    it was built with, from its parameters and buffers, as a saved run is read.
 
     Raises:
         InputError: features or predictions depend on the action, the reward or later steps, on
@@ -107,11 +102,7 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
 
 
 def _sample(train: EpisodeStore, length: int, most: int | None = None) -> Windows:
-    """Windows that end at steps spread over the training episodes.
-
-    Args:
-        most: number of steps that each has at most; None for as many as there are.
-    """
+    """Windows of at most `most` steps that end at steps spread over the training episodes."""
     steps = np.linspace(0, train.n_steps - 1, _WINDOWS).astype(np.int64)
     episodes, _ = train.locate(steps)
     lasts = train.lengths[episodes] - 1

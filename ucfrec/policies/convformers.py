@@ -20,6 +20,7 @@ from ucfrec.policies.base import (
     Timesteps,
     init_linear,
 )
+from ucfrec.policies.dt import attend
 from ucfrec.policies.ucf import Dropout, TokenEmbedding, interleave, visible_tokens
 from ucfrec.settings import require, settings_table
 
@@ -55,7 +56,7 @@ class DCPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        hidden = self.dropout(interleave(*self.embed(windows, self.head.embed(windows.actions))))
+        hidden = self.dropout(interleave(self.embed(windows, self.head.embed(windows.actions))))
         valid = windows.mask.repeat_interleave(3, dim=1).unsqueeze(-1)
         for block in self.blocks:
             hidden = block(hidden, valid)
@@ -81,7 +82,7 @@ class _ConvBlock(nn.Module):
         padded = F.pad(normed, (self.reach, 0))
         # Each modality has its own filter; stride 3 computes only the outputs of that modality.
         mixed = [conv(padded[..., i:]).transpose(1, 2) for i, conv in enumerate(self.mixers)]
-        hidden = hidden + interleave(*mixed)
+        hidden = hidden + interleave(mixed)
         return hidden + self.mlp(self.mlp_norm(hidden))  # type: ignore[no-any-return]
 
 
@@ -140,7 +141,7 @@ class LSDTPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d): outputs at the tokens s_t."""
-        hidden = interleave(*self.embed(windows, self.head.embed(windows.actions)))
+        hidden = interleave(self.embed(windows, self.head.embed(windows.actions)))
         valid = windows.mask.repeat_interleave(3, dim=1)
         for block in self.blocks:
             hidden = block(hidden, valid)
@@ -170,10 +171,7 @@ class _LongShortBlock(nn.Module):
         self.out = nn.Linear(dim, dim)
         self.norm = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(
-            nn.Linear(dim, 4 * dim),
-            nn.GELU(),
-            nn.Linear(4 * dim, dim),
-            Dropout(config.dropout),
+            nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim), Dropout(config.dropout)
         )
         self.mlp_norm = nn.LayerNorm(dim)
         self.dropout = Dropout(config.dropout)
@@ -195,15 +193,8 @@ class _Attention(nn.Module):
         self.dropout = Dropout(config.attention_dropout)
 
     def forward(self, hidden: Tensor, valid: Tensor) -> Tensor:
-        batch, tokens, dim = hidden.shape
-        # (B, L, 3c) -> three times (B, H, L, c/H)
-        query, key, value = (
-            x.view(batch, tokens, self.heads, dim // self.heads).transpose(1, 2)
-            for x in self.query_key_value(hidden).chunk(3, dim=-1)
-        )
-        visible = visible_tokens(valid)
-        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
-        return self.dropout(mixed.transpose(1, 2).reshape(hidden.shape))  # type: ignore[no-any-return]
+        query, key, value = self.query_key_value(hidden).chunk(3, dim=-1)
+        return self.dropout(attend(query, key, value, visible_tokens(valid), self.heads))  # type: ignore[no-any-return]
 
 
 class _DynamicConvolution(nn.Module):

@@ -21,17 +21,12 @@ from ucfrec.policies.base import (
     Layers,
     PolicyConfig,
     SequencePolicy,
+    embed_time,
     init_linear,
     recurrent,
     require_heads,
 )
-from ucfrec.policies.ucf import (
-    Dropout,
-    TokenEmbedding,
-    draw_mask,
-    interleave,
-    visible_tokens,
-)
+from ucfrec.policies.ucf import Dropout, TokenEmbedding, draw_mask, interleave, visible_tokens
 from ucfrec.settings import Weight, settings_table
 
 
@@ -76,23 +71,18 @@ class DTPolicy(SequencePolicy):
         """Tokens R_t, s_t and a_t, (B, K, d) each, from normalised windows."""
         return self.embed(windows, self.head.embed(windows.actions))  # type: ignore[no-any-return]
 
-    def attend(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> Tensor:
-        """Outputs (B, 3K, d) at tokens of `tokens`; `mask` (B, K) is false at padding."""
-        hidden, visible = self._first(tokens, mask)
-        for block in self.blocks:
-            hidden = block(hidden, visible)
-        return self.final_norm(hidden)  # type: ignore[no-any-return]
+    def attend(
+        self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor, rows: slice | None = None
+    ) -> Tensor:
+        """Outputs (B, 3K, d) at tokens of `tokens`, or the `rows` of them alone; `mask` (B, K) is
+        false at padding."""
+        hidden = self.dropout(interleave(tokens))
+        visible = visible_tokens(mask.repeat_interleave(3, dim=1))
+        return self.final_norm(pass_rows(self.blocks, hidden, visible, rows))  # type: ignore[no-any-return]
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), without what the last block has for other tokens."""
-        first = self._first(self.tokens(windows), windows.mask)
-        state = slice(-2, -1)
-        return self.final_norm(pass_rows(self.blocks, *first, state))[:, 0]  # type: ignore[no-any-return]
-
-    def _first(self, tokens: tuple[Tensor, Tensor, Tensor], mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs of the first block (B, 3K, d), and which of them see which, (B, 1, 3K, 3K)."""
-        visible = visible_tokens(mask.repeat_interleave(3, dim=1))
-        return self.dropout(interleave(*tokens)), visible
+        return self.attend(self.tokens(windows), windows.mask, slice(-2, -1))[:, 0]
 
 
 class Block(nn.Module):
@@ -109,50 +99,50 @@ class Block(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim))
         self.dropout = Dropout(config.dropout)
 
-    def forward(self, hidden: Tensor, visible: Tensor) -> Tensor:
-        """Map (B, L, d) to (B, L, d); `visible` (B, 1, L, L) comes from `visible_tokens`."""
-        query, key, value = self.query_key_value(self.attention_norm(hidden)).chunk(3, dim=-1)
-        return self._update(hidden, query, key, value, visible)
-
-    def rows(self, hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
-        """The `rows` of what `forward` gives, (B, M, d)."""
-        layer, dim, normed = self.query_key_value, hidden.shape[-1], self.attention_norm(hidden)
-        query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
-        key, value = F.linear(normed, layer.weight[dim:], layer.bias[dim:]).chunk(2, dim=-1)
-        return self._update(hidden[:, rows], query, key, value, visible[:, :, rows])
-
-    def _update(
-        self, hidden: Tensor, query: Tensor, key: Tensor, value: Tensor, visible: Tensor
-    ) -> Tensor:
-        """Tokens (B, M, d) whose queries (B, M, d) have attended to keys and values (B, L, d)."""
-        batch, _, dim = hidden.shape
-        # (B, L, d) -> (B, H, L, d/H)
-        query, key, value = (
-            x.view(batch, -1, self.heads, dim // self.heads).transpose(1, 2)
-            for x in (query, key, value)
-        )
-        mixed = attend(query, key, value, visible, self.rate if self.training else 0.0)
-        hidden = hidden + self.dropout(self.out(mixed.transpose(1, 2).reshape(hidden.shape)))
+    def forward(self, hidden: Tensor, visible: Tensor, rows: slice | None = None) -> Tensor:
+        """Map (B, L, d) to (B, L, d), or to the `rows` (B, M, d) of it; `visible` (B, 1, L, L)
+        comes from `visible_tokens`."""
+        normed = self.attention_norm(hidden)
+        if rows is None:
+            query, key, value = self.query_key_value(normed).chunk(3, dim=-1)
+        else:
+            layer, dim = self.query_key_value, hidden.shape[-1]
+            query = F.linear(normed[:, rows], layer.weight[:dim], layer.bias[:dim])
+            key, value = F.linear(normed, layer.weight[dim:], layer.bias[dim:]).chunk(2, dim=-1)
+            hidden, visible = hidden[:, rows], visible[:, :, rows]
+        rate = self.rate if self.training else 0.0
+        mixed = attend(query, key, value, visible, self.heads, rate)
+        hidden = hidden + self.dropout(self.out(mixed))
         return hidden + self.dropout(self.mlp(self.mlp_norm(hidden)))  # type: ignore[no-any-return]
 
 
-def pass_rows(blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice) -> Tensor:
-    """The `rows` (B, M, d) of what `Block`s make of (B, L, d), by `visible` (B, 1, L, L)."""
+def pass_rows(
+    blocks: Iterable[nn.Module], hidden: Tensor, visible: Tensor, rows: slice | None
+) -> Tensor:
+    """The `rows` (B, M, d), or all, of what `Block`s make of tokens (B, L, d)."""
     *first_blocks, last = blocks
-    assert isinstance(last, Block)
     for block in first_blocks:
         hidden = block(hidden, visible)
-    return last.rows(hidden, visible, rows)
+    return last(hidden, visible, rows)  # type: ignore[no-any-return]
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, visible: Tensor, dropout: float) -> Tensor:
-    """Scaled dot-product attention (B, H, L, c) of query, key and value of this shape, where a mask
-    (B, 1, L, L), true somewhere in each row, is true; drops weights as `Dropout`."""
+def attend(
+    query: Tensor, key: Tensor, value: Tensor, visible: Tensor, heads: int, dropout: float = 0.0
+) -> Tensor:
+    """Scaled dot-product attention (B, M, d) of queries (B, M, d) to keys and values (B, L, d) that
+    are `visible` (B, 1, M, L), some in each row; drops weights as `Dropout`."""
+    batch, rows, dim = query.shape
+    # (B, L, d) -> (B, H, L, d/H)
+    query, key, value = (
+        x.view(batch, -1, heads, dim // heads).transpose(1, 2) for x in (query, key, value)
+    )
     if dropout == 0 or query.device.type != "cpu":
-        return F.scaled_dot_product_attention(query, key, value, visible, dropout)
-    scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
-    weights = scores.masked_fill(~visible, -torch.inf).softmax(-1)
-    return torch.matmul(weights * draw_mask(weights.shape, dropout), value)
+        mixed = F.scaled_dot_product_attention(query, key, value, visible, dropout)
+    else:
+        scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-2, -1)
+        weights = scores.masked_fill(~visible, -torch.inf).softmax(-1)
+        mixed = torch.matmul(weights * draw_mask(weights.shape, dropout), value)
+    return mixed.transpose(1, 2).reshape(batch, rows, dim)
 
 
 @settings_table("policy")
@@ -195,10 +185,7 @@ class CDT4RecPolicy(DTPolicy):
         """Estimates (B, K) of the logged actions' standardised rewards, from outputs (B, 3K, d) of
         `transform`; the mask (B, K) is false at padding."""
         states, actions = hidden[:, 1::3], hidden[:, 2::3]
-        length = mask.shape[1]
-        later = torch.ones(length, length, dtype=torch.bool, device=mask.device).triu(1)
-        diagonal = torch.eye(length, dtype=torch.bool, device=mask.device)
-        hidden_keys = (later | ~mask.unsqueeze(1)) & ~diagonal  # (B, K, K)
+        hidden_keys = ~visible_tokens(mask)[:, 0]  # (B, K, K)
         attended, _ = self.attention(
             states,
             actions,
@@ -210,16 +197,13 @@ class CDT4RecPolicy(DTPolicy):
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Action loss plus weighted reward loss over all steps, and scalars to log."""
-        mask = windows.mask
-        normalized = self.normalize(windows)
+        mask, normalized = windows.mask, self.normalize(windows)
         hidden = self.transform(normalized)
         imitation, scalars = self.imitation(hidden[:, 1::3], normalized)
         rewards = (windows.rewards - self.reward_mean) / self.reward_std
         reward_loss = (self.estimate_rewards(hidden, mask) - rewards).square()[mask].mean()
-        return imitation + self.config.reward_weight * reward_loss, {
-            **scalars,
-            "reward_loss": reward_loss.detach(),
-        }
+        scalars["reward_loss"] = reward_loss.detach()
+        return imitation + self.config.reward_weight * reward_loss, scalars
 
 
 @settings_table("policy")
@@ -263,7 +247,7 @@ class DT4RecPolicy(DTPolicy):
 
     def start_from(self, train: EpisodeStore) -> None:
         """Spread the buckets evenly over the range of training returns-to-go."""
-        returns = torch.from_numpy(train.step_values(schema.RETURN_TO_GO, *train.all_steps()))
+        returns = torch.from_numpy(train.column(schema.RETURN_TO_GO))
         low, high = returns.min() / self.return_scale, returns.max() / self.return_scale
         centres = self.embed.embed_return.centres
         centres.copy_(low + (high - low) * torch.linspace(0, 1, len(centres)))
@@ -319,17 +303,13 @@ class PromptedEmbedding(TokenEmbedding):
         """Tokens of returns-to-go, states and actions, (B, K, d) each; see `TokenEmbedding`."""
         states = recurrent(self.states, self.embed_state(windows.states), windows.mask)
         actions = recurrent(self.actions, actions, windows.mask)
-        time = self._time(windows)
+        time = embed_time(self.embed_timestep, windows)
         return self.returns(windows), self.norm(states + time), self.norm(actions + time)
 
     def returns(self, windows: Windows) -> Tensor:
         """Tokens of returns-to-go alone, (B, K, d)."""
         prompts = self.embed_return(windows.returns_to_go.unsqueeze(-1))
-        return self.norm(prompts + self._time(windows))  # type: ignore[no-any-return]
-
-    def _time(self, windows: Windows) -> Tensor:
-        last = self.embed_timestep.num_embeddings - 1
-        return self.embed_timestep(windows.timesteps.clamp(max=last))  # type: ignore[no-any-return]
+        return self.norm(prompts + embed_time(self.embed_timestep, windows))  # type: ignore[no-any-return]
 
 
 class RewardPrompt(nn.Module):

@@ -17,7 +17,7 @@ from ucfrec import schema
 from ucfrec.arrays import Float32Array, Float64Array, IntArray
 from ucfrec.counterfactual.reward_model import mlp
 from ucfrec.episodes.store import EpisodeStore
-from ucfrec.episodes.windows import Transitions, Windows
+from ucfrec.episodes.windows import Exposed, Transitions, Windows
 from ucfrec.fitting.loop import LoopConfig, fit
 from ucfrec.policies.base import Context, PolicyConfig, Returns, standardise
 from ucfrec.policies.dt import DTConfig, DTPolicy
@@ -153,9 +153,7 @@ def relabel(
 
 
 def optimistic_returns(
-    rewards: npt.NDArray[np.floating],
-    values: Float64Array,
-    lengths: IntArray,
+    rewards: npt.NDArray[np.floating], values: Float64Array, lengths: IntArray
 ) -> Float32Array:
     """R_t = r_t + max(R_{t+1}, V_{t+1}) (N,) within each episode, R = V = 0 after its end, from
     rewards (N,) and values (N,) before each step of episodes of some lengths (E,).
@@ -249,14 +247,10 @@ class EDT4RecPolicy(DTPolicy):
         exposed = self.exposed(normalized, windows.mask)
         entropy = self.head.entropy(features[windows.mask], exposed)  # type: ignore[operator]
         multiplier = self.log_multiplier.exp()
-        constraint = (
-            multiplier * (entropy.detach() - self.least_entropy) - multiplier.detach() * entropy
-        )
-        return imitation + constraint, {
-            **scalars,
-            "entropy": entropy.detach(),
-            "multiplier": multiplier.detach(),
-        }
+        constraint = multiplier * (entropy.detach() - self.least_entropy)
+        constraint = constraint - multiplier.detach() * entropy
+        scalars |= {"entropy": entropy.detach(), "multiplier": multiplier.detach()}
+        return imitation + constraint, scalars
 
 
 class GaussianHead(VectorHead):
@@ -270,18 +264,18 @@ class GaussianHead(VectorHead):
         """Log standard deviations (..., A) from features (..., d), clamped to [−5, 2]."""
         return self.log_deviation(features).clamp(-5.0, 2.0)  # type: ignore[no-any-return]
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean negative log-likelihood (nats) over M steps: features (M, d), actions (M, A)."""
         return self.losses(features, actions).mean()
 
-    def losses(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Negative log-likelihood (nats) of each of M steps, (M,)."""
         log_deviation = self.deviations(features)
         error = (actions - self.predict(features)) / self.scale / log_deviation.exp()
         nats = 0.5 * error.square() + log_deviation + 0.5 * math.log(2 * math.pi)
         return nats.sum(-1)
 
-    def entropy(self, features: Tensor, exposed: None = None) -> Tensor:
+    def entropy(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean entropy (nats) over M steps, features (M, d)."""
         nats = self.deviations(features) + 0.5 * math.log(2 * math.pi * math.e)
         return nats.sum(-1).mean()

@@ -1,36 +1,16 @@
-"""Action heads, which embed and predict actions (vectors or items), and a head of state values."""
+"""Action heads, which embed and predict actions, vectors or items."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ucfrec.episodes.exposure import ExposureTerm, Likeness, columns_of
-from ucfrec.episodes.windows import Exposed, Windows
-from ucfrec.fitting.distributed import joint_moments
+from ucfrec.episodes.exposure import ExposureTerm, columns_of
+from ucfrec.episodes.windows import Exposed
 
-EXPOSURE_KNOTS = 6
-"""Returns-to-go at which an exposure term has weights of its own."""
 _AT_ONCE = 2**24
 """Largest number of logits that a loss over all items of a large catalogue keeps at once."""
-BEST: float = 0.99
-"""τ of the expectile that stands for the best return within the logs (Reinformer)."""
-_CLIP = (-5.0, 3.0)
-"""Range of the standardised advantage in the exponent of a weight."""
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Items that were drawn, and how much each stands for."""
-
-    items: Tensor
-    """(L,) int64, ascending, each once."""
-    log_weights: Tensor
-    """(L,) log of draws over their expected number: Σ exp(log_weight + x) expects Σ exp(x) of
-    all."""
 
 
 class Proposal:
@@ -48,20 +28,22 @@ class Proposal:
         self.share = (share + 1 / len(counts)) / 2
         self._cumulative = self.share.cumsum(0)
 
-    def draw(self, count: int) -> Candidates:
-        """Draw `count` times, by torch's global generator."""
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """The items (L,) of `count` draws, ascending, each once, and the logs (L,) of draws over
+        their expected number, by torch's global generator."""
         cumulative, device = self._cumulative, self.share.device
         parts = torch.arange(count, device=device)
         points = (parts + torch.rand(count, device=device, dtype=torch.float64)) / count
         draws = torch.searchsorted(cumulative, points * cumulative[-1], right=True)
         draws = draws.clamp(max=len(cumulative) - 1)
         items, copies = torch.unique_consecutive(draws, return_counts=True)
-        return Candidates(items, torch.log(copies / (count * self.share[items])).float())
+        return items, torch.log(copies / (count * self.share[items])).float()
 
 
 class VectorHead(nn.Module):
     """Continuous actions: a linear layer and tanh, trained by squared error (Algorithm 6)."""
 
+    exposure: None = None
     scale: Tensor
 
     def __init__(self, dim: int, size: int) -> None:
@@ -74,15 +56,15 @@ class VectorHead(nn.Module):
         """Embed actions (B, K, A) as (B, K, d)."""
         return self.embed_action(actions / self.scale)  # type: ignore[no-any-return]
 
-    def predict(self, features: Tensor, exposed: None = None) -> Tensor:
+    def predict(self, features: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Actions (..., A) from features (..., d), within ± `scale`, the logs' largest value."""
         return torch.tanh(self.out(features)) * self.scale
 
-    def loss(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+    def loss(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """Mean squared error over M steps in units of `scale`: features (M, d), actions (M, A)."""
         return F.mse_loss(self.predict(features) / self.scale, actions / self.scale)
 
-    def losses(self, features: Tensor, actions: Tensor, exposed: None = None) -> Tensor:
+    def losses(self, features: Tensor, actions: Tensor, exposed: Exposed | None = None) -> Tensor:
         """The squared error of each of M steps, (M,), whose mean is `loss`."""
         error = (self.predict(features) - actions) / self.scale
         return error.square().mean(-1)
@@ -92,11 +74,9 @@ class ItemHead(nn.Module):
     """Items: dot products with item vectors, trained by negative log-likelihood (Algorithm 6).
 
     An item's vector is a learned projection of its fixed embedding, which items without training
-    steps have too, plus a correction learned per item. The bias is initialised to the log of the
-    item's share of the training steps, so that an untrained policy recommends popular items.
-
-    With an exposure term, what the session was shown lately moves the logits too; a dot product
-    cannot say "unlike what was just shown".
+    steps have too, plus a correction learned per item. The bias begins as the log of the item's
+    share of the training steps. With an exposure term, what the session was shown lately moves the
+    logits too; a dot product cannot say "unlike what was just shown".
 
     With `samples`, training takes the softmax over items drawn for the batch (`Proposal`) instead
     of all, subtracting the log of their expected number of draws from their logits (Bengio &
@@ -200,10 +180,9 @@ class ItemHead(nn.Module):
                 for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
             ]
             return torch.stack(parts).logsumexp(0) - logit
-        candidates = self._proposal_now().draw(self.samples)
-        logits = self._weigh(features, candidates, exposed)
+        items, logits, _ = self._sampled_logits(features, exposed)
         # The logged item counts as itself, not as one that was drawn.
-        column = columns_of(actions, candidates.items)
+        column = columns_of(actions, items)
         rows = torch.nonzero(column >= 0)[:, 0]
         logits = logits.index_put_((rows, column[rows]), logits.new_tensor(-torch.inf))
         return torch.logaddexp(logits.logsumexp(-1), logit) - logit
@@ -214,9 +193,9 @@ class ItemHead(nn.Module):
             logs = self.predict(features, exposed).log_softmax(-1)
             of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
             return of_all
-        candidates = self._proposal_now().draw(self.samples)
-        logs = self._weigh(features, candidates, exposed).log_softmax(-1)
-        estimate: Tensor = -(logs.exp() * (logs - candidates.log_weights)).sum(-1).mean()
+        _, logits, log_weights = self._sampled_logits(features, exposed)
+        logs = logits.log_softmax(-1)
+        estimate: Tensor = -(logs.exp() * (logs - log_weights)).sum(-1).mean()
         return estimate
 
     def _logits(
@@ -233,11 +212,16 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def _weigh(self, features: Tensor, candidates: Candidates, exposed: Exposed | None) -> Tensor:
-        """Logits (M, L) of the candidates plus their log weights."""
-        items = candidates.items
-        bias = self._gather_bias(items) + candidates.log_weights
-        return self._logits(features, self.vectors(items), bias, items, exposed)
+    def _sampled_logits(
+        self, features: Tensor, exposed: Exposed | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Items (L,) as `Proposal.draw`s them, logits (M, L) plus log weights, and these (L,)."""
+        if self._proposal is None or self._proposal.share.device != self.counts.device:
+            self._proposal = Proposal(self.counts)
+        items, log_weights = self._proposal.draw(self.samples)
+        bias = self._gather_bias(items) + log_weights
+        logits = self._logits(features, self.vectors(items), bias, items, exposed)
+        return items, logits, log_weights
 
     def logit(self, features: Tensor, actions: Tensor, exposed: Exposed | None) -> Tensor:
         """Logits (M,) of the logged items."""
@@ -250,77 +234,9 @@ class ItemHead(nn.Module):
     def _gather_bias(self, items: Tensor) -> Tensor:
         return torch.gather(self.bias, 0, items, sparse_grad=True)
 
-    def _proposal_now(self) -> Proposal:
-        proposal = self._proposal
-        if proposal is None or proposal.share.device != self.counts.device:
-            proposal = self._proposal = Proposal(self.counts)
-        return proposal
-
     def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
         super()._load_from_state_dict(*arguments, **options)
         self._proposal = None
 
 
 Head = VectorHead | ItemHead
-
-
-def head_from(sizes: Mapping[str, Any], dim: int, lags: int = 0, samples: int = 0) -> Head:
-    """The head for a store's actions, items if `sizes["items"]` is above 0, with an exposure term
-    of `lags` earlier steps unless these are 0."""
-    if not sizes["items"]:
-        return VectorHead(dim, sizes["action"])
-    exposure = None
-    if lags:
-        likeness = Likeness(sizes["items"], sizes["action"], sizes.get("tags", 0))
-        exposure = ExposureTerm(lags, EXPOSURE_KNOTS, likeness)
-    return ItemHead(dim, sizes["items"], sizes["action"], exposure, samples)
-
-
-class ValueHead(nn.Module):
-    """V(h_t), the mean of the return-to-go Ĝ_t, and V_τ(h_t), its expectile at τ = `BEST`.
-
-    The history h_t is what the policy sees but the returns-to-go: states and step numbers up to t
-    and actions before t, within the context. The expectile minimises E[|τ − 1(Ĝ < V)| (Ĝ − V)²]
-    (Zhuang et al., ICML 2024). Values are in units of the policy's return scale.
-    """
-
-    def __init__(self, state_size: int, dim: int) -> None:
-        super().__init__()
-        self.embed = nn.Linear(state_size + 1 + dim, dim)
-        self.history = nn.GRU(dim, dim, batch_first=True)
-        self.out = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, 2))
-
-    def forward(self, windows: Windows, actions: Tensor) -> Tensor:
-        """Mean and expectile (B, K, 2), of normalised windows and their embedded actions (B, K, d),
-        into which no gradient goes."""
-        mask = windows.mask
-        time = torch.log1p(windows.timesteps.float()).unsqueeze(-1) / 5
-        actions = actions.detach().masked_fill(~mask.unsqueeze(-1), 0.0)
-        earlier = F.pad(actions, (0, 0, 1, 0))[:, :-1]
-        tokens = F.relu(self.embed(torch.cat([windows.states, time, earlier], dim=-1)))
-        # Padding is moved from the left to the right, where it follows every step.
-        padding, steps = (~mask).sum(1, keepdim=True), torch.arange(mask.shape[1]).to(mask.device)
-        following = (steps + padding).clamp(max=mask.shape[1] - 1)
-        outputs, _ = self.history(_take_steps(tokens, following))
-        return self.out(_take_steps(outputs, (steps - padding).clamp(min=0)))  # type: ignore[no-any-return]
-
-    @staticmethod
-    def loss(values: Tensor, returns: Tensor) -> Tensor:
-        """Squared error of the mean plus the expectile's, values (M, 2), to returns-to-go (M,)."""
-        error = returns - values[:, 1]
-        slope = torch.where(error < 0, 1 - BEST, BEST)
-        return F.mse_loss(values[:, 0], returns) + (slope * error.square()).mean()
-
-
-def _take_steps(values: Tensor, steps: Tensor) -> Tensor:
-    """The rows (B, K) `steps` of `values` (B, K, d)."""
-    return values.gather(1, steps.unsqueeze(-1).expand_as(values))
-
-
-def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
-    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation, from
-    values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over all processes."""
-    advantage = (returns - values[:, 0]).detach()
-    deviation = joint_moments(advantage)[1]
-    weights = (advantage / deviation.clamp(min=1e-6)).clamp(_CLIP[0], _CLIP[1]).exp()
-    return weights / joint_moments(weights)[0]

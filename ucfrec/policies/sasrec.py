@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ucfrec.episodes.windows import Windows
-from ucfrec.policies.base import Layers, SequencePolicy, embedding, require_items
+from ucfrec.policies.base import Layers, SequencePolicy, embed_time, embedding
 from ucfrec.policies.dt import Block, DTConfig, pass_rows
 from ucfrec.policies.heads import ItemHead
 from ucfrec.policies.ucf import Dropout, visible_tokens
@@ -42,26 +42,21 @@ class SASRecPolicy(SequencePolicy):
 
     def features(self, windows: Windows) -> Tensor:
         """Features (B, K, d); row t depends on the actions before t."""
-        hidden, visible = self._tokens(windows)
-        for block in self.blocks:
-            hidden = block(hidden, visible)
-        return self.final_norm(hidden)  # type: ignore[no-any-return]
+        return self._attend(windows, None)
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d), without what the last block has for other steps."""
-        hidden, visible = self._tokens(windows)
-        return self.final_norm(pass_rows(self.blocks, hidden, visible, slice(-1, None)))[:, 0]  # type: ignore[no-any-return]
+        return self._attend(windows, slice(-1, None))[:, 0]
 
-    def _tokens(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """The first block's tokens (B, K, d), and which of them see which, (B, 1, K, K)."""
+    def _attend(self, windows: Windows, rows: slice | None) -> Tensor:
+        """The `rows` of the features."""
         earlier = self.head.embed(windows.actions).roll(1, dims=1)
         # The first step of a window has no earlier action in the window.
         has_earlier = windows.mask & windows.mask.roll(1, dims=1)
         has_earlier[:, 0] = False
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
-        tokens = earlier.masked_fill(~has_earlier.unsqueeze(-1), 0.0) + time
-        return self.dropout(tokens), visible_tokens(windows.mask)
+        tokens = earlier.masked_fill(~has_earlier.unsqueeze(-1), 0.0)
+        tokens = self.dropout(tokens + embed_time(self.embed_timestep, windows))
+        return self.final_norm(pass_rows(self.blocks, tokens, visible_tokens(windows.mask), rows))  # type: ignore[no-any-return]
 
 
 @settings_table("policy")
@@ -86,10 +81,7 @@ class GSASRecPolicy(SASRecPolicy):
 
     Config = GSASRecConfig
     config: GSASRecConfig
-
-    def __init__(self, config: GSASRecConfig, sizes: Mapping[str, int]) -> None:
-        require_items("gsasrec", sizes)
-        super().__init__(config, sizes)
+    items_only = "gsasrec"
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean gBCE over all steps of the windows, and scalars to log."""

@@ -3,7 +3,7 @@
 Dropout, attention and convolution cost less here than PyTorch's on a CPU.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Final
 
 import torch
@@ -18,6 +18,7 @@ from ucfrec.policies.base import (
     PolicyConfig,
     Returns,
     SequencePolicy,
+    embed_time,
     embedding,
     require_heads,
     some_padding,
@@ -104,15 +105,19 @@ class UCFPolicy(SequencePolicy):
         """Features (B, K, d): outputs at the tokens s_t."""
         return self.attend(windows)[0]
 
-    def attend(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Features (B, K, d) and attention probabilities (B, H, K, 3K), from normalised windows."""
+    def attend(self, windows: Windows, rows: slice = slice(None)) -> tuple[Tensor, Tensor]:
+        """Features (B, Q, d) and attention probabilities (B, H, Q, 3K) of the `rows`, Q of the K
+        steps, from normalised windows."""
         states, tokens = self._fuse_streams(windows)
-        return self._outputs(states, tokens, _visible(windows.mask))
+        states, visible = states[:, rows], _visible(windows.mask)[:, rows]
+        attended, attention = self.attention(states, tokens, visible)
+        hidden = self.dropout.add(states, attended)
+        hidden = self.dropout.add(hidden, self.mlp(self.mlp_norm(hidden)))
+        return self.final_norm(hidden), attention
 
     def last_features(self, windows: Windows) -> Tensor:
         """Row K − 1 of `features`, (B, d): attention has a single query."""
-        states, tokens = self._fuse_streams(windows)
-        return self._outputs(states[:, -1:], tokens, _visible(windows.mask)[:, -1:])[0][:, 0]
+        return self.attend(windows, slice(-1, None))[0][:, 0]
 
     def acting_features(self) -> Callable[[Windows], Tensor]:
         """`last_features`, with stacked weights for a few windows."""
@@ -135,40 +140,27 @@ class UCFPolicy(SequencePolicy):
         fused_states = self.fuse_norm(states + revealed)
         revealed = revealed + F.linear(actions, of_action)
         fused_actions = self.fuse_norm(actions + revealed)
-        return fused_states, interleave(fused_returns, fused_states, fused_actions)
-
-    def _outputs(self, states: Tensor, tokens: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (B, Q, d) and attention (B, H, Q, 3K) of Q tokens s_t, (B, Q, d)."""
-        attended, attention = self.attention(states, tokens, visible)
-        hidden = self.dropout.add(states, attended)
-        hidden = self.dropout.add(hidden, self.mlp(self.mlp_norm(hidden)))
-        return self.final_norm(hidden), attention
+        return fused_states, interleave([fused_returns, fused_states, fused_actions])
 
     def loss(self, windows: Windows) -> tuple[Tensor, dict[str, Tensor]]:
         """L_action + λ L_mask over all steps (Eq. 5, Algorithm 6), and scalars to log."""
-        normalized = self.normalize(windows)
+        config, normalized = self.config, self.normalize(windows)
         features, attention = self.attend(normalized)
         imitation, scalars = self.imitation(features, normalized)
-        if self.config.lambda_mask == 0:
+        if config.lambda_mask == 0:
             return imitation, scalars
-        supervision, attended = self._supervision(attention, windows.mask)
-        return imitation + self.config.lambda_mask * supervision, scalars | attended
-
-    def _supervision(self, attention: Tensor, mask: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """L_mask, and scalars to log about attention (B, H, K, 3K)."""
-        config = self.config
+        mask = windows.mask
         targets = parent_targets(
             mask, config.parent_window, config.parent_decay, config.parent_action
         )
         supervision = mask_loss(attention, targets, mask)
-        on_parents = (attention.detach().mean(1) * (targets > 0)).sum(-1)
-        visible = _visible(mask)
-        uniform = ((targets > 0) & visible).sum(-1) / visible.sum(-1)
-        return supervision, {
-            "mask_loss": supervision.detach(),
-            "attention_on_parents": on_parents[mask].mean(),
-            "uniform_on_parents": uniform[mask].mean(),
-        }
+        parents, visible = targets > 0, _visible(mask)
+        on_parents = (attention.detach().mean(1) * parents).sum(-1)
+        uniform = (parents & visible).sum(-1) / visible.sum(-1)
+        scalars["mask_loss"] = supervision.detach()
+        scalars["attention_on_parents"] = on_parents[mask].mean()
+        scalars["uniform_on_parents"] = uniform[mask].mean()
+        return imitation + config.lambda_mask * supervision, scalars
 
 
 class UCFPaperPolicy(UCFPolicy):
@@ -277,16 +269,14 @@ class TokenEmbedding(nn.Module):
 
     def _parts(self, windows: Windows) -> tuple[Tensor, Tensor, Tensor]:
         """Embedded time, returns-to-go and states, (B, K, d) each."""
-        last = self.embed_timestep.num_embeddings - 1
-        time = self.embed_timestep(windows.timesteps.clamp(max=last))
         returns = self.embed_return(windows.returns_to_go.unsqueeze(-1))
+        time = embed_time(self.embed_timestep, windows)
         return time, returns, self.embed_state(windows.states)
 
 
-def interleave(returns: Tensor, states: Tensor, actions: Tensor) -> Tensor:
-    """Merge three tensors (B, K, d) into (B, 3K, d) in the order R_0, s_0, a_0, R_1, …"""
-    batch, length, dim = returns.shape
-    return torch.stack([returns, states, actions], dim=2).reshape(batch, 3 * length, dim)
+def interleave(modalities: Sequence[Tensor]) -> Tensor:
+    """Merge returns, states and actions, (B, K, d) each, into (B, 3K, d): R_0, s_0, a_0, R_1, …"""
+    return torch.stack(list(modalities), dim=2).flatten(1, 2)
 
 
 class CausalDepthwise(nn.Conv1d):
@@ -306,16 +296,21 @@ class CausalDepthwise(nn.Conv1d):
         return _ShiftedProducts.apply(steps, taps, self.bias)  # type: ignore[no-any-return, no-untyped-call]
 
 
+def shift_products(steps: Tensor, taps: Tensor, bias: Tensor) -> Tensor:
+    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from steps x (..., K, d), taps w (3, ...) and bias b."""
+    out = torch.addcmul(bias, steps, taps[2])
+    for back in (1, 2):
+        out[..., back:, :].addcmul_(steps[..., :-back, :], taps[2 - back])
+    return out
+
+
 class _ShiftedProducts(torch.autograd.Function):
-    """Σ_n x_{t − n} ⊙ w_{2 − n} + b, from x (B, K, d), w (3, d) and b (d,)."""
+    """`shift_products` of steps (B, K, d), taps (3, d) and a bias (d,), with its gradient."""
 
     @staticmethod
     def forward(ctx: Any, steps: Tensor, taps: Tensor, bias: Tensor) -> Any:
         ctx.save_for_backward(steps, taps)
-        out = torch.addcmul(bias, steps, taps[2])
-        for back in (1, 2):
-            out[:, back:].addcmul_(steps[:, :-back], taps[2 - back])
-        return out
+        return shift_products(steps, taps, bias)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
@@ -419,7 +414,7 @@ class StackedStreams:
     @torch.no_grad()
     def __call__(self, windows: Windows) -> Tensor:
         """Features (B, d) from normalised windows."""
-        policy, (batch, length) = self._policy, windows.mask.shape
+        policy, batch = self._policy, windows.mask.shape[0]
         # A graph that is exported may be for any batch.
         if not isinstance(batch, int) or batch > _FEW:
             return policy.last_features(windows)
@@ -427,26 +422,19 @@ class StackedStreams:
         # Vectors of a few items cost less than keeping those of all.
         embed = head.vectors if isinstance(head, ItemHead) else head.embed
         tokens = policy.embed.stack(windows, embed(windows.actions))
-        tokens = self._convolve(tokens, some_padding(windows.mask))
-        rows = tokens.view(3, batch * length, -1)
+        shape, dim, mask = tokens.shape, tokens.shape[-1], some_padding(windows.mask)
+        for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
+            steps = tokens if mask is None else tokens.masked_fill(~mask.unsqueeze(-1), 0.0)
+            local = shift_products(steps, taps, bias).view(3, -1, dim)
+            rows = torch.baddbmm(pointwise_bias, local, pointwise)
+            normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,), eps=self._eps)
+            tokens = torch.addcmul(shift, normed, scale)
+        rows = tokens.view(3, -1, dim)
         sums = torch.bmm(rows, self._fuse).cumsum(0).add_(self._fuse_bias)
-        fused = policy.fuse_norm(sums.add_(rows)).view(tokens.shape)
+        fused = policy.fuse_norm(sums.add_(rows)).view(shape)
         attended = self._attend_last(fused, windows.mask)
         hidden = fused[1, :, -1] + attended
         return policy.final_norm(hidden + policy.mlp(policy.mlp_norm(hidden)))  # type: ignore[no-any-return]
-
-    def _convolve(self, tokens: Tensor, mask: Tensor | None) -> Tensor:
-        """The three streams of tokens (3, B, K, d); padded steps count as zeros."""
-        shape, dim = tokens.shape, tokens.shape[-1]
-        for taps, bias, pointwise, pointwise_bias, scale, shift in self._blocks:
-            steps = tokens if mask is None else tokens.masked_fill(~mask.unsqueeze(-1), 0.0)
-            local = torch.addcmul(bias, steps, taps[2])
-            for back in (1, 2):
-                local[:, :, back:].addcmul_(steps[:, :, :-back], taps[2 - back])
-            rows = torch.baddbmm(pointwise_bias, local.view(3, -1, dim), pointwise)
-            normed = F.layer_norm(F.gelu(rows).view(shape).add_(tokens), (dim,), eps=self._eps)
-            tokens = torch.addcmul(shift, normed, scale)
-        return tokens
 
     def _attend_last(self, tokens: Tensor, mask: Tensor) -> Tensor:
         """What the last s_t attends to among tokens (3, B, K, d), (B, d)."""

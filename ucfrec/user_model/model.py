@@ -149,14 +149,11 @@ class LoggedRewards:
     session, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        parts = [
-            np.unique(rewards, return_counts=True)
-            for (rewards,) in store.column_batches(schema.REWARD)
-        ]
-        rewards, place = np.unique(
-            np.concatenate([distinct for distinct, _ in parts]), return_inverse=True
-        )
-        counts = np.bincount(place, np.concatenate([distinct for _, distinct in parts]))
+        batches = store.column_batches(schema.REWARD)
+        parts = [np.unique(rewards, return_counts=True) for (rewards,) in batches]
+        distinct, numbers = (np.concatenate(part) for part in zip(*parts, strict=True))
+        rewards, place = np.unique(distinct, return_inverse=True)
+        counts = np.bincount(place, numbers)
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]
         if len(values) > _GROUPS:
             middle = (counts.cumsum() - counts / 2) / counts.sum()

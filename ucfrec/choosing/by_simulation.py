@@ -35,7 +35,7 @@ from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.processes import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
-from ucfrec.user_model.reward_report import halve_users
+from ucfrec.user_model.reward_report import number_users
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
@@ -342,7 +342,7 @@ class RuleSearch:
         """Whether the chosen rule is level with the best allowed one in either half of users."""
         own_returns = self._sessions[chosen.rule].returns
         n = len(own_returns)
-        half = halve_users(self._store)[np.arange(n) % len(self._store)]
+        half = number_users(self._store)[np.arange(n) % len(self._store)] % 2
         allowed = {item.rule for item in candidates if self.is_allowed(item)} | {chosen.rule}
         returns = [self._sessions[rule].returns[:n] for rule in allowed]
         returns = [values for values in returns if len(values) == n]
@@ -389,15 +389,15 @@ class RuleSearch:
 
     def _roll_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
         """Sessions of one half of the users, with its own calibration; each part has others."""
-        half, n = halve_users(self._store), self._config.sessions
-        episodes = np.flatnonzero(half == number)
-        episodes = episodes if len(episodes) else np.arange(len(half))
+        users, n = number_users(self._store), self._config.sessions
+        episodes = np.flatnonzero(users % 2 == number)
+        episodes = episodes if len(episodes) else np.arange(len(users))
         store = self._store.select(np.roll(episodes, -(n // 2 + part * n)))
-        users, report = self.users, self.users.calibration_report
+        model, report = self.users, self.users.calibration_report
         if report is not None:
-            users = replace(users, calibration=report.halves[number])
+            model = replace(model, calibration=report.halves[number])
         seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
-        return self._roll_out([rule], store, n, seed, users)[rule]
+        return self._roll_out([rule], store, n, seed, model)[rule]
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:

@@ -441,7 +441,7 @@ def _describe_choice(users: UserModel) -> str:
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
-    """Rules of all kinds that the log can tell of, each kind beside the best one of those before."""
+    """Rules of all kinds that the log can tell of, each beside the best of those before."""
     problem, config = search.problem, search.problem.config
     candidates = search.simulate([*_list_unweighted(problem)])
     first = search.best(candidates).rule

@@ -43,14 +43,8 @@ SETTINGS = ["train.steps=5", "policy.dim=16", "policy.context=4", "augment.copie
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranking")
-    store = store_of(
-        tagged_log(),
-        folder,
-        tagged_mapping(folder),
-        reward="reward",
-        session_by="user",
-        embedding_size=6,
-    )
+    options = {"reward": "reward", "session_by": "user", "embedding_size": 6}
+    store = store_of(tagged_log(), folder, tagged_mapping(folder), **options)
     train_run(store, folder / "run", resolve_config("ucf", None, SETTINGS))
     return folder
 
@@ -88,9 +82,7 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
         assert each["hits"] == pytest.approx(float(np.asarray(hits)), abs=1e-9)
 
 
-def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked_too(
-    folder: Path,
-) -> None:
+def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(folder: Path) -> None:
     found = chosen(folder, 50.0, 0.0, 1000.0)
     ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
     weights = [each.rule.reward_weight for each in ranked]
@@ -143,9 +135,8 @@ def evident(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def problem(evident: Path, evidence: int) -> Problem:
     views = training_views(EpisodeStore.open(evident / "store"))
     trained = TrainedPolicy.load(evident / "run")
-    config = RuleConfig(
-        sessions=20, evidence=evidence, least_items=2, least_impressions=1, tag_windows=(0,)
-    )
+    least = {"evidence": evidence, "least_items": 2, "least_impressions": 1}
+    config = RuleConfig(sessions=20, tag_windows=(0,), **least)
     users = UserModel.fit(*views, evident / "run" / REWARD_MODEL, 0)
     targets = {quantile: trained.target_return(quantile) for quantile in config.quantiles}
     return Problem(trained.scorer(DecisionRule(2.0)), users, targets, *views, config, 0)
@@ -167,9 +158,8 @@ def test_evidence_is_what_off_policy_evaluation_finds(evident: Path) -> None:
     for rule, evidence in zip(rules, found, strict=True):
         scores = logged_scores(given.scorer.under(rule), view, episodes, steps)
         logs = rule.log_probabilities(scores).double().numpy()[np.arange(len(items)), items]
-        logged = LoggedSteps(
-            episodes, rewards, np.full(len(items), 1 / ITEMS), np.exp(logs), user=user
-        )
+        shown = np.full(len(items), 1 / ITEMS)
+        logged = LoggedSteps(episodes, rewards, shown, np.exp(logs), user=user)
         assert evidence.likelihood == pytest.approx(np.exp(logs.mean()), rel=1e-5)
         assert evidence.effective_users is not None
         if not np.exp(logs).any() or rule.temperature == 0:
@@ -208,14 +198,11 @@ def test_the_report_draws_what_a_bolder_rule_would_gain(evident: Path) -> None:
     found, table = draw_frontier(record, candidates), tabulate_user_model(record)
     assert found is not None
     assert table is not None
-    values = [float(cells[0]) for _, cells in found[1].rows]
-    users = [float(cells[1]) for _, cells in found[1].rows]
-    assert values == sorted(values)
-    assert users == sorted(users, reverse=True)
-    best = max(each.value or 0.0 for each in candidates)
-    assert values[-1] == pytest.approx(best, rel=1e-3)
+    values, users = zip(*((float(c[0]), float(c[1])) for _, c in found[1].rows), strict=True)
+    assert [*values] == sorted(values)
+    assert [*users] == sorted(users, reverse=True)
+    assert values[-1] == pytest.approx(max(each.value or 0.0 for each in candidates), rel=1e-3)
     parts = dict(table.rows)
-    estimate_of_run = record.rule.estimate
-    assert estimate_of_run is not None
-    assert parts["estimated value"][0].startswith(f"{estimate_of_run.value:.4g} ±")
+    assert record.rule.estimate is not None
+    assert parts["estimated value"][0].startswith(f"{record.rule.estimate.value:.4g} ±")
     assert "±" in parts["rewards expected too high by"][0]

@@ -35,6 +35,7 @@ from ucfrec.user_model.model import UserModel
 
 SMALL = ["train.steps=60", "train.learning_rate=3e-3", "train.warmup_steps=5", "policy.dim=16"]
 SETTINGS = [*SMALL, "train.validate_every=20", "policy.context=6", "augment.copies=0"]
+ONE_TAG = torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0)
 FEW = RuleConfig(sessions=40, reward_weights=(0.0, 4.0), least_impressions=1, least_items=2.0)
 
 
@@ -66,10 +67,15 @@ def users_of(run: Path, store: EpisodeStore) -> UserModel:
     return UserModel.fit(*training_views(store), run / REWARD_MODEL, 0)
 
 
-def search_of(folder: Path, trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
-    store, scorer = EpisodeStore.open(folder / "store"), trained.scorer(DecisionRule(2.0))
-    users = users_of(folder / "run", store)
+def search_of(trained: TrainedPolicy, config: RuleConfig = FEW) -> RuleSearch:
+    store = EpisodeStore.open(trained.folder.parent / "store")
+    users, scorer = users_of(trained.folder, store), trained.scorer(DecisionRule(2.0))
     return RuleSearch(Problem(scorer, users, {}, *training_views(store), config, 0))
+
+
+def drawn(weight: float) -> DecisionRule:
+    """At temperature 1, with a reward weight."""
+    return DecisionRule(2.0, reward_weight=weight, temperature=1.0)
 
 
 def chosen(
@@ -108,22 +114,8 @@ def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
     assert "WARNING: it cannot be trusted: the log has no propensities" in found.describe()
 
 
-def test_a_reward_weight_pays_where_the_reward_model_knows_the_items(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    search = search_of(folder, trained)
-    plain, weighted = search.simulate(
-        [
-            DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
-            for reward_weight in (0, 4)
-        ]
-    )
-    assert weighted.value > plain.value + 2 * plain.error
-    assert weighted.items < plain.items
-
-
-def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: TrainedPolicy) -> None:
-    search = search_of(folder, trained, replace(FEW, sessions=30))
+def test_rules_side_by_side_do_what_each_does_alone(trained: TrainedPolicy) -> None:
+    search = search_of(trained, replace(FEW, sessions=30))
     rules = [
         DecisionRule(2.0, temperature=1.0),
         DecisionRule(1.0, minimum_target=1.0, reward_weight=2.0, temperature=0.5),
@@ -133,9 +125,9 @@ def test_rules_side_by_side_do_what_each_does_alone(folder: Path, trained: Train
     assert search.simulate(rules) == [search.simulate([rule])[0] for rule in rules]
 
 
-def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: TrainedPolicy) -> None:
-    search = search_of(folder, trained)
-    (simulated,) = search.simulate([DecisionRule(2.0, temperature=1.0)])
+def test_unsupported_and_narrow_rules_are_not_allowed(trained: TrainedPolicy) -> None:
+    search = search_of(trained)
+    (simulated,) = search.simulate([drawn(0.0)])
     assert search.is_allowed(simulated)
     assert not search.is_allowed(replace(simulated, support=0.5))
     assert not search.is_allowed(replace(simulated, items=1.0))
@@ -153,18 +145,17 @@ def test_unsupported_and_narrow_rules_are_not_allowed(folder: Path, trained: Tra
 
 
 def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
-    folder: Path, trained: TrainedPolicy
+    trained: TrainedPolicy,
 ) -> None:
-    search = search_of(folder, trained)
-    rules = DecisionRule(2.0), DecisionRule(2.0, temperature=1.0)
+    search, rules = search_of(trained), [DecisionRule(2.0), drawn(0.0)]
     found = search.simulate(rules)
     luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
     nothing = np.zeros(0, dtype=np.int64)
     for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
         search._sessions[each] = Outcomes(returns, nothing, nothing)
     low, high = (
-        replace(each, value=float(search._sessions[each.rule].returns.mean()), error=3.2)
-        for each in found
+        replace(each, value=luck.mean() + more, error=3.2)
+        for each, more in zip(found, (0.0, 3.0), strict=True)
     )
     assert search.level([low, high]) == [high]
     search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
@@ -179,42 +170,36 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.most_evident([likely, hitting]) == hitting
 
 
-def test_rules_far_behind_are_not_simulated_in_all_sessions(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    search = search_of(folder, trained, replace(FEW, sessions=120))
-    plain, close, best = (
-        DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 3.8, 4.0)
-    )
+def test_rules_far_behind_are_not_simulated_in_all_sessions(trained: TrainedPolicy) -> None:
+    search = search_of(trained, replace(FEW, sessions=120))
+    plain, close, best = (drawn(weight) for weight in (0.0, 3.8, 4.0))
     found = dict(zip((plain, close, best), search.simulate([plain, close, best]), strict=True))
-    sizes = {rule: len(sessions.returns) for rule, sessions in search._sessions.items()}
-    assert sizes == {plain: 30, close: 120, best: 120}
     returns = {rule: sessions.returns for rule, sessions in search._sessions.items()}
+    assert [len(returns[rule]) for rule in found] == [30, 120, 120]
     ahead = max(close, best, key=lambda rule: float(returns[rule][:30].mean()))
     behind = float((returns[ahead][:30] - returns[plain]).mean())
     assert found[ahead].value == pytest.approx(returns[ahead].mean())
     assert found[plain].value == pytest.approx(found[ahead].value - behind)
     assert found[plain].error > found[ahead].error
     # The first sessions are those of a search that has no others.
-    few = search_of(folder, trained, replace(FEW, sessions=30))
+    few = search_of(trained, replace(FEW, sessions=30))
     few.simulate([plain, best])
     for rule in (plain, best):
-        expected = few._sessions[rule].returns
-        np.testing.assert_array_equal(search._sessions[rule].returns[:30], expected)
+        np.testing.assert_array_equal(returns[rule][:30], few._sessions[rule].returns)
     # A rule that the log does not support rules nothing out.
-    unsupported = search_of(folder, trained, replace(FEW, sessions=120))
+    unsupported = search_of(trained, replace(FEW, sessions=120))
     unsupported.least_items = 1e9
     unsupported.simulate([plain, best])
     assert {len(each.returns) for each in unsupported._sessions.values()} == {120}
 
 
 def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
-    folder: Path, trained: TrainedPolicy
+    trained: TrainedPolicy,
 ) -> None:
-    search = search_of(folder, trained, replace(FEW, sessions=39))
-    plain, weighted = search.simulate(
-        [DecisionRule(2.0, reward_weight=each, temperature=1.0) for each in (0.0, 4.0)]
-    )
+    search = search_of(trained, replace(FEW, sessions=39))
+    plain, weighted = search.simulate([drawn(0.0), drawn(4.0)])
+    assert weighted.value > plain.value + 2 * plain.error
+    assert weighted.items < plain.items
     assert search.halves_agree(weighted, [plain, weighted]) == (True, True)
     assert not any(search.halves_agree(plain, [plain, weighted]))
 
@@ -239,20 +224,16 @@ def test_what_the_log_supports_only_without_recent_tags_is_found(
     # The best shows item 0 for ever, drawing shows items that the log hardly has; items 0 to 3
     # share no tag.
     narrow = with_bias(trained, torch.tensor([12.0, 10.0, 8.0, 6.0] + [0.0] * 20))
-    config = replace(
-        FEW,
-        least_impressions=int(training_views(store)[0].item_counts()[:4].min()),
-        temperatures=(0.0, 4.0),
-        reward_weights=(0.0,),
-        tag_windows=(0, 3),
-    )
+    least = int(training_views(store)[0].item_counts()[:4].min())
+    tried = {"temperatures": (0.0, 4.0), "reward_weights": (0.0,), "tag_windows": (0, 3)}
+    config = replace(FEW, least_impressions=least, **tried)
     found = chosen(narrow, store, folder / "run", config, 2.0, 2.0)
     assert not found.warning
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
 
 
-def test_a_policy_below_the_log_is_warned_of(folder: Path, trained: TrainedPolicy) -> None:
-    search, rule = search_of(folder, trained), DecisionRule(2.0, temperature=1.0)
+def test_a_policy_below_the_log_is_warned_of(trained: TrainedPolicy) -> None:
+    search, rule = search_of(trained), drawn(0.0)
     (found,), estimate = search.simulate([rule]), search.estimate(rule)
     logged = float(search.problem.train.returns.mean())
     for value, below in ((logged - 0.5, True), (logged - 0.1, False), (logged + 1, False)):
@@ -262,33 +243,21 @@ def test_a_policy_below_the_log_is_warned_of(folder: Path, trained: TrainedPolic
 
 @pytest.mark.slow
 def test_users_who_tire_are_shown_no_longer_runs(tmp_path: Path, trained: TrainedPolicy) -> None:
-    store = tiring_store(tmp_path)
-    scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
+    store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
     one = {"temperatures": (1.0,), "reward_weights": (0.0,)}
     config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), **one)
     found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     fatigue = found.as_dict()["fatigue"]
     assert (fatigue["length"], fatigue["steps"]) == (3, 4)
     assert found.rule.tag_run == 2
-    runs = {candidate.rule.tag_run for candidate in found.candidates}
-    assert runs == set(FEW.tag_runs)
-    none = replace(config, tag_runs=(0,))
-    unlimited = chosen(scorer, store, tmp_path, none, 2.0, 3.0)
-    assert {candidate.rule.tag_run for candidate in unlimited.candidates} == {0}
+    unlimited = chosen(scorer, store, tmp_path, replace(config, tag_runs=(0,)), 2.0, 3.0)
+    for choice, runs in ((found, FEW.tag_runs), (unlimited, (0,))):
+        assert {candidate.rule.tag_run for candidate in choice.candidates} == {*runs}
 
 
-def test_rules_of_the_highest_value_are_simulated_in_more_sessions(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    few = replace(FEW, sessions=10)
-    search, more = (search_of(folder, trained, each) for each in (few, replace(few, sessions=40)))
-    reward_weights = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
-    simulated = search.simulate(
-        [
-            DecisionRule(2.0, reward_weight=reward_weight, temperature=1.0)
-            for reward_weight in reward_weights
-        ]
-    )
+def test_rules_of_the_highest_value_are_simulated_in_more_sessions(trained: TrainedPolicy) -> None:
+    search, more = (search_of(trained, replace(FEW, sessions=sessions)) for sessions in (10, 40))
+    simulated = search.simulate([drawn(weight) for weight in (0, 0.5, 1, 2, 3, 4, 5, 6, 7, 8)])
     allowed = [each for each in simulated if search.is_allowed(each)]
     worst = min(allowed, key=lambda each: each.value)
     again = search.finalists(simulated, worst)
@@ -301,15 +270,15 @@ def test_rules_of_the_highest_value_are_simulated_in_more_sessions(
 
 
 def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_path: Path) -> None:
-    one = ("temperatures=[1.0]", "reward_weights=[0.0, 4.0]", "tag_windows=[0]", "tag_runs=[0]")
-    one = (*one, "quantiles=[1.0]", "lookaheads=[0.0]", "sessions=15")
-    rule = [f"rule.{each}" for each in (*one, "least_items=2", "least_impressions=1")]
-    config = resolve_config("bc", None, [*SMALL, "train.validate_every=20", *rule])
+    one = "temperatures=[1.0] reward_weights=[0.0,4.0] tag_windows=[0] tag_runs=[0] quantiles=[1.0]"
+    rule = f"{one} lookaheads=[0.0] sessions=15 least_items=2 least_impressions=1".split()
+    settings = [*SMALL, "train.validate_every=20", *(f"rule.{each}" for each in rule)]
+    config = resolve_config("bc", None, settings)
     store = tiring_store(tmp_path)
     record = train_run(store, tmp_path / "run", config)
     assert record.reward_model is not None
-    assert record.reward_model.new_users
     assert record.rule is not None
+    assert record.reward_model.new_users
     assert "tastes of training users" in record.rule.chosen_by
     choice = record.rule.model_dump()
     users = choice["users"]
@@ -322,7 +291,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert not model.affinity.any()
     assert not model.user.any()
     # The chosen rule was simulated again in four times the sessions.
-    more = search_of(tmp_path, trained, replace(config.rule, sessions=60))
+    more = search_of(trained, replace(config.rule, sessions=60))
     (simulated,) = more.simulate([trained.rule])
     own = next(each for each in read_candidates(trained.folder) if each.rule == trained.rule)
     assert (own.value, own.error) == (simulated.value, simulated.error)
@@ -332,8 +301,7 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
 def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
     tmp_path: Path, trained: TrainedPolicy
 ) -> None:
-    store = tiring_store(tmp_path)
-    scorer = with_bias(trained, torch.where(torch.arange(24) % 4 == 0, 9.0, 0.0))
+    store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
     config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), tolerance=0.1)
     found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
     rule = found.rule

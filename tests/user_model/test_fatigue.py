@@ -45,22 +45,16 @@ def on_end(tags: IntArray, likes: BoolArray) -> int:
     return length
 
 
-def test_fatigue_is_found_with_its_length_steps_and_factor() -> None:
-    found = fit_fatigue(sessions(0.1, seed=0), sessions(0.1, seed=1))
+def test_fatigue_is_found_where_held_out_sessions_show_it_too() -> None:
+    tires, not_at_all = sessions(0.1, seed=0), sessions(1.0, seed=1)
+    found = fit_fatigue(tires, sessions(0.1, seed=1))
     assert found is not None
     assert (found.length, found.steps) == (3, 4)
     assert found.factor == pytest.approx(0.1, abs=0.03)
-
-
-def test_users_who_do_not_tire_are_not_said_to() -> None:
-    assert fit_fatigue(sessions(1.0, seed=0), sessions(1.0, seed=1)) is None
-    assert fit_fatigue(sessions(0.8, seed=0), sessions(0.8, seed=1)) is None
-
-
-def test_held_out_sessions_must_show_it_too() -> None:
-    tires, not_at_all, few = sessions(0.1, 0), sessions(1.0, 1), sessions(0.1, 1, count=1)
-    assert fit_fatigue(tires, not_at_all) is None
-    assert fit_fatigue(tires, few) is None
+    for held_out in (not_at_all, sessions(0.1, seed=1, count=1)):
+        assert fit_fatigue(tires, held_out) is None
+    for factor in (0.8, 1.0):
+        assert fit_fatigue(sessions(factor, seed=0), sessions(factor, seed=1)) is None
 
 
 def test_users_are_tired_for_so_many_steps_after_a_run() -> None:
@@ -75,9 +69,8 @@ def test_runs_of_a_log_know_nothing_of_the_step_or_later(tmp_path: Path) -> None
 
     def runs(last: float, name: str) -> LoggedRuns:
         rewards = [1.0] * 5 + [last] * 3
-        logged = [
-            Logged(rewards, np.zeros((8, 0), np.float32), items=items.tolist()) for items in given
-        ]
+        nothing = np.zeros((8, 0), np.float32)
+        logged = [Logged(rewards, nothing, items=items.tolist()) for items in given]
         store = write_store(tmp_path / name, logged, some_states(users=1))
         return LoggedRuns.of(store, tags, LAGS, 10_000)
 
@@ -86,11 +79,9 @@ def test_runs_of_a_log_know_nothing_of_the_step_or_later(tmp_path: Path) -> None
     assert torch.equal(liked.runs[steps <= 5], not_liked.runs[steps <= 5])
     assert not torch.equal(liked.runs, not_liked.runs)
     assert not_liked.liked.tolist() == (steps < 5).tolist()
-    for session in range(5):
-        for step in range(8):
-            history = given[session, :step] % 3
-            by_hand = on_end(history, np.ones(step, dtype=bool))
-            assert int(liked.runs[8 * session + step, 0]) == by_hand
+    all_liked = np.ones(8, dtype=bool)
+    by_hand = [on_end(tags[:n], all_liked[:n]) for tags in given % 3 for n in range(8)]
+    assert liked.runs[:, 0].tolist() == by_hand
 
 
 TAGS = MainTags(torch.tensor([0, 0, 1, 1, 2, -1]), 0.0, 2.0)
@@ -99,10 +90,8 @@ steps = st.lists(st.tuples(st.integers(0, 5), st.sampled_from([0.0, 1.0, 1.2, 2.
 
 def shown_of(history: list[tuple[int, float]], reach: int) -> Shown:
     """The last `reach` steps of a session (oldest first), most recent first, padded."""
-    recent = [*history[::-1], *[(-1, 0.0)] * reach][:reach]
-    return Shown(
-        torch.tensor([[item for item, _ in recent]]), torch.tensor([[r for _, r in recent]])
-    )
+    items, rewards = zip(*[*history[::-1], *[(-1, 0.0)] * reach][:reach], strict=True)
+    return Shown(torch.tensor([items]), torch.tensor([rewards]))
 
 
 def run_by_hand(history: list[tuple[int, float]]) -> int:
@@ -124,9 +113,7 @@ def test_runs_are_those_counted_by_hand(history: list[tuple[int, float]]) -> Non
 def test_a_tag_tires_after_a_run_of_it(history: list[tuple[int, float]], run: int) -> None:
     expected = int(TAGS.tags[history[-1][0]]) if run_by_hand(history) >= run else -1
     assert TAGS.find_tired(shown_of(history, 10), run).tolist() == [expected]
-
-
-def test_what_is_not_remembered_tires_nobody() -> None:
+    # What is not remembered tires nobody.
     assert TAGS.find_tired(shown_of([(0, 2.0)] * 3, 3), 4).tolist() == [-1]
 
 

@@ -84,28 +84,19 @@ def test_scores_are_the_sum_of_the_effects_also_of_one_item_alone(tags: bool) ->
 def test_missing_lags_are_steps_before_the_session_and_unknown_users_are_alike() -> None:
     model = planted(tags=True)
     states, shown, _ = asked(4, model.lags + 3)
-    few = Shown(shown.items[:, :4], shown.rewards[:, :4])
-    padded = Shown(
-        F.pad(few.items, (0, model.lags - 4), value=-1), F.pad(few.rewards, (0, model.lags - 4))
-    )
-    most = Shown(shown.items[:, : model.lags], shown.rewards[:, : model.lags])
+    few, most, missing = shown.latest(4), shown.latest(model.lags), (0, model.lags - 4)
+    padded = Shown(F.pad(few.items, missing, value=-1), F.pad(few.rewards, missing))
     assert torch.equal(model.scores(states, few), model.scores(states, padded))
     torch.testing.assert_close(model.scores(states, shown), model.scores(states, most))
     for unknown in (-1, USERS, USERS + 9):
         users = torch.full((4,), unknown)
         assert torch.equal(model.scores(states, few, users), model.scores(states, few))
-
-
-def test_level_is_what_all_items_share() -> None:
-    model = planted(tags=True)
-    states, shown, users = asked(5, model.lags)
-    model.interaction.zero_()
-    model.affinity.zero_()
-    model.exposure.zero_()
-    rest = model.scores(states, shown, users) - model.level(
-        states, users, model.tastes_after(shown)
-    ).unsqueeze(1)
-    torch.testing.assert_close(rest, model.item.expand(5, -1), atol=1e-5, rtol=0)
+    # The level is what all items share.
+    for effects in (model.interaction, model.affinity, model.exposure):
+        effects.zero_()
+    level = model.level(states, None, model.tastes_after(shown)).unsqueeze(1)
+    rest = model.scores(states, shown) - level
+    torch.testing.assert_close(rest, model.item.expand(4, -1), atol=1e-5, rtol=0)
 
 
 def test_expected_rewards_are_in_reward_units() -> None:
@@ -141,7 +132,7 @@ def test_tastes_are_those_of_a_gaussian_process() -> None:
     tastes, vectors = planted_tastes()
     items, targets = sessions(5, 30)
     found = tastes(items, vectors, targets)
-    inputs = (torch.nn.functional.pad(vectors, (1, 0), value=1.0) @ tastes.root).double().numpy()
+    inputs = (F.pad(vectors, (1, 0), value=1.0) @ tastes.root).double().numpy()
     for row in range(5):
         shown = items[row][items[row] >= 0]
         unusual = (targets[row][items[row] >= 0] - tastes.usual[shown]).double().numpy()
@@ -158,12 +149,10 @@ def test_neither_order_nor_padding_matters(length: int, seed: int) -> None:
     tastes, vectors = planted_tastes()
     items, targets = sessions(3, length, seed)
     order = torch.randperm(length, generator=torch.Generator().manual_seed(seed))
-    padding = torch.nn.functional.pad
     found = tastes(items, vectors, targets)
-    for other in (
-        tastes(items[:, order], vectors, targets[:, order]),
-        tastes(padding(items, (2, 3), value=-1), vectors, padding(targets, (2, 3), value=9.0)),
-    ):
+    ordered = tastes(items[:, order], vectors, targets[:, order])
+    padded = tastes(F.pad(items, (2, 3), value=-1), vectors, F.pad(targets, (2, 3), value=9.0))
+    for other in (ordered, padded):
         torch.testing.assert_close(other, found, rtol=1e-4, atol=1e-4)
 
 
@@ -196,14 +185,12 @@ def test_the_root_is_of_how_users_differ(users: int) -> None:
     drawn = torch.from_numpy(rng.normal(size=(users, SIZE + 1)) @ spread).float()
     vectors = torch.from_numpy(rng.normal(size=(400, SIZE))).float()
     root = root_of_tastes(drawn, vectors)
-    inputs = torch.nn.functional.pad(vectors, (1, 0), value=1.0)
+    inputs = F.pad(vectors, (1, 0), value=1.0)
     assert float((inputs @ root).square().sum(1).mean()) == pytest.approx(1.0, rel=1e-4)
     if users == 500:
-        variances = (root @ root.T).diagonal()
-        expected = torch.tensor([0.01, 4.0, 1.0, 0.25])
-        torch.testing.assert_close(
-            variances / variances.sum(), expected / expected.sum(), rtol=0.2, atol=0.01
-        )
+        variances, expected = (root @ root.T).diagonal(), torch.tensor([0.01, 4.0, 1.0, 0.25])
+        shares = expected / expected.sum()
+        torch.testing.assert_close(variances / variances.sum(), shares, rtol=0.2, atol=0.01)
 
 
 def test_users_who_differ_in_one_direction_have_a_root() -> None:

@@ -40,27 +40,24 @@ def design(rows: int, binary: bool, items: int = 12, users: int = 9) -> Design:
 
 def matrix(given: Design, name: str) -> sparse.csr_matrix:
     """What every number of an effect multiplies, row by row."""
-    count = len(given.items)
-    if name in ("item", "user"):
-        columns = (given.items if name == "item" else given.users).numpy()
-        shape = (count, len(given.zeros(name)))
-        return sparse.csr_matrix((np.ones(count), (np.arange(count), columns)), shape=shape)
-    if name == "content":
-        tags = torch.stack([(given.tags == tag).sum(1) for tag in range(given.n_tags)], 1)
-        return sparse.csr_matrix(torch.cat([tags[given.items].float(), given.rows], 1).numpy())
-    if name == "affinity":
-        of_users = torch.nn.functional.one_hot(given.users, given.n_users + 1).float()
-        return sparse.csr_matrix(_products(of_users, given.rows).numpy())
-    if name == "context":
-        return sparse.csr_matrix(_products(given.observed, given.rows).numpy())
-    if name == "interaction":
-        return sparse.csr_matrix(_products(given.x, given.rows).numpy())
-    columns = {"exposure": given.exposure, "state": given.x, "tastes": given.tastes.unsqueeze(1)}
-    return sparse.csr_matrix(columns[name].numpy())
+    users = torch.nn.functional.one_hot(given.users, given.n_users + 1).float()
+    tags = torch.stack([(given.tags == tag).sum(1) for tag in range(given.n_tags)], 1)
 
+    def times_vectors(left: Tensor) -> Tensor:
+        return torch.einsum("ma,mb->mab", left, given.rows).flatten(1)
 
-def _products(left: Tensor, right: Tensor) -> Tensor:
-    return torch.einsum("ma,mb->mab", left, right).flatten(1)
+    columns = {
+        "item": torch.nn.functional.one_hot(given.items, len(given.vectors)).float(),
+        "user": users,
+        "content": torch.cat([tags[given.items].float(), given.rows], 1),
+        "affinity": times_vectors(users),
+        "tastes": given.tastes.unsqueeze(1),
+        "exposure": given.exposure,
+        "context": times_vectors(given.observed),
+        "state": given.x,
+        "interaction": times_vectors(given.x),
+    }
+    return sparse.csr_matrix(columns[name].double().numpy())
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -84,15 +81,12 @@ def test_effects_are_fitted_jointly_and_a_start_changes_nothing() -> None:
     given = design(800, binary=True)
     spreads = dict.fromkeys(EFFECTS, 0.5)
     alone = fit_effects(given, {}, spreads)
-    inputs = sparse.hstack(
-        [matrix(given, name) * given.penalty(name, 0.5) ** -0.5 for name in EFFECTS]
-    )
+    parts = [matrix(given, name) * given.penalty(name, 0.5) ** -0.5 for name in EFFECTS]
+    inputs = sparse.hstack(parts)
     reference = LogisticRegression(C=1.0, tol=1e-8, max_iter=10_000)
     reference.fit(inputs.tocsr(), given.target.numpy())
     expected = inputs @ reference.coef_.ravel() + reference.intercept_
     np.testing.assert_allclose(given.predictor(alone).numpy(), expected, atol=0.05)
     start = {name: torch.randn(given.zeros(name).shape) for name in EFFECTS}
-    other = fit_effects(given, start, spreads)
-    np.testing.assert_allclose(
-        given.predictor(other).numpy(), given.predictor(alone).numpy(), atol=0.05
-    )
+    other = given.predictor(fit_effects(given, start, spreads))
+    np.testing.assert_allclose(other.numpy(), given.predictor(alone).numpy(), atol=0.05)

@@ -17,14 +17,14 @@ from torch import Tensor
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule, best_items
 from ucfrec.acting.scorer import Query, Scorer, sessions_before
-from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
+from ucfrec.arrays import BoolArray, Float64Array, IntArray
 from ucfrec.choosing.choice import Evidence, Problem, RankedRule, RuleChoice
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, seen_before
 from ucfrec.processes import progress
 from ucfrec.results.statistics import effective_number
-from ucfrec.user_model.reward_report import draw_steps
+from ucfrec.user_model.reward_report import draw_steps, number_users, read_propensities
 
 SHOWN = 10
 """Items that a rule shows at a step."""
@@ -50,19 +50,12 @@ class LoggedScores:
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
     ) -> None:
         self.view, self.episodes, self.steps = view, episodes, steps
-        self.items = self.read(schema.ITEM).astype(np.int64)
+        self.items = view.step_values(schema.ITEM, episodes, steps).astype(np.int64)
         """(M,) logged."""
-        self.liked = liked_rewards(view, self.read(schema.REWARD))
+        self.liked = liked_rewards(view, view.step_values(schema.REWARD, episodes, steps))
         """(M,) bool."""
-        owners = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
-        self.owners = owners.astype(np.int64)
-        """(E,) users of the episodes; the episodes, where users are not named."""
         self._scorer = scorer
         self._queries: dict[tuple[object, ...], Query] = {}
-
-    def read(self, column: str) -> Array:
-        """(M,) values of the steps."""
-        return self.view.step_values(column, self.episodes, self.steps)
 
     @torch.no_grad()
     def score(self, rules: Sequence[DecisionRule]) -> Iterator[tuple[slice, list[Tensor]]]:
@@ -102,12 +95,9 @@ class LoggedEvidence:
         view = view.select(np.sort(order[: last + 1]))
         episodes, steps = view.all_steps()
         self._logged = LoggedScores(scorer, view, episodes, steps)
-        self.propensities: Float64Array | None = None
+        self.propensities = read_propensities(view, episodes, steps)
         """(M,) if all steps have one."""
-        if schema.PROPENSITY in view.record.columns:
-            propensities = self._logged.read(schema.PROPENSITY).astype(np.float64)
-            self.propensities = propensities if (propensities > 0).all() else None
-        self._users = np.unique(self._logged.owners, return_inverse=True)[1]
+        self._users = np.unique(number_users(view), return_inverse=True)[1]
         self.n_users = int(self._users.max(initial=-1)) + 1
 
     def evaluate(self, rules: Sequence[DecisionRule]) -> list[Evidence]:
@@ -156,7 +146,7 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
     most = int(np.clip(_SCORES / n_items, _FEWEST_STEPS, _MOST_STEPS))
     episodes, steps = draw_steps(validation, most, problem.seed)
     logged = LoggedScores(scorer, validation, episodes, steps)
-    users, candidates = logged.owners[logged.episodes], list[_Candidate]()
+    users, candidates = number_users(validation)[episodes], list[_Candidate]()
     most_liked = TrainingCounts.of(train).liked.topk(min(SHOWN, n_items)).indices.numpy()
     baseline = np.isin(logged.items, most_liked)
     counts = TrainingCounts.of(validation)
@@ -245,8 +235,6 @@ class _Candidate:
 
     def _error_of_sum(self, values: Float64Array) -> float:
         """Standard error of the sum of values (M,) of mean 0, whose rows depend within users."""
-        if not len(values):
-            return 0.0
         return float(np.sqrt(np.square(np.bincount(self.users, values)).sum()))
 
 

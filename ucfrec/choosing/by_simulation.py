@@ -24,18 +24,13 @@ from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.choosing.by_ranking import LoggedEvidence
-from ucfrec.choosing.choice import (
-    Problem,
-    RuleChoice,
-    SimulatedRule,
-    ValueEstimate,
-)
+from ucfrec.choosing.choice import Problem, RuleChoice, SimulatedRule, ValueEstimate
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Sessions, Windows
 from ucfrec.processes import progress
 from ucfrec.user_model.model import UserModel, UserSimulator, longest_session
 from ucfrec.user_model.reward_fit import draw_sessions
-from ucfrec.user_model.reward_report import halve_users
+from ucfrec.user_model.reward_report import number_users
 
 _LOGGED_STEPS: Final = 10_000, 1000
 """Logged steps that evidence is from: where it decides what is allowed, and elsewhere."""
@@ -170,9 +165,8 @@ class RuleSearch:
             return []
         n = times * self._config.sessions
         first = n // _FIRST_PART if n >= _FIRST_PART * _FEWEST else n
-        sessions = self._roll_out(rules, self._store, first, self.problem.seed)
-        self._sessions |= sessions
-        candidates = [self._summarise(rule, outcomes) for rule, outcomes in sessions.items()]
+        self._sessions |= self._roll_out(rules, self._store, first, self.problem.seed)
+        candidates = [self._summarise(rule) for rule in rules]
         if 0 < self.least_users < self._many.n_users:
             candidates = self._add_evidence(candidates)
         return candidates if first == n else self._simulate_rest(candidates, n - first)
@@ -189,12 +183,12 @@ class RuleSearch:
         first = len(self._sessions[top.rule].returns)
         store = self._store.select(np.roll(np.arange(self._store.n_episodes), -first))
         more = self._roll_out(near, store, n, self.problem.seed + _SEED_OF_REST)
-        whole = {rule: self._sessions[rule].append(outcomes) for rule, outcomes in more.items()}
-        self._sessions |= whole
-        best, results = self._summarise(top.rule, whole[top.rule]), list[SimulatedRule]()
+        for rule, outcomes in more.items():
+            self._sessions[rule] = self._sessions[rule].append(outcomes)
+        best, results = self._summarise(top.rule), list[SimulatedRule]()
         for candidate in candidates:
-            if candidate.rule in whole:
-                result = self._summarise(candidate.rule, whole[candidate.rule])
+            if candidate.rule in more:
+                result = self._summarise(candidate.rule)
                 results.append(replace(result, evidence=candidate.evidence))
                 continue
             error = math.hypot(best.error, self._error(top, candidate))
@@ -206,14 +200,11 @@ class RuleSearch:
         """The rules with evidence: of many sessions where it decides, and no lookahead is slow."""
         slow = [item for item in candidates if item.rule.looks_ahead or not self.least_users]
         fast = [item for item in candidates if item not in slow]
-        return [
-            replace(candidate, evidence=evidence)
-            for logged, part in ((self._many, fast), (self._few, slow))
-            if part
-            for candidate, evidence in zip(
-                part, logged.evaluate([item.rule for item in part]), strict=True
-            )
-        ]
+        found = list[SimulatedRule]()
+        for logged, part in ((self._many, fast), (self._few, slow)):
+            evidence = logged.evaluate([item.rule for item in part]) if part else []
+            found += map(lambda item, of_it: replace(item, evidence=of_it), part, evidence)
+        return found
 
     def _roll_out(
         self,
@@ -225,9 +216,8 @@ class RuleSearch:
     ) -> dict[DecisionRule, Outcomes]:
         """Simulate `n` sessions of each rule that begin as a store's, with draws of its own."""
         scorers = [self.problem.scorer.under(rule) for rule in rules]
-        simulator = UserSimulator(
-            users or self.users, store, n, self._longest, seed, times=len(rules)
-        )
+        users = users or self.users
+        simulator = UserSimulator(users, store, n, self._longest, seed, len(rules))
         actor = _ManyRules(scorers, n, store, seed)
         live = np.arange(len(rules) * n)
         returns, lengths = np.zeros(len(live)), np.zeros(len(live), dtype=np.int64)
@@ -246,13 +236,14 @@ class RuleSearch:
                     live = live[going]
                     actor.keep(going)
         numbers, items = np.concatenate(decisions).T
-        parts = [slice(number * n, (number + 1) * n) for number in range(len(rules))]
-        return {
-            rule: Outcomes(returns[part], lengths[part], items[numbers // n == number])
-            for number, (rule, part) in enumerate(zip(rules, parts, strict=True))
-        }
+        outcomes = dict[DecisionRule, Outcomes]()
+        for number, rule in enumerate(rules):
+            part = slice(number * n, (number + 1) * n)
+            outcomes[rule] = Outcomes(returns[part], lengths[part], items[numbers // n == number])
+        return outcomes
 
-    def _summarise(self, rule: DecisionRule, sessions: Outcomes) -> SimulatedRule:
+    def _summarise(self, rule: DecisionRule) -> SimulatedRule:
+        sessions = self._sessions[rule]
         shares = np.bincount(sessions.items) / len(sessions.items)
         shares = shares[shares > 0]
         return SimulatedRule(
@@ -271,11 +262,10 @@ class RuleSearch:
 
     def is_allowed(self, candidate: SimulatedRule) -> bool:
         """Whether the log supports what the candidate did, and can evaluate it."""
-        evidence = candidate.evidence
-        if not self.least_users or evidence is None:
-            return self.is_supported(candidate) and not self.least_users
-        enough = candidate.effective_users >= self.least_users and evidence.spread <= _WIDEST
-        return self.is_supported(candidate) and enough
+        if not self.least_users or not self.is_supported(candidate):
+            return self.is_supported(candidate)
+        evidence, enough = candidate.evidence, candidate.effective_users >= self.least_users
+        return evidence is not None and enough and evidence.spread <= _WIDEST
 
     def _select_allowed(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         allowed = [candidate for candidate in candidates if self.is_allowed(candidate)]
@@ -296,15 +286,14 @@ class RuleSearch:
         rule that the choice starts from, or the one with the most effective items."""
         allowed = self._select_allowed(candidates)
         if not allowed:
-            most_varied = max(candidates, key=lambda candidate: candidate.items)
-            return self._find_start(candidates) or [most_varied]
+            return self._find_start(candidates) or [max(candidates, key=attrgetter("items"))]
         top = max(allowed, key=_value)
         least = self._config.tolerance * abs(top.value)
-        return [
-            candidate
-            for candidate in allowed
-            if top.value - candidate.value <= max(least, self._error(top, candidate))
-        ]
+
+        def is_level(item: SimulatedRule) -> bool:
+            return top.value - item.value <= max(least, self._error(top, item))
+
+        return [*filter(is_level, allowed)]
 
     def _find_start(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
         return [candidate for candidate in candidates if candidate.rule == self.problem.start]
@@ -325,8 +314,8 @@ class RuleSearch:
         they differ by a percentage point; then the simplest. A handful of users is no evidence."""
         level = self.level(candidates)
         level = self._find_start(level) or level
-        complete = [candidate for candidate in level if candidate.evidence is not None]
         unknown = [candidate for candidate in level if candidate.evidence is None]
+        complete = [candidate for candidate in level if candidate not in unknown]
 
         def rank(candidate: SimulatedRule) -> tuple[float, ...]:
             evidence, users = candidate.evidence, candidate.effective_users
@@ -342,13 +331,12 @@ class RuleSearch:
         """Whether the chosen rule is level with the best allowed one in either half of users."""
         own_returns = self._sessions[chosen.rule].returns
         n = len(own_returns)
-        half = halve_users(self._store)[np.arange(n) % len(self._store)]
+        half = number_users(self._store)[np.arange(n) % len(self._store)] % 2
         allowed = {item.rule for item in candidates if self.is_allowed(item)} | {chosen.rule}
         returns = [self._sessions[rule].returns[:n] for rule in allowed]
-        returns = [values for values in returns if len(values) == n]
 
         def agrees(rows: Any) -> bool:
-            top = max((values[rows] for values in returns), key=np.sum)
+            top = max((values[rows] for values in returns if len(values) == n), key=np.sum)
             if len(top) < _FEWEST:
                 return True
             mean, error = float(top.mean()), _standard_error(top - own_returns[rows])
@@ -361,12 +349,10 @@ class RuleSearch:
         """The return of a session under a rule, in sessions that did not choose it: those of either
         half of the users, with its own calibration; more where their standard error is large."""
         halves = [self._roll_half(rule, number) for number in (0, 1)]
-        returns = np.concatenate([half.returns for half in halves])
+        returns = halves[0].append(halves[1]).returns
         if _standard_error(returns) > _LARGEST_ERROR * abs(returns.mean()):
-            halves = [
-                half.append(self._roll_half(rule, number, part=1))
-                for number, half in enumerate(halves)
-            ]
+            more = [self._roll_half(rule, number, part=1) for number in (0, 1)]
+            halves = [half.append(others) for half, others in zip(halves, more, strict=True)]
         values = float(halves[0].returns.mean()), float(halves[1].returns.mean())
         value = sum(values) / 2
         first, second = (_standard_error(half.returns) for half in halves)
@@ -389,33 +375,29 @@ class RuleSearch:
 
     def _roll_half(self, rule: DecisionRule, number: int, part: int = 0) -> Outcomes:
         """Sessions of one half of the users, with its own calibration; each part has others."""
-        half, n = halve_users(self._store), self._config.sessions
-        episodes = np.flatnonzero(half == number)
-        episodes = episodes if len(episodes) else np.arange(len(half))
+        users, n = number_users(self._store), self._config.sessions
+        episodes = np.flatnonzero(users % 2 == number)
+        episodes = episodes if len(episodes) else np.arange(len(users))
         store = self._store.select(np.roll(episodes, -(n // 2 + part * n)))
-        users, report = self.users, self.users.calibration_report
+        model, report = self.users, self.users.calibration_report
         if report is not None:
-            users = replace(users, calibration=report.halves[number])
+            model = replace(model, calibration=report.halves[number])
         seed = self.problem.seed + 1 + number + part * _SEED_OF_REST
-        return self._roll_out([rule], store, n, seed, users)[rule]
+        return self._roll_out([rule], store, n, seed, model)[rule]
 
 
 def choose_by_simulation(problem: Problem) -> RuleChoice:
-    """Choose target, minimum target and temperature, then the reward weight.
+    """Choose target, minimum target and temperature, then the reward weight, and what
+    `_search_all` tries next; or, with a rule to start from, among that rule and its neighbours.
 
-    Where items have tags, tag window and temperature follow, and the reward weight with the window;
-    where the log shows fatigue, the tag run, and temperature and reward weight with it. Where the
-    log has propensities, rules that stay near it follow. For new users, the rules of the highest
-    value are then simulated in more sessions. Of rules that the model cannot distinguish, the one
-    with the most support in the log is taken.
-
-    With a rule to start from, the candidates are that rule and its neighbours instead, and it stays
-    unless one of them is better.
+    For new users, the rules of the highest value are then simulated in more sessions. Of rules that
+    the model cannot distinguish, the one with the most support in the log is taken.
     """
-    search = RuleSearch(problem)
+    search, where = RuleSearch(problem), ""
     if problem.start is None:
         candidates = _search_all(search)
     else:
+        where = "; only rules near that of an earlier run"
         more = _NEAR_THE_LOG if search.least_users else ()
         rules = find_neighbours(problem.start, problem, more)
         candidates = search.simulate([*dict.fromkeys(rules)])
@@ -426,7 +408,6 @@ def choose_by_simulation(problem: Problem) -> RuleChoice:
         candidates = [*(item for item in candidates if item.rule not in again), *finalists]
     best = search.most_evident(finalists)
     agree, estimate = search.halves_agree(best, finalists), search.estimate(best.rule)
-    where = "" if problem.start is None else "; only rules near that of an earlier run"
     return RuleChoice(
         rule=best.rule,
         chosen_by=_describe_choice(search.users) + where,
@@ -451,7 +432,7 @@ def _describe_choice(users: UserModel) -> str:
     report, calibration = users.training_users.report, users.calibration_report
     whose = "new users" if users.reward_report.new_users else "validation users"
     weights = "weighted by their propensities" if report.weighted else "without weights"
-    if calibration is not None and calibration.weighted:
+    if calibration and calibration.weighted:
         weights += ", and calibrated by propensities"
     return (
         f"mean return of sessions of {whose}, who have the fixed tastes of training users; these "
@@ -460,35 +441,36 @@ def _describe_choice(users: UserModel) -> str:
 
 
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
+    """Rules of all kinds that the log can tell of, each beside the best of those before."""
     problem, config = search.problem, search.problem.config
     candidates = search.simulate([*_list_unweighted(problem)])
     first = search.best(candidates).rule
-    candidates += search.simulate([*_vary(first, reward_weight=config.reward_weights)])
+    candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
     second = search.best(candidates).rule
     if search.users.session_end_report.kept != "constant":
         # More than randomness ends sessions.
         grid = {"reward_weight": config.lookahead_weights, "policy_weight": config.policy_weights}
-        candidates += search.simulate([*_vary(second, lookahead=_lookaheads(problem), **grid)])
+        candidates += search.simulate(_vary(second, lookahead=_lookaheads(problem), **grid))
     if problem.validation.item_states.tags.shape[1]:
         longest, temperatures = problem.scorer.known, config.temperatures
         windows = [window for window in config.tag_windows if 0 < window <= longest]
         # At all temperatures: at a low one, the log may support what the policy shows only once
         # some items are excluded.
-        rules = search.simulate([*_vary(second, temperature=temperatures, tag_window=windows)])
+        rules = search.simulate(_vary(second, temperature=temperatures, tag_window=windows))
         candidates += rules
         if rules:
             best = search.best(rules).rule
             weights = [weight for weight in config.reward_weights if weight != best.reward_weight]
             more = _vary(best, tag_window=sorted({*windows}), reward_weight=weights)
-            candidates += search.simulate([*more])
+            candidates += search.simulate(more)
         # Without a tag window, which may only have served to cause no fatigue.
         runs = [run for run in config.tag_runs if run] if search.users.fatigue else []
-        rules = search.simulate([*_vary(second, tag_run=runs)])
+        rules = search.simulate(_vary(second, tag_run=runs))
         candidates += rules
         if rules:
-            best, weights = search.best(rules).rule, [*config.reward_weights]
-            more = _vary(best, temperature=temperatures, reward_weight=weights)
-            candidates += search.simulate([*more])
+            best = search.best(rules).rule
+            more = _vary(best, temperature=temperatures, reward_weight=config.reward_weights)
+            candidates += search.simulate(more)
     if search.least_users:
         done = {candidate.rule for candidate in candidates}
         near = [rule for grid in _NEAR_THE_LOG for rule in _vary(first, **grid)]
@@ -526,11 +508,12 @@ def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
             yield DecisionRule(None, temperature=temperature)
 
 
-def _vary(rule: DecisionRule, **values: Sequence[Any]) -> Iterator[DecisionRule]:
-    for combination in product(*values.values()):
-        variant = replace(rule, **dict(zip(values, combination, strict=True)))
-        if variant != rule:
-            yield variant
+def _vary(rule: DecisionRule, **values: Sequence[Any]) -> list[DecisionRule]:
+    """The rule's variants with every combination of some values of its parts."""
+    variants = [rule]
+    for name, candidates in values.items():
+        variants = [replace(of, **{name: value}) for of in variants for value in candidates]
+    return [variant for variant in variants if variant != rule]
 
 
 def _lookaheads(problem: Problem) -> list[float]:
@@ -543,11 +526,8 @@ def find_neighbours(
     rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
 ) -> Iterator[DecisionRule]:
     """The rule, rules with another target, and those with another of its numbers one candidate up
-    or down, among those of the configuration and `more`.
-
-    A rule without lookahead also gets one, with the middle weight of the policy, and loses it with
-    the middle reward weight.
-    """
+    or down, among those of the configuration and `more`. A rule without lookahead also gets one,
+    with the middle weight of the policy; one with it loses it, with the middle reward weight."""
     config, policy = problem.config, problem.scorer.policy
     yield rule
     for target in dict.fromkeys(problem.targets.values()):
@@ -555,13 +535,16 @@ def find_neighbours(
         yield replace(rule, target=target, minimum_target=target)
     if policy.values is not None and policy.config.max_return:
         yield replace(rule, target=None, minimum_target=None)
-    grid: dict[str, Sequence[float]] = {
-        name: [*getattr(config, f"{name}s"), *(value for part in more for value in part[name])]
-        for name in ("temperature", "reward_weight")
+    grid: dict[str, list[float]] = {
+        "temperature": [*config.temperatures],
+        "reward_weight": [*config.reward_weights],
     }
+    for part in more:
+        for name, values in grid.items():
+            values += part[name]
     if rule.looks_ahead:
-        grid |= {"lookahead": _lookaheads(problem), "policy_weight": config.policy_weights}
-        grid["reward_weight"] = config.lookahead_weights
+        grid |= {"lookahead": _lookaheads(problem), "policy_weight": [*config.policy_weights]}
+        grid["reward_weight"] = [*config.lookahead_weights]
         weight = _middle(config.reward_weights)
         yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
     elif problem.users.session_end_report.kept != "constant":
@@ -576,8 +559,9 @@ def find_neighbours(
         value = getattr(rule, name)
         smaller = [candidate for candidate in values if candidate < value]
         larger = [candidate for candidate in values if candidate > value]
-        nearest: list[Any] = [*sorted(smaller)[-1:], *sorted(larger)[:1]]
-        yield from (replace(rule, **{name: neighbour}) for neighbour in nearest)
+        for neighbour in (*sorted(smaller)[-1:], *sorted(larger)[:1]):
+            changed: dict[str, Any] = {name: neighbour}
+            yield replace(rule, **changed)
 
 
 def _middle(values: Sequence[float]) -> float:

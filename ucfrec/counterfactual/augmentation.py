@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Final
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ucfrec import schema
-from ucfrec.arrays import Array, Float32Array, IntArray
+from ucfrec.arrays import Array, BoolArray, Float32Array, IntArray
 from ucfrec.counterfactual.generators import (
     ActionSupport,
     CSGConfig,
@@ -56,9 +56,12 @@ _CHUNK, _ACTION_CHUNK = 8192, 4096
 _ACTION_STREAM = 1
 """Keeps the draws of actions apart from others with the same seed."""
 _DELTA_LEVEL = "0.95"
-_ROUNDING = 1e-9
+_LESS = 1 - 1e-9
+"""Of a gate, so that rounding opens none."""
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _BINS = 20
+_Edits = tuple[IntArray, IntArray, IntArray, Float32Array]
+"""M accepted edits: position of the episode in the view, copy, step, state (M, S)."""
 
 
 @settings_table("augment")
@@ -264,14 +267,15 @@ def edit_states(
             proposed = generator.propose(s, a, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
             factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
-            gates = (epsilon_r * (1 - _ROUNDING), rho_high * (1 - _ROUNDING))
-            passed = accept(exact, factual, z, proposed.double(), *gates)
+            passed = accept(
+                exact, factual, z, proposed.double(), epsilon_r * _LESS, rho_high * _LESS
+            )
             moves.add(exact.moves(s[passed], proposed[passed].double()).cpu())
             accepted[rows] = passed.cpu().numpy()
             states.append(proposed[passed].cpu().numpy())
         moves.proposals += len(steps)
         copies = np.full(int(accepted.sum()), number)
-        return _Edits(episodes[accepted], copies, steps[accepted], np.concatenate(states))
+        return episodes[accepted], copies, steps[accepted], np.concatenate(states)
 
     episodes, steps = find_candidates(view, config, rng)
     if config.edits_per_copy:
@@ -279,27 +283,18 @@ def edit_states(
     else:
         rounds = [edit(episodes, steps, number) for number in range(config.copies)]
     rounds.append(edit(episodes[:0], steps[:0]))
-    edits = _Edits(*(np.concatenate(column) for column in zip(*rounds, strict=True)))
+    edited, numbers, at, states = map(np.concatenate, zip(*rounds, strict=True))
     copies = max(config.copies, 1)
-    copy_keys, edit_copy = np.unique(edits.episode * copies + edits.copy, return_inverse=True)
-    order = np.lexsort((edits.step, edit_copy))
+    copy_keys, edit_copy = np.unique(edited * copies + numbers, return_inverse=True)
+    order = np.lexsort((at, edit_copy))
     augmented = AugmentedEpisodes(
         copy_source=view.episode_ids[copy_keys // copies],
         edit_copy=edit_copy[order],
-        edit_step=edits.step[order],
-        edit_state=edits.state[order],
+        edit_step=at[order],
+        edit_state=states[order],
     )
     report = moves.report(rho_high, int((crm.state_std > 0).sum()))
     return augmented, _report(len(copy_keys), moves.proposals, report, epsilon_r, crm_report)
-
-
-class _Edits(NamedTuple):
-    """M accepted edits: position of the episode in the view, copy, step, state (M, S)."""
-
-    episode: IntArray
-    copy: IntArray
-    step: IntArray
-    state: Float32Array
 
 
 def accept(
@@ -345,11 +340,11 @@ def _fill_copies(
         if not new_proposals.any():
             return
         rows = order[_ranges(first + proposed, new_proposals)]
-        edits = edit(episodes[rows], steps[rows])
-        index = np.searchsorted(unique_episodes, edits.episode)
+        edited, _, at, states = edit(episodes[rows], steps[rows])
+        index = np.searchsorted(unique_episodes, edited)
         new_edits = np.bincount(index, minlength=len(counts))
         number = _ranges(accepted, new_edits)
-        yield edits._replace(copy=number // config.edits_per_copy)
+        yield edited, number // config.edits_per_copy, at, states
         proposed, accepted = proposed + new_proposals, accepted + new_edits
 
 
@@ -436,27 +431,21 @@ def _report(
     )
 
 
-def interventions(
-    view: EpisodeStore, dimensions: Sequence[int], seed: int, copies: int = 2
-) -> AugmentedEpisodes:
-    """Copies of every episode of `view` under do(d ~ marginal), d being `dimensions`: values are
-    drawn, jointly, from its steps, for copies 0, 2, … once an episode, otherwise at every step."""
+def interventions(view: EpisodeStore, dimensions: Sequence[int], seed: int) -> AugmentedEpisodes:
+    """Two copies of every episode of `view` under do(d ~ marginal), d being `dimensions`: values
+    are drawn, jointly, from its steps, for the first copy once an episode, then at every step."""
     rng = np.random.default_rng(seed)
     episodes, steps = view.all_steps()
     states = view.windows(episodes, steps, 1).states[:, 0].numpy()
-    edited = []
-    for copy_number in range(copies):
-        sources = rng.integers(len(steps), size=view.n_episodes)[episodes]
-        if copy_number % 2:
-            sources = rng.integers(len(steps), size=len(steps))
-        changed = states.copy()
-        changed[:, list(dimensions)] = states[sources][:, list(dimensions)]
-        edited.append(changed)
-    numbers = np.arange(copies)[:, None] * view.n_episodes + episodes
+    once, _ = rng.integers(len(steps), size=(2, view.n_episodes))
+    always = rng.integers(len(steps), size=len(steps))
+    edited, columns = np.stack([states, states]), list(dimensions)
+    edited[0][:, columns] = states[once[episodes]][:, columns]
+    edited[1][:, columns] = states[always][:, columns]
     return AugmentedEpisodes(
-        copy_source=np.tile(view.episode_ids, copies),
-        edit_copy=numbers.reshape(-1),
-        edit_step=np.tile(steps, copies),
+        copy_source=np.tile(view.episode_ids, 2),
+        edit_copy=np.concatenate([episodes, episodes + view.n_episodes]),
+        edit_step=np.tile(steps, 2),
         edit_state=np.concatenate(edited),
     )
 
@@ -492,31 +481,36 @@ class ActionGenerator:
         Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
         """
         # In float64, so that a later check confirms what passes.
-        exact = copy.deepcopy(self.crm).double()
+        view, exact = self.view, copy.deepcopy(self.crm).double()
         rng = np.random.default_rng([seed, _ACTION_STREAM])
         chunks = []
         for start in range(0, max(1, len(steps)), _ACTION_CHUNK):
             part = slice(start, start + _ACTION_CHUNK)
-            chunks.append(self._predict(exact, episodes[part], steps[part], count, rng))
-        proposed = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
-        logged_rewards = self.view.column(schema.REWARD)
-        low, high = logged_rewards.min(), logged_rewards.max()
-        reward = proposed["reward"].clip(low, high).astype(np.float32)
-        change = reward - proposed["logged"]
-        accepted = proposed["reproduced"] & (np.abs(change) > self.delta)
+            drawn, *rest = self._predict(exact, episodes[part], steps[part], count, rng)
+            chunks.append((drawn + start, *rest))
+        rows, actions, predicted, reproduced = map(np.concatenate, zip(*chunks, strict=True))
+        logged_rewards = view.column(schema.REWARD)
+        reward = predicted.clip(logged_rewards.min(), logged_rewards.max()).astype(np.float32)
+        logged = view.step_values(schema.REWARD, episodes[rows], steps[rows])
+        change = reward - logged.astype(np.float64)
+        accepted = reproduced & (np.abs(change) > self.delta)
+        change, copied = change[accepted], rows[accepted]
         report = ActionReport(
-            proposals=len(accepted),
-            reproduced=float(proposed["reproduced"].mean()) if len(accepted) else 0.0,
-            copies=int(accepted.sum()),
-            mean_change=float(change[accepted].mean()) if accepted.any() else 0.0,
-            earns_more=float((change[accepted] > 0).mean()) if accepted.any() else 0.0,
+            proposals=len(rows),
+            reproduced=float(reproduced.mean()) if len(rows) else 0.0,
+            copies=len(change),
+            mean_change=float(change.mean()) if len(change) else 0.0,
+            earns_more=float((change > 0).mean()) if len(change) else 0.0,
         )
-        none = np.zeros(0, dtype=np.int64)
+        none, no_states = np.zeros(0, dtype=np.int64), np.zeros((0, view.state_size), np.float32)
         copies = AugmentedEpisodes(
-            *(none, none, none, np.zeros((0, self.view.state_size), dtype=np.float32)),
-            action_source=self.view.episode_ids[proposed["episode"][accepted]],
-            action_step=proposed["step"][accepted],
-            action=proposed["action"][accepted],
+            copy_source=none,
+            edit_copy=none,
+            edit_step=none,
+            edit_state=no_states,
+            action_source=view.episode_ids[episodes[copied]],
+            action_step=steps[copied],
+            action=actions[accepted],
             action_reward=reward[accepted],
         )
         return copies, report
@@ -529,9 +523,9 @@ class ActionGenerator:
         steps: IntArray,
         count: int,
         rng: np.random.Generator,
-    ) -> dict[str, Any]:
-        """Draw N other actions: `episode`, `step`, `action`, its predicted `reward`, the `logged`
-        reward, and whether the reward model has `reproduced` that."""
+    ) -> tuple[IntArray, Array, Array, BoolArray]:
+        """Draw other actions at some of the steps: their numbers, the actions, predicted rewards,
+        and whether the model reproduces the logged reward."""
         factual = read_transitions(self.view, episodes, steps, self.item_rewards)
         factual = factual.to(self.crm.device)
         s, a, r = (values.double() for values in (factual.states, factual.actions, factual.rewards))
@@ -548,14 +542,8 @@ class ActionGenerator:
             self.view, episodes[rows], steps[rows], self.item_rewards, actions
         )
         at = torch.from_numpy(rows).to(s.device)
-        return {
-            "episode": episodes[rows],
-            "step": steps[rows],
-            "action": actions,
-            "reward": exact.predict(s[at], changed.actions.to(s), z[at]).cpu().numpy(),
-            "logged": r.cpu().numpy()[rows],
-            "reproduced": reproduced[rows],
-        }
+        predicted = exact.predict(s[at], changed.actions.to(s), z[at])
+        return rows, actions, predicted.cpu().numpy(), reproduced[rows]
 
 
 def read_actions(view: EpisodeStore, episodes: IntArray, steps: IntArray) -> Array:

@@ -1,5 +1,6 @@
 """Clusters of states, and generators: they propose other states with the same predicted reward."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,10 +94,6 @@ class StateClusters:
             covariances[cluster] = (squares + size * whole) / (rows + size)
         return cls(centres, covariances)
 
-    def to(self, device: torch.device) -> "StateClusters":
-        """The clusters on `device`."""
-        return StateClusters(self.centres.to(device), self.covariances.to(device))
-
     def nearest(self, states: Tensor) -> Tensor:
         """(B,) cluster whose centre is nearest to each of the normalised states (B, S)."""
         return torch.cdist(states, self.centres).argmin(dim=1)
@@ -108,19 +105,15 @@ class ActionSupport:
     def __init__(self, labels: IntArray, actions: Array) -> None:
         """Of M logged steps: clusters (M,) of their states, and items (M,) or vectors (M, A)."""
         order = np.argsort(labels, kind="stable")
-        self._actions = actions[order]
-        self._counts = np.bincount(labels)
-        self._starts = np.cumsum(self._counts) - self._counts
+        self._labels, self._actions = labels[order], actions[order]
 
     def draw(self, labels: IntArray, generator: np.random.Generator) -> tuple[Array, BoolArray]:
         """The action of a random logged step of each of B clusters, (B,) or (B, A); and (B,)
         whether the cluster has a logged step at all, without which the action means nothing."""
-        drawable = labels < len(self._counts)
-        clusters = np.where(drawable, labels, 0)
-        counts = np.where(drawable, self._counts[clusters], 0)
-        numbers = (generator.random(len(labels)) * counts).astype(np.int64)
-        places = np.minimum(self._starts[clusters] + numbers, len(self._actions) - 1)
-        return self._actions[places], counts > 0
+        first, end = (np.searchsorted(self._labels, labels, side) for side in ("left", "right"))
+        numbers = (generator.random(len(labels)) * (end - first)).astype(np.int64)
+        places = np.minimum(first + numbers, len(self._actions) - 1)
+        return self._actions[places], end > first
 
 
 class Generator(Protocol):
@@ -152,8 +145,9 @@ class TangentGenerator:
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
         self._crm, self._config, self.band = crm, config, config.band
-        self._clusters = clusters.to(crm.device)
-        values, vectors = torch.linalg.eigh(clusters.covariances)
+        matrices = clusters.covariances
+        self._clusters = StateClusters(clusters.centres.to(crm.device), matrices.to(crm.device))
+        values, vectors = torch.linalg.eigh(matrices)
         self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
 
     @torch.no_grad()
@@ -167,8 +161,9 @@ class TangentGenerator:
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
         order = near.argsort(stable=True)
         rows = torch.bincount(near, minlength=len(self._clusters.centres)).tolist()
-        ordered = (values[order] for values in (states, actions, z, noise, length))
-        moves = self._moves(rows, *ordered)
+        moves = self._moves(
+            rows, states[order], actions[order], z[order], noise[order], length[order]
+        )
         return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
 
     def _moves(
@@ -185,12 +180,12 @@ class TangentGenerator:
         steepest = _products(self._clusters.covariances, gradient, rows)
         move = _products(self._roots, noise, rows)
         move = move - steepest * _ratio((gradient * move).sum(1), gradient, steepest)
-        move = _scale(move, length)
+        move = _scale(move, length, math.inf)
         for _ in range(self._config.corrections):
             current, gradient = self._reward(states, actions, z, move)
             steepest = _products(self._clusters.covariances, gradient, rows)
             step = steepest * _ratio(current - reward, gradient, steepest)
-            move = _shorten(move - _shorten(step, length), length)
+            move = _scale(move - _scale(step, length), length)
         return move
 
     def _reward(
@@ -242,7 +237,7 @@ class NoiseGenerator:
         noise = torch.randn(states.shape, generator=generator).to(states.device)
         noise = noise * (self._std > 0)
         length = _lengths(self.band, states, generator)
-        return states + self._std * _scale(noise, length)
+        return states + self._std * _scale(noise, length, math.inf)
 
 
 def state_clusters(
@@ -290,19 +285,18 @@ def _fit_faithful(
     train: Transitions, crm: CausalRewardModel, config: CSGConfig, folder: Path, seed: int
 ) -> CounterfactualStateGenerator:
     rows = _high_rewards(train, config, seed)
-    states, actions, rewards = (
-        values[rows].to(crm.device) for values in (train.states, train.actions, train.rewards)
-    )
+    logged = [part[rows].to(crm.device) for part in (train.states, train.actions, train.rewards)]
     torch.manual_seed(seed)
     csg = CounterfactualStateGenerator(crm, config).to(crm.device)
     low, high = config.band
 
-    def draw(generator: np.random.Generator) -> Tensor:
-        rows = generator.integers(len(rewards), size=config.batch_size)
-        return torch.from_numpy(rows).to(crm.device)
+    def draw(generator: np.random.Generator) -> tuple[Tensor, ...]:
+        drawn = generator.integers(len(rows), size=config.batch_size)
+        at = torch.from_numpy(drawn).to(crm.device)
+        return tuple(values[at] for values in logged)
 
-    def loss(rows: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        s, a, r = states[rows], actions[rows], rewards[rows]
+    def loss(batch: tuple[Tensor, ...]) -> tuple[Tensor, Mapping[str, Tensor]]:
+        s, a, r = batch
         with torch.no_grad():
             z = crm.abduct(s, a, r)
         move = csg.move(s, a, z)
@@ -314,7 +308,7 @@ def _fit_faithful(
         parts = {"reward_change": change.detach(), "band": band.detach()}
         return config.lambda_r * change + config.lambda_band * band, parts
 
-    epoch = max(1, len(rewards) // config.batch_size)
+    epoch = max(1, len(rows) // config.batch_size)
     loop = LoopConfig(
         steps=config.epochs * epoch,
         batch_size=config.batch_size,
@@ -347,11 +341,7 @@ def _ratio(change: Tensor, gradient: Tensor, steepest: Tensor) -> Tensor:
     return (change / ((gradient * steepest).sum(1) + _TINY)).unsqueeze(1)
 
 
-def _scale(move: Tensor, length: Tensor) -> Tensor:
-    scaled: Tensor = move * (length / (move.norm(dim=1, keepdim=True) + _TINY))
-    return scaled
-
-
-def _shorten(move: Tensor, length: Tensor) -> Tensor:
+def _scale(move: Tensor, length: Tensor, most: float = 1.0) -> Tensor:
+    """The moves (M, S) with lengths (M, 1), but none longer than `most` times what it was."""
     factor: Tensor = length / (move.norm(dim=1, keepdim=True) + _TINY)
-    return move * factor.clamp(max=1.0)
+    return move * factor.clamp(max=most)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import Transitions
 from ucfrec.files.record import Undefinable
 from ucfrec.fitting.checkpoint import load_weights
-from ucfrec.fitting.loop import LoopConfig, fit, load_trained
+from ucfrec.fitting.loop import Fit, LoopConfig, fit, load_trained
 from ucfrec.processes import random_state_kept
 from ucfrec.settings import (
     BatchSize,
@@ -52,6 +52,7 @@ _VALIDATION_LIMIT = 20_000
 _CHUNK = 16_384
 _AT_ONCE = 1024
 _CPU = torch.device("cpu")
+_Rows = tuple[Tensor, ...]
 
 
 @settings_table("crm")
@@ -115,20 +116,16 @@ class EffectsMean(nn.Module):
     predictor that does not depend on the state.
     """
 
-    state_mean: Tensor
-    state_std: Tensor
-    state: Tensor
-    interaction: Tensor
-    reward: Tensor
-
     def __init__(self, model: ItemRewardModel) -> None:
         super().__init__()
         self.binary = bool(model.binary)
-        for name in ("state_mean", "state_std", "state", "interaction"):
-            self.register_buffer(name, model.get_buffer(name).clone())
+        self.state_mean = nn.Buffer(model.state_mean.clone())
+        self.state_std = nn.Buffer(model.state_std.clone())
+        self.state = nn.Buffer(model.state.clone())
+        self.interaction = nn.Buffer(model.interaction.clone())
         ends = (model.reward_low, model.reward_high - model.reward_low)
         units = ends if self.binary else (model.reward_mean, model.reward_std)
-        self.register_buffer("reward", torch.stack(units))
+        self.reward = nn.Buffer(torch.stack(units))
 
     def forward(self, states: Tensor, actions: Tensor) -> Tensor:
         """Expected rewards (...), in reward units, of states (..., S) and actions (..., D + 1)."""
@@ -147,14 +144,6 @@ class CausalRewardModel(nn.Module):
     decoder is E[r | s, a] plus a term that depends on z; the encoder's input is the residual
     r − E[r | s, a]. Without `mean_first`, that mean is 0.
     """
-
-    state_mean: Tensor
-    state_std: Tensor
-    action_mean: Tensor
-    action_std: Tensor
-    reward_mean: Tensor
-    reward_std: Tensor
-    surprise_std: Tensor
 
     expected: nn.Sequential | EffectsMean
 
@@ -176,10 +165,13 @@ class CausalRewardModel(nn.Module):
         self.expected = mean or mlp(input_size, config.hidden, 2, 1)
         self.encoder = mlp(input_size + 1, config.hidden, 2, 2 * config.latent_dim)
         self.decoder = mlp(input_size + config.latent_dim, config.hidden, 2, 1)
-        for name, shape in (("state", (state_size,)), ("action", (action_size,)), ("reward", ())):
-            self.register_buffer(f"{name}_mean", torch.zeros(shape))
-            self.register_buffer(f"{name}_std", torch.ones(shape))
-        self.register_buffer("surprise_std", torch.ones(()))
+        self.state_mean = nn.Buffer(torch.zeros(state_size))
+        self.state_std = nn.Buffer(torch.ones(state_size))
+        self.action_mean = nn.Buffer(torch.zeros(action_size))
+        self.action_std = nn.Buffer(torch.ones(action_size))
+        self.reward_mean = nn.Buffer(torch.zeros(()))
+        self.reward_std = nn.Buffer(torch.ones(()))
+        self.surprise_std = nn.Buffer(torch.ones(()))
 
     @property
     def device(self) -> torch.device:
@@ -367,22 +359,15 @@ def fit_crm(
 def _fit_mean(
     model: CausalRewardModel, train: Transitions, held_out: Transitions, folder: Path, seed: int
 ) -> None:
-    (inputs, rewards), held_out_rows = (
+    rows, held_out_rows = (
         (model.given(steps.states, steps.actions), model.normalise_rewards(steps.rewards))
         for steps in (train, held_out)
     )
 
-    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
-        rows = _draw_rows(generator, len(rewards), model)
-        return inputs[rows], rewards[rows]
-
-    def loss(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
+    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
         return (batch[1] - model.expected(batch[0]).squeeze(-1)).square().mean(), {}
 
-    def validate() -> float:
-        return _mean_over_chunks(loss, held_out_rows)
-
-    first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rewards))
+    first, whole = copy.deepcopy(model.expected.state_dict()), _loop(model.config, len(rows[1]))
     best, weights = math.inf, first
     for share in _REGRESSION_SHARES:
         steps = max(1, whole.steps // share)
@@ -394,10 +379,7 @@ def _fit_mean(
             validate_every=max(1, steps // 3),
         )
         model.expected.load_state_dict(first)
-        outcome = fit(
-            model.expected, draw, loss, loop, folder / str(steps), seed=seed, validate=validate,
-            describe="expected reward",
-        )  # fmt: skip
+        outcome = _fit(model.expected, loss, rows, held_out_rows, loop, folder / str(steps), seed)
         if outcome.best_validation >= best:
             break
         best, weights = outcome.best_validation, copy.deepcopy(model.expected.state_dict())
@@ -405,7 +387,7 @@ def _fit_mean(
 
 
 @torch.no_grad()
-def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Tensor, Tensor]:
+def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> _Rows:
     """What the CVAE sees of the steps: normalised inputs (M, S + A) and residuals (M,)."""
     s, a, r = transitions.states, transitions.actions, transitions.rewards
     parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
@@ -414,39 +396,49 @@ def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> tuple[Te
 
 
 def _fit_elbo(
-    model: CausalRewardModel,
-    train: tuple[Tensor, Tensor],
-    held_out: tuple[Tensor, Tensor],
-    folder: Path,
-    seed: int,
+    model: CausalRewardModel, rows: _Rows, held_out: _Rows, folder: Path, seed: int
 ) -> None:
-    config, (inputs, residuals) = model.config, train
+    config = model.config
 
-    def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        rows = _draw_rows(generator, len(residuals), model)
-        return inputs[rows], residuals[rows], _draw_noise(generator, config.batch_size, model)
-
-    def loss(batch: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Mapping[str, Tensor]]:
-        log_likelihood, kl = (term.mean() for term in model.elbo(*batch))
+    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
+        inputs, residuals, noise = batch
+        log_likelihood, kl = (term.mean() for term in model.elbo(inputs, residuals, noise))
         parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
         return config.beta * kl - log_likelihood, parts
 
-    fixed = _draw_noise(np.random.default_rng(seed), len(held_out[1]), model)
+    fixed = _draw_noise(np.random.default_rng(seed), held_out[1], config.latent_dim)
+    loop = _loop(config, len(rows[1]))
+    _fit(model, loss, rows, (*held_out, fixed), loop, folder, seed, config.latent_dim)
+
+
+def _fit(
+    module: nn.Module,
+    loss: Callable[[_Rows], tuple[Tensor, Mapping[str, Tensor]]],
+    rows: _Rows,
+    held_out: _Rows,
+    loop: LoopConfig,
+    folder: Path,
+    seed: int,
+    noise: int = 0,
+) -> Fit:
+    """Fit a part of the model to batches of inputs and targets, with `noise` numbers a row."""
+    inputs, target = rows
+
+    def draw(generator: np.random.Generator) -> _Rows:
+        drawn = generator.integers(len(target), size=loop.batch_size)
+        at = torch.from_numpy(drawn).to(target.device)
+        return inputs[at], target[at], _draw_noise(generator, target[at], noise)
 
     def validate() -> float:
-        return _mean_over_chunks(loss, (*held_out, fixed))
+        # Of few rows at once: what a layer returns then stays in the cache.
+        total = 0.0
+        for start in range(0, len(held_out[0]), _AT_ONCE):
+            part = tuple(values[start : start + _AT_ONCE] for values in held_out)
+            total += float(loss(part)[0]) * len(part[0])
+        return total / len(held_out[0])
 
-    loop = _loop(config, len(residuals))
-    fit(model, draw, loss, loop, folder, seed=seed, validate=validate, describe="reward model")
-
-
-def _mean_over_chunks(
-    loss: Callable[[Any], tuple[Tensor, Mapping[str, Tensor]]], rows: tuple[Tensor, ...]
-) -> float:
-    """The loss of M rows, of few at once: what a layer returns then stays in the cache."""
-    chunks = zip(*(torch.split(values, _AT_ONCE) for values in rows), strict=True)
-    total = sum(float(loss(chunk)[0]) * len(chunk[0]) for chunk in chunks)
-    return total / len(rows[0])
+    what = "reward model" if noise else "expected reward"
+    return fit(module, draw, loss, loop, folder, seed=seed, validate=validate, describe=what)
 
 
 def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
@@ -466,15 +458,9 @@ def _loop(config: CRMConfig, transitions: int) -> LoopConfig:
     )
 
 
-def _draw_rows(generator: np.random.Generator, most: int, model: CausalRewardModel) -> Tensor:
-    rows = generator.integers(most, size=model.config.batch_size)
-    return torch.from_numpy(rows).to(model.device)
-
-
-def _draw_noise(generator: np.random.Generator, rows: int, model: CausalRewardModel) -> Tensor:
-    size = (rows, model.config.latent_dim)
-    values: Float32Array = generator.standard_normal(size, dtype=np.float32)
-    return torch.from_numpy(values).to(model.device)
+def _draw_noise(generator: np.random.Generator, target: Tensor, size: int) -> Tensor:
+    values: Float32Array = generator.standard_normal((len(target), size), dtype=np.float32)
+    return torch.from_numpy(values).to(target.device)
 
 
 @torch.no_grad()

@@ -88,17 +88,17 @@ class ScreeningReport:
         lines = [f"{self.transitions:,} transitions{r2}", ""]
         lines.append("dimension  next state        p     reward        p  measures reward  causes")
         for d in self.dimensions:
-            numbers = [
-                "–" if value is None else f"{value:{form}}"
-                for value, form in (
-                    *((d.effect, ".4f"), (d.p_value, ".1g")),
-                    *((d.reward_effect, ".5f"), (d.reward_p_value, ".1g")),
-                )
-            ]
-            lines.append(
-                "{:>9}  {:>10}  {:>7}  {:>9}  {:>7}  ".format(d.dimension, *numbers)
-                + f"{_ANSWERS[d.measures_reward]:>15}  {'yes' if d.causes else 'NOTHING'}"
+            numbers = (
+                (d.effect, ".4f", 10),
+                (d.p_value, ".1g", 7),
+                (d.reward_effect, ".5f", 9),
+                (d.reward_p_value, ".1g", 7),
             )
+            line = f"{d.dimension:>9}"
+            for value, form, width in numbers:
+                line += f"  {'–' if value is None else format(value, form):>{width}}"
+            measures, causes = _ANSWERS[d.measures_reward], "yes" if d.causes else "NOTHING"
+            lines.append(f"{line}  {measures:>15}  {causes}")
         flagged = ", ".join(map(str, self.flagged)) or "none"
         return "\n".join([*lines, "", f"dimensions without effect: {flagged}"])
 
@@ -124,11 +124,8 @@ def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
             f"the actions of {train.path} are vectors; screen it with ucfrec-control, which tests "
             "what each dimension predicts"
         )
-    measures = find_measurements(train, MAX_TRANSITIONS, seed)
-    reports = [
-        DimensionReport(dimension, measures_reward=yes, causes=not yes)
-        for dimension, yes in measures.items()
-    ]
+    measures = find_measurements(train, MAX_TRANSITIONS, seed).items()
+    reports = (DimensionReport(d, measures_reward=yes, causes=not yes) for d, yes in measures)
     episodes, _ = steps_with_successor(train, MAX_TRANSITIONS, seed)
     return ScreeningReport(tuple(reports), None, len(episodes))
 
@@ -142,20 +139,19 @@ def find_measurements(
     Raises:
         InputError: there are too few episodes with two steps or more to hold some out.
     """
-    if dimensions is not None and not len(dimensions):
+    tested = range(train.observation_size) if dimensions is None else dimensions
+    if not tested:
         return {}
-    data = _Steps(train, most, seed)
-    all_dimensions = range(data.columns.shape[1])
-    tested = all_dimensions if dimensions is None else dimensions
-    verdicts: dict[int, bool] = {}
-    for part in filter(len, (tested, [d for d in all_dimensions if d not in tested])):
-        with progress(len(part), "screening, what measures the reward", "dimensions") as bar:
-            for dimension in part:
-                verdicts[dimension] = _measures(data, dimension, (), seed)
-                bar.update()
-        if not any(verdicts.values()):
-            break
-    leaks = {dimension for dimension, measures in verdicts.items() if measures}
+    data, leaks = _Steps(train, most, seed), set[int]()
+    others = [d for d in range(data.columns.shape[1]) if d not in tested]
+    count = len(tested) + len(others)
+    with progress(count, "screening, what measures the reward", "dimensions") as bar:
+        for dimension in (*tested, *others):
+            if dimension in others and not leaks:
+                break
+            if _measures(data, dimension, (), seed):
+                leaks.add(dimension)
+            bar.update()
     # A measurement explains a cause too, through the reward: the others are excluded from the rest.
     return {
         d: d in leaks and (len(leaks) == 1 or _measures(data, d, leaks - {d}, seed)) for d in tested

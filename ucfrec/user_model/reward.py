@@ -34,18 +34,14 @@ class UserPosterior(nn.Module):
     (Rasmussen and Williams, 2006, Gaussian Processes for Machine Learning, section 2.1).
     """
 
-    root: Tensor
-    usual: Tensor
-    weight: Tensor
-
     def __init__(self, items: int, embedding_size: int) -> None:
         super().__init__()
         size = embedding_size + 1
-        self.register_buffer("root", torch.zeros(size, size))
+        self.root = nn.Buffer(torch.zeros(size, size))
         """L with L Lᵀ = C, in units of the standard deviation of the noise."""
-        self.register_buffer("usual", torch.zeros(items))
+        self.usual = nn.Buffer(torch.zeros(items))
         """The reward of every item with a user without tastes of their own, as `targets`."""
-        self.register_buffer("weight", torch.zeros(()))
+        self.weight = nn.Buffer(torch.zeros(()))
         """Scores per unit of target; 0 if sessions show nothing."""
         self.are_known = False
         """Whether sessions show tastes."""
@@ -131,21 +127,6 @@ class ItemRewardModel(nn.Module):
     `ucfrec.user_model.reward_fit` fits the model; effects that it excludes are 0.
     """
 
-    binary: Tensor
-    reward_low: Tensor
-    reward_high: Tensor
-    reward_mean: Tensor
-    reward_std: Tensor
-    state_mean: Tensor
-    state_std: Tensor
-    vectors: Tensor
-    item: Tensor
-    user: Tensor
-    affinity: Tensor
-    state: Tensor
-    interaction: Tensor
-    exposure: Tensor
-
     def __init__(self, sizes: Mapping[str, int]) -> None:
         """Args:
         sizes: `state` S; `action` D, the size of an item's embedding; `items`; `users` (0 or
@@ -156,16 +137,20 @@ class ItemRewardModel(nn.Module):
         state, dim, items = sizes["state"], sizes["action"], sizes["items"]
         users = sizes.get("users", 0) + 1  # the last row is that of unknown users
         self.lags = LAGS
-        ones = {"reward_high": (), "reward_std": (), "state_std": (state,)}
-        zeros: dict[str, tuple[int, ...]] = {
-            **{"reward_low": (), "reward_mean": (), "state_mean": (state,)},
-            **{"vectors": (items, dim), "item": (items,)},
-            **{"user": (users,), "affinity": (users, dim)},
-            **{"state": (state,), "interaction": (state, dim), "exposure": (4, LAGS)},
-        }
-        self.register_buffer("binary", torch.zeros((), dtype=torch.bool))
-        for name, shape in (zeros | ones).items():
-            self.register_buffer(name, torch.ones(shape) if name in ones else torch.zeros(shape))
+        self.binary = nn.Buffer(torch.zeros((), dtype=torch.bool))
+        self.reward_low = nn.Buffer(torch.zeros(()))
+        self.reward_mean = nn.Buffer(torch.zeros(()))
+        self.state_mean = nn.Buffer(torch.zeros(state))
+        self.vectors = nn.Buffer(torch.zeros(items, dim))
+        self.item = nn.Buffer(torch.zeros(items))
+        self.user = nn.Buffer(torch.zeros(users))
+        self.affinity = nn.Buffer(torch.zeros(users, dim))
+        self.state = nn.Buffer(torch.zeros(state))
+        self.interaction = nn.Buffer(torch.zeros(state, dim))
+        self.exposure = nn.Buffer(torch.zeros(4, LAGS))
+        self.reward_high = nn.Buffer(torch.ones(()))
+        self.reward_std = nn.Buffer(torch.ones(()))
+        self.state_std = nn.Buffer(torch.ones(state))
         self.likeness = Likeness(items, dim, sizes.get("tags", 0))
         self.tastes = UserPosterior(items, dim)
 

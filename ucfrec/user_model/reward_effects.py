@@ -114,8 +114,9 @@ class Design:
 
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
-        names = ("items", "users", "x", "observed", "exposure", "target", "rows", "weights")
-        return replace(self, **{name: getattr(self, name)[rows] for name in (*names, "tastes")})
+        of_items = ("vectors", "tags", "n_tags", "n_users", "binary")
+        names = [part.name for part in dataclasses.fields(self) if part.name not in of_items]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
@@ -164,8 +165,8 @@ class Design:
 
     def squares(self, name: str) -> Tensor:
         """Weighted sum over rows of the squares of what each number of the effect multiplies."""
-        weight = self.weights.unsqueeze(1)
-        vectors, sums = weight * self.rows.square(), self.zeros(name)
+        weight, sums = self.weights.unsqueeze(1), self.zeros(name)
+        vectors = weight * self.rows.square()
         match name:
             case "mean":
                 return sums + self.count
@@ -173,22 +174,22 @@ class Design:
                 return sums.index_add(0, self.items, self.weights)
             case "user":
                 return sums.index_add(0, self.users, self.weights)
+            case "affinity":
+                return sums.index_add(0, self.users, vectors)
             case "content":
                 tags = self.tags[self.items]
                 counts = torch.zeros(self.n_tags + 1)
                 counts.index_add_(0, tags.flatten(), weight.expand(tags.shape).flatten())
                 return torch.cat([counts[: self.n_tags], vectors.sum(0)])
-            case "affinity":
-                return sums.index_add(0, self.users, vectors)
-            case "context":
-                return self.observed.square().T @ vectors
             case "tastes":
                 return (self.weights * self.tastes.square()).sum()
-            case "exposure":
-                return (weight * self.exposure.square()).sum(0)
-            case "state":
-                return (weight * self.x.square()).sum(0)
-        return self.x.square().T @ vectors
+            case "exposure" | "state":
+                return (weight * self.inputs(name).square()).sum(0)
+        return self.inputs(name).square().T @ vectors
+
+    def inputs(self, name: str) -> Tensor:
+        """What the effects `name` of numbers that are the same for all items multiply."""
+        return {"exposure": self.exposure, "context": self.observed}.get(name, self.x)
 
     @property
     def count(self) -> float:
@@ -296,15 +297,14 @@ def _newton(gradient: Tensor, history: deque[tuple[Tensor, Tensor]]) -> Tensor:
 def _scale(design: Design, name: str, curvature: float, penalty: float) -> tuple[_Map, _Map]:
     """Maps of an effect to units in which the objective is about evenly curved, and back."""
     if name in ("state", "exposure"):
-        inputs = design.x if name == "state" else design.exposure
-        factor, inverse = _factors(curvature * _moments(design, inputs), penalty)
+        factor, inverse = _factors(curvature * _moments(design, design.inputs(name)), penalty)
         return factor.matmul, inverse.matmul
     if name in ("context", "interaction"):
-        x = design.observed if name == "context" else design.x
         # The curvature is about a Kronecker product of two second moments, each with a part of the
         # penalty.
         scale = (curvature / design.count) ** 0.5
-        of_states, of_items = (scale * _moments(design, rows) for rows in (x, design.rows))
+        of_states = scale * _moments(design, design.inputs(name))
+        of_items = scale * _moments(design, design.rows)
         ratio = float(of_states.diagonal().mean() / of_items.diagonal().mean())
         left, left_inverse = _factors(of_states, (penalty * ratio) ** 0.5)
         right, right_inverse = _factors(of_items, (penalty / ratio) ** 0.5)

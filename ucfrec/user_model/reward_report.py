@@ -55,7 +55,8 @@ class RewardRows:
     @classmethod
     def of(cls, view: EpisodeStore, lags: int, limit: int, seed: int) -> "RewardRows":
         """All steps of a view of a store of items; of more than `limit`, so many drawn."""
-        return cls.at(view, *draw_steps(view, limit, seed), lags)
+        episodes, steps = draw_steps(view, limit, seed)
+        return cls.at(view, episodes, steps, lags)
 
     @classmethod
     def at(cls, view: EpisodeStore, episodes: IntArray, steps: IntArray, lags: int) -> "RewardRows":
@@ -103,16 +104,29 @@ def weigh_by_propensity(
     to their effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal
     selection probabilities in multilevel models"). None if the log does not have every p.
     """
-    if schema.PROPENSITY not in view.record.columns:
-        return None
-    propensities = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
-    if not (propensities > 0).all():
+    propensities = read_propensities(view, episodes, steps)
+    if propensities is None:
         return None
     shares = np.minimum(1 / (propensities * items), _LARGEST_WEIGHT)
-    owners = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
-    users = np.unique(owners, return_inverse=True)[1][episodes]
-    sums, squares = (np.bincount(users, weights=entry) for entry in (shares, np.square(shares)))
-    return torch.from_numpy(shares * (sums / squares)[users]).float()
+    users = np.unique(number_users(view), return_inverse=True)[1][episodes]
+    factors = np.bincount(users, shares) / np.bincount(users, np.square(shares))
+    return torch.from_numpy(shares * factors[users]).float()
+
+
+def read_propensities(
+    view: EpisodeStore, episodes: IntArray, steps: IntArray
+) -> Float64Array | None:
+    """Propensities of logged steps (M,); None if the log does not have every one."""
+    if schema.PROPENSITY not in view.record.columns:
+        return None
+    values = view.step_values(schema.PROPENSITY, episodes, steps).astype(np.float64)
+    return values if (values > 0).all() else None
+
+
+def number_users(view: EpisodeStore) -> IntArray:
+    """Users (E,) of the episodes of a view; the episodes, where users are not named."""
+    numbers = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
+    return numbers.astype(np.int64)
 
 
 @pydantic.dataclasses.dataclass(frozen=True, config=SAVED)
@@ -190,14 +204,11 @@ def calibration(predicted: Float64Array, observed: Float64Array) -> Calibration:
     """The calibration of predicted rewards (M,) against observed ones (M,)."""
     order = np.argsort(predicted, kind="stable")
     bins = [part for part in np.array_split(order, _BINS) if len(part)]
-    means = np.array([[predicted[part].mean(), observed[part].mean()] for part in bins])
-    count = np.array([len(part) for part in bins])
-    return Calibration(
-        predicted=tuple(means[:, 0].tolist()),
-        observed=tuple(means[:, 1].tolist()),
-        count=tuple(count.tolist()),
-        error=float((np.abs(means[:, 0] - means[:, 1]) * count).sum() / count.sum()),
-    )
+    expected = tuple(float(predicted[part].mean()) for part in bins)
+    seen = tuple(float(observed[part].mean()) for part in bins)
+    count = tuple(map(len, bins))
+    error = np.average(np.abs(np.subtract(expected, seen)), weights=count)
+    return Calibration(expected, seen, count, float(error))
 
 
 def fit_line(scores: Tensor, target: Tensor, binary: bool, weights: Tensor | None = None) -> Line:
@@ -267,7 +278,8 @@ class UserCalibration:
     ) -> "UserCalibration":
         """Calibrate the scores of a model on at most `limit` drawn steps of a view."""
         episodes, steps = draw_steps(view, limit, seed)
-        rows, half = RewardRows.at(view, episodes, steps, model.reach), halve_users(view)[episodes]
+        rows = RewardRows.at(view, episodes, steps, model.reach)
+        half = number_users(view)[episodes] % 2
         weights = weigh_by_propensity(view, episodes, steps, len(model.item))
         counts = torch.ones(len(rows)) if weights is None else weights
         scores, target = score_rows(model, rows)[0], model.target(rows.rewards)
@@ -277,8 +289,10 @@ class UserCalibration:
             return fit_line(scores[part], target[part], bool(model.binary), counts[part])
 
         line = fit_part(np.ones(len(rows), dtype=bool))
-        parts = half == 0, half == 1
-        first, second = (fit_part(part) if part.sum() >= _FEWEST else line for part in parts)
+        first, second = (
+            fit_part(half == number) if (half == number).sum() >= _FEWEST else line
+            for number in (0, 1)
+        )
         slope, intercept = torch.tensor([second, first])[torch.from_numpy(half)].unbind(1)
         expected = (counts * model.expect(slope * scores + intercept)).double().numpy()
         observed = (counts * rows.rewards).double().numpy()
@@ -286,10 +300,3 @@ class UserCalibration:
         by_user = np.bincount(episodes, expected - (1 + off) * observed)
         error = float(np.sqrt(np.square(by_user).sum()) / abs(observed.sum() or 1.0))
         return cls(line, (first, second), float(off), error, weights is not None)
-
-
-def halve_users(view: EpisodeStore) -> IntArray:
-    """Half (E,) of the users, 0 or 1, to which the episodes of a view belong; of the episodes,
-    where users are not named."""
-    numbers = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
-    return numbers.astype(np.int64) % 2

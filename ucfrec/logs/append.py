@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ucfrec import schema
-from ucfrec.arrays import Array, BoolArray, IntArray
+from ucfrec.arrays import Array, BoolArray
 from ucfrec.episodes.record import Source, StoreRecord
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_folder
@@ -46,9 +46,8 @@ class AppendOptions:
     """Sessions that ended longer ago than this, before the end of the new logs, are left out; None
     keeps all."""
     split: tuple[float, ...] = SPLIT
-    """As of `PrepareOptions`, of the new rows."""
+    """As of `PrepareOptions`, of the new rows; so is the next."""
     memory_limit: str = "2GB"
-    """As of `PrepareOptions`."""
 
 
 def append_logs(
@@ -143,9 +142,8 @@ def _read_report(out: Path, made_of: Mapping[str, Any]) -> dict[str, Any]:
             f"{out} is a store of {' and of '.join(differences)}; give the same as before, or name "
             "another folder"
         )
-    report = dict(remembered["appended"])
-    _require_held_out(str(out), report)
-    return report
+    _require_held_out(str(out), remembered["appended"])
+    return dict(remembered["appended"])
 
 
 def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
@@ -162,8 +160,7 @@ def _require_held_out(name: str, report: Mapping[str, Any]) -> None:
 def _survey_ids(
     log: PreparedLog, mapping: LogMapping, store: Path, old: StoreRecord
 ) -> dict[str, int]:
-    """How many ids are new, and the steps that have them. Warns of logs that share no user, or no
-    item, with the store, and of new ones of which no feature table says anything."""
+    """How many ids are new, and the steps that have them, with warnings of unusual ones."""
     typed, counts = log.rows.log, {}
     for name, table, file in ID_TABLES:
         old_count = pq.read_metadata(store / file).num_rows
@@ -189,22 +186,15 @@ def _survey_ids(
     return counts
 
 
-@dataclass(frozen=True)
 class _Shard:
-    """A shard of the old store."""
+    """A shard of the old store: `lengths` (E,) of its episodes, and which of them `stays` (E,)."""
 
-    folder: Path
-    lengths: IntArray
-    """(E,) steps of its episodes."""
-    stays: BoolArray
-    """(E,) false for episodes that are left out."""
-
-    @classmethod
-    def read(cls, folder: Path, cut_ms: float) -> "_Shard":
+    def __init__(self, folder: Path, cut_ms: float) -> None:
         """Episodes that ended before `cut_ms` are left out."""
         offsets = np.load(folder / f"{schema.OFFSETS}.npy")
         times = np.load(folder / f"{schema.TIMESTAMP}.npy", mmap_mode="r")
-        return cls(folder, np.diff(offsets), np.asarray(times[offsets[1:] - 1] >= cut_ms))
+        self.folder, self.lengths = folder, np.diff(offsets)
+        self.stays: BoolArray = np.asarray(times[offsets[1:] - 1] >= cut_ms)
 
     def load(self, name: str, episodes: BoolArray) -> Array:
         """A column at every step of some episodes (E,), even if it is one of episodes."""
@@ -228,7 +218,7 @@ def _write(
 
     typed = log.rows.log
     cut_ms = -np.inf if window_ms is None else log.report["time_range_ms"][1] - window_ms
-    shards = [_Shard.read(store / f"shard-{n:05d}", cut_ms) for n in range(old.n_shards)]
+    shards = [_Shard(store / f"shard-{n:05d}", cut_ms) for n in range(old.n_shards)]
     left = [shard for shard in shards if shard.stays.any()]
     added = [name for name in _FILL if name in typed.columns and name not in old.columns]
     if schema.OBSERVATION in old.columns and schema.OBSERVATION not in typed.columns:
@@ -275,8 +265,7 @@ def _move_train_counts(log: TypedLog, shards: Sequence[_Shard]) -> None:
 def _copy_shard(
     shard: _Shard, target: Path, old: StoreRecord, added: Sequence[str]
 ) -> dict[str, tuple[int, str]]:
-    """Link the files of an old shard, or write what changes, and step columns `added` that the old
-    store lacks; returns known checksums."""
+    """Link or write the files of an old shard, and columns `added`; returns known checksums."""
     target.mkdir()
     checksums, whole = {}, bool(shard.stays.all())
     for file in sorted(shard.folder.glob("*.npy")):

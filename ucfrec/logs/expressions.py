@@ -82,23 +82,17 @@ FUNCTIONS: Final = frozenset(" ".join((_MATHS, _TEXTS, _TIMES, _LISTS, _OPERATOR
 """Allowed functions, and operators by the parser's names (~~ is LIKE)."""
 COPYING: Final = frozenset({"least", "greatest", "nullif", "split_part", "array_to_string"})
 """Macros: DuckDB copies each argument up to three times, or nine times with three arguments."""
-_JOINING: Final = frozenset(
-    {"concat", "concat_ws", "||", "list_concat", "list_cat", "list_append", "list_prepend"}
-)
+_JOINING: Final = ("concat", "||", "list_concat", "list_cat", "list_append", "list_prepend")
 """What they return is as long as all their arguments together."""
-_QUOTING: Final = frozenset(
-    (
-        *("string_split", "str_split", "string_split_regex"),
-        *("json_extract", "json_extract_string", "->>"),
-    )
+_QUOTING: Final = (
+    *("string_split", "str_split", "string_split_regex"),
+    *("json_extract", "json_extract_string", "->>"),
 )
 """What they return is longer than an argument once it is text: lists have quotes and commas."""
 _QUOTES: Final = 3
 _DATE_PARTS: Final = 12
 """Characters for two of the format of `strftime`."""
-_TEXTS_AND_LISTS: Final = frozenset(
-    {"VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST"}
-)
+_TEXTS_AND_LISTS: Final = ("VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST")
 _SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
 _WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
 _ALLOWED: Final = (
@@ -147,14 +141,24 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
     It is not evaluated, nor are the existence and types of columns checked. Raises NotScalarError
     if it is anything else, too long, too large, or nested too deep.
     """
-    _require_small(expression)
+    if len(expression) > MAX_LENGTH:
+        raise NotScalarError(f"it has {len(expression):,} characters; {MAX_LENGTH:,} are allowed")
+    depth = 0
+    for char in expression:
+        depth += (char in "([{") - (char in ")]}")
+        if depth > MAX_NESTING:
+            raise _too_deep()
+    # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
+    # largest if every CASE has the same number of WHENs.
+    cases, whens = len(_SIMPLE_CASE.findall(expression)), len(_WHEN.findall(expression))
+    if cases and (whens / cases) ** cases * len(expression) > _MAX_COPIED:
+        raise NotScalarError(
+            f"it has {cases} CASE x WHEN … with {whens} WHEN; write CASE WHEN x = … instead"
+        )
     # Parsed alone and in the brackets in which it will be used: a text with an unmatched bracket,
     # quote or comment cannot give the same tree both times.
-    alone, bracketed = (
-        _parse(connection, f"{expression}\n"),
-        _parse(connection, f"({expression}\n)"),
-    )
-    if alone != bracketed:
+    alone = _parse(connection, f"{expression}\n")
+    if alone != _parse(connection, f"({expression}\n)"):
         raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
     columns: dict[str, None] = {}
     if _walk(alone, 0, columns) > MAX_SIZE:
@@ -197,24 +201,6 @@ def _parts(tree: Any) -> Collection[Any]:
     return tree if isinstance(tree, list) else ()
 
 
-def _require_small(expression: str) -> None:
-    """Refuse text that would make the parser slow: long, deeply bracketed, or nested CASE."""
-    if len(expression) > MAX_LENGTH:
-        raise NotScalarError(f"it has {len(expression):,} characters; {MAX_LENGTH:,} are allowed")
-    depth = 0
-    for char in expression:
-        depth += (char in "([{") - (char in ")]}")
-        if depth > MAX_NESTING:
-            raise _too_deep()
-    # CASE x WHEN … copies x for every WHEN, so nested ones multiply. The product of the copies is
-    # largest if every CASE has the same number of WHENs.
-    cases, whens = len(_SIMPLE_CASE.findall(expression)), len(_WHEN.findall(expression))
-    if cases and (whens / cases) ** cases * len(expression) > _MAX_COPIED:
-        raise NotScalarError(
-            f"it has {cases} CASE x WHEN … with {whens} WHEN; write CASE WHEN x = … instead"
-        )
-
-
 def _too_deep() -> NotScalarError:
     return NotScalarError(f"it is nested more than {MAX_NESTING} levels deep; simplify it")
 
@@ -227,8 +213,7 @@ def _too_large() -> NotScalarError:
 def _parse(connection: "duckdb.DuckDBPyConnection", expression: str) -> dict[str, Any]:
     """Syntax tree of the single value of `SELECT expression`."""
     node, value = _select(connection, expression)
-    plain, _ = _select(connection, "1")
-    if node != plain or value["alias"]:
+    if node != _select(connection, "1")[0] or value["alias"]:
         raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
     return value
 
@@ -271,8 +256,7 @@ def _remove_locations(tree: Any) -> Any:
 
 
 def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:
-    """Check every node of a tree and add the names of columns that it reads; returns the number of
-    its nodes, counting every copy of those that DuckDB copies."""
+    """Check a tree and add the columns that it reads; returns its size as of `MAX_SIZE`."""
     if not isinstance(tree, dict) or "class" not in tree:
         return sum(_walk(part, depth, columns) for part in _parts(tree))
     if depth == MAX_NESTING:

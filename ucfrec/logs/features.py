@@ -65,9 +65,8 @@ def load_features(
     Raises InputError if a file or column cannot be used, two parts have a column of different
     types, or a table repeats an id.
     """
-    names = []
-    for number, table in enumerate(tables):
-        name = f"{kind}_features_{number}"
+    names = [f"{kind}_features_{number}" for number in range(len(tables))]
+    for name, table in zip(names, tables, strict=True):
         opened = open_tables(connection, log_files(table.files))
         parts = [_read_part(connection, part, table, kind) for part in opened]
         types = _find_common_types(parts, kind)
@@ -76,15 +75,13 @@ def load_features(
             connection.execute(
                 f"CREATE TABLE {name} AS SELECT * FROM ({rows_of_parts}) WHERE id IS NOT NULL"
             )
-        ((rows, ids),) = connection.sql(
-            f"SELECT count(*), count(DISTINCT id) FROM {name}"
-        ).fetchall()
+        counts = f"SELECT count(*), count(DISTINCT id) FROM {name}"
+        ((rows, ids),) = connection.sql(counts).fetchall()
         if rows != ids:
             raise InputError(
                 f"{', '.join(map(str, table.files))}: {rows - ids} of {rows} rows "
                 f"repeat a {table.key}; keep one row per {kind}"
             )
-        names.append(name)
     return names
 
 
@@ -170,7 +167,6 @@ def _select_rows(part: _Part, types: dict[str, str], id_type: str) -> str:
 
 
 def _cast_id(key: str, key_type: str, id_type: str) -> str:
-    """SQL that casts a key to an id type, NULL where no cast does."""
     if is_number(key_type) and not is_integer(key_type):
         # 12.0 is the text '12' and no other; a cast of 12.4 would round it to another id, as the
         # file did with whole numbers that its type does not hold.
@@ -190,7 +186,7 @@ def feature_digest(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) 
     digest = hashlib.sha256()
     for name in names:
         columns = connection.sql(f"DESCRIBE {name}").fetchall()
-        digest.update(repr([(column[0], column[1]) for column in columns]).encode())
+        digest.update(repr([column[:2] for column in columns]).encode())
         rows = connection.sql(f"SELECT * FROM {name} ORDER BY id")
         for batch in rows.to_arrow_reader(BATCH_ROWS):
             for column in batch.columns:
@@ -210,7 +206,7 @@ def require_known_ids(
     noted: bool,
 ) -> None:
     """Raise InputError if a feature table has no row of an id of the log; if `noted`, warn if many
-    ids have none. `names` are those of `load_features`, `kind` as there."""
+    ids have none. `names` and `kind` are those of `load_features`."""
     used_ids = next(f"used_{table}" for name, table, _ in ID_TABLES if name == kind)
     for table, name in zip(tables, names, strict=True):
         if not _count(connection, f"{used_ids} SEMI JOIN {name} ON id = {kind}"):
@@ -225,9 +221,8 @@ def require_known_ids(
                 "expression that gives the same ids, or leave the file out"
             )
     if noted:
-        note_lacking(
-            connection, tables, names, kind, used_ids, f"{kind}s of the log", _MANY_LACKING
-        )
+        which = f"{kind}s of the log"
+        note_lacking(connection, tables, names, kind, used_ids, which, _MANY_LACKING)
 
 
 def note_lacking(
@@ -239,8 +234,7 @@ def note_lacking(
     which: str,
     share: float = 0,
 ) -> None:
-    """Warn of ids in some rows (SQL), `which` in words, if more than a share have no row in a
-    feature table."""
+    """Warn of ids in rows (SQL; `which` in words), if more than a share have no features."""
     count = _count(connection, rows)
     for table, name in zip(tables, names, strict=True):
         without_row = _count(connection, f"{rows} ANTI JOIN {name} ON id = {kind}")

@@ -170,9 +170,7 @@ def predict_from_features(
     axes = _axes(features[trained], CONTENT_RANK)
     trained_rows = np.asarray(features[trained] @ axes, dtype=np.float64)
     weights = counts / (counts + PRIOR_COUNT)
-    gram = trained_rows.T @ (weights[:, None] * trained_rows) + RIDGE * np.eye(
-        trained_rows.shape[1]
-    )
+    gram = trained_rows.T @ (weights[:, None] * trained_rows) + RIDGE * np.eye(axes.shape[1])
     slopes = np.linalg.solve(gram, trained_rows.T @ (weights[:, None] * cooccurrence))
     # Sparse times dense is computed row by row, so an item's result does not depend on other items.
     return np.asarray(features @ (axes @ slopes), dtype=np.float64)
@@ -194,10 +192,8 @@ def _axes(trained_rows: sparse.csr_matrix, size: int) -> Array:
     from sklearn.utils.extmath import randomized_svd  # takes seconds to import
 
     require_blas_memory()
-    _, _, directions = randomized_svd(
-        trained_rows, min(size, trained_rows.shape[0]), random_state=0
-    )
-    return np.asarray(directions.T)
+    rank = min(size, trained_rows.shape[0])
+    return np.asarray(randomized_svd(trained_rows, rank, random_state=0)[2].T)
 
 
 def _unit_rows(rows: Array) -> Array:
@@ -209,7 +205,6 @@ class SparseRows:
     """A sparse matrix on disk, in blocks of consecutive rows."""
 
     def __init__(self, path: Path, n_columns: int) -> None:
-        """Without rows yet, to be written to a new file."""
         self._file: IO[bytes] = path.open("w+b")
         self._blocks: list[tuple[int, int]] = []
         self.shape = (0, n_columns)
@@ -222,7 +217,6 @@ class SparseRows:
         self.shape = (self.shape[0] + rows.shape[0], self.shape[1])
 
     def blocks(self) -> Iterator[sparse.csr_matrix]:
-        """The rows, as they were appended."""
         self._file.seek(0)
         for rows, values in self._blocks:
             starts = np.fromfile(self._file, "<i8", rows + 1)
@@ -286,10 +280,8 @@ def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64A
     """Square roots of the largest eigenvalues, descending, 0 for rounding errors; eigenvectors."""
     values, vectors = np.linalg.eigh(symmetric)
     values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
-    if rank > len(values):
-        missing = rank - len(values)
-        values = np.pad(values, (0, missing))
-        vectors = np.pad(vectors, ((0, 0), (0, missing)))
+    missing = max(0, rank - len(values))
+    values, vectors = np.pad(values, (0, missing)), np.pad(vectors, ((0, 0), (0, missing)))
     values = np.where(values > _SMALL * max(values[0], 0), values, 0)
     return np.sqrt(values), np.where(values > 0, vectors, 0)
 
@@ -364,10 +356,8 @@ def _extend_rows(old: Float32Array, features: sparse.csr_matrix | None, counts: 
 def _fold_in(
     vectors: Float64Array, shown: sparse.csr_matrix, old_counts: IntArray, step_counts: IntArray
 ) -> Float64Array:
-    """Vectors (n, D) moved towards the mean of their users' vectors, as of `folding in` (SVD): that
-    of the items (users, n) shown, weighted by liking. New steps of an item weigh as much as their
-    number, against the number of old ones.
-    """
+    """Vectors (n, D) moved towards the mean of their users' vectors, that of the items (users, n)
+    shown, weighted by liking; new steps of an item weigh as much as old ones."""
     of_users = (shown @ vectors) / np.asarray(shown.sum(axis=1))
     folded = shown.T @ (of_users - of_users.mean(axis=0))
     norms = np.linalg.norm(vectors[old_counts > 0], axis=1)
@@ -378,8 +368,8 @@ def _fold_in(
 
 
 def _number_tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
-    """(n_items, T) tags by the numbers of `old` (n_old, T); −1 for tags of new items that the store
-    lacks. `new_tags` (n_items, T') are numbered otherwise; T' is 0 without tables."""
+    """(n_items, T) tags, those of new items, numbered otherwise in `new_tags` (n_items, T'), by the
+    numbers of `old` (n_old, T); −1 for tags that the store lacks."""
     tags = np.full((n_items, old.shape[1]), -1, dtype=np.int64)
     tags[: len(old)] = old
     if not (old.shape[1] and new_tags.shape[1]):
@@ -391,11 +381,8 @@ def _number_tags(old: IntArray, new_tags: IntArray, n_items: int) -> IntArray:
     union = have_new.sum(axis=0).T + have_old.sum(axis=0) - both
     share = np.asarray(both / np.maximum(union, 1))
     best = share.argmax(axis=1)
-    same = {
-        tag: int(best[tag])
-        for tag in range(min(sizes[0], DISTINCT_TAGS + 1))
-        if share[tag, best[tag]] >= _ALIKE
-    }
+    alike = np.flatnonzero(share.max(axis=1)[: DISTINCT_TAGS + 1] >= _ALIKE)
+    same = dict(zip(alike.tolist(), best[alike].tolist(), strict=True))
     for item in range(len(old), n_items):
         shared = [same[tag] for tag in new_tags[item].tolist() if tag in same][: old.shape[1]]
         tags[item, : len(shared)] = shared

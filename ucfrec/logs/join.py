@@ -7,13 +7,13 @@ from tempfile import gettempdir
 from typing import Final
 
 import duckdb
-import pyarrow.parquet as pq
 
 from ucfrec import schema
 from ucfrec.errors import InputError, warn_user
 from ucfrec.files.atomic import atomic_file, require_other_files, scratch_folder
 from ucfrec.logs.engine import BATCH_ROWS, bind, engine, explain_errors
 from ucfrec.logs.mapping import LogMapping, log_files
+from ucfrec.logs.sessions import write_batches
 from ucfrec.logs.summary import note_undefined
 from ucfrec.logs.tables import (
     PANDAS_INDEX,
@@ -72,13 +72,12 @@ class Joined:
 
     def __str__(self) -> str:
         share = self.with_feedback / max(self.exposures, 1)
-        lines = [
+        return (
             f"{self.exposures:,} exposures, {self.with_feedback:,} of them with feedback "
-            f"({share:.1%}); {self.repeated:,} repeated rows left out",
-            f"{self.matched:,} rows of feedback matched, {self.unmatched:,} without an exposure",
-            f"feedback columns: {', '.join((FEEDBACK, *self.columns))}",
-        ]
-        return "\n".join(lines)
+            f"({share:.1%}); {self.repeated:,} repeated rows left out\n"
+            f"{self.matched:,} rows of feedback matched, {self.unmatched:,} without an exposure\n"
+            f"feedback columns: {', '.join((FEEDBACK, *self.columns))}"
+        )
 
 
 def join_feedback(
@@ -137,8 +136,8 @@ def join_feedback(
                 "SELECT (SELECT count(*) FROM exposures), (SELECT count(*) FROM given_exposures), "
                 "(SELECT count(*) FROM feedback), count(*), count(DISTINCT row) FROM matches"
             ).fetchall()
-            counts = shown, written - shown, with_feedback, matched, rows - matched
-            joined = Joined(*counts, columns)
+            unmatched = rows - matched
+            joined = Joined(shown, written - shown, with_feedback, matched, unmatched, columns)
             if not joined.matched:
                 warn_user(_why_unmatched(connection, joined))
             return joined
@@ -218,10 +217,8 @@ def _select_others(table: Table, keys: Table, further: Mapping[str, _Further]) -
 def _make_feedback(
     connection: duckdb.DuckDBPyConnection, tables: tuple[Table, ...], mapping: LogMapping
 ) -> tuple[str, ...]:
-    """Create the table `feedback` with its `row`; returns its columns of feedback.
-
-    Their values are its columns `_value(0)`, …, so that any name is possible.
-    """
+    """Create the table `feedback` with its `row`; returns its columns of feedback,
+    whose values are its columns value_0, …, so that any name is possible."""
     for table in tables:
         if _names_of(table).keys() >= {*_ONLY_SHOWN}:
             raise InputError(
@@ -241,18 +238,16 @@ def _make_feedback(
     }
     keys |= {name.casefold() for table in tables for name, _ in table.partitions}
     columns = _feedback_columns(connection, tables, keys)
-    selects = []
+    selects, folded = [], [name.casefold() for name in columns]
     for whole, narrow, select in zip(tables, typed.tables, typed.selects, strict=True):
         names = _names_of(whole)
-        present = {
-            n: names[key] for n, key in enumerate(map(str.casefold, columns)) if key in names
-        }
+        present = {n: names[key] for n, key in enumerate(folded) if key in names}
         values = []
         for n, name in present.items():
             column = quote_name(name)
             if not _holds_feedback(whole.columns[name]):
                 column = f"CAST({column} AS VARCHAR)"  # it holds text of numbers, or nothing
-            values.append(f"CAST({column} AS DOUBLE) AS {_value(n)}")
+            values.append(f"CAST({column} AS DOUBLE) AS value_{n}")
         requests = [names[_REQUEST]] if _REQUEST in names else []
         values.append(f"{whole.text_of(requests[0]) if requests else 'NULL'} AS {_REQUEST}")
         source = narrow.with_texts(present.values(), requests)
@@ -273,9 +268,8 @@ def _make_feedback(
 def _feedback_columns(
     connection: duckdb.DuckDBPyConnection, tables: Sequence[Table], keys: set[str]
 ) -> tuple[str, ...]:
-    """Columns of numbers and truth values, each once, with a note on those that are left out: not
-    `keys` (in lower case) nor columns of exposures. A column may not be numbers in one file only.
-    """
+    """Columns of numbers and truth values but `keys` (in lower case), each once, with a note on
+    those that are left out."""
     columns: dict[str, tuple[str, Path]] = {}
     left_out: dict[str, str] = {}
     not_numbers = []
@@ -318,10 +312,6 @@ def _feedback_columns(
     return tuple(name for name, _ in columns.values())
 
 
-def _value(n: int) -> str:
-    return f"value_{n}"
-
-
 def _keys_of(mapping: LogMapping) -> LogMapping:
     """The mapping of user, item and time; feedback has nothing else that a log could."""
     absent = {schema.OBSERVATION: "", schema.PROPENSITY: "", schema.IS_RANDOM: ""}
@@ -335,8 +325,8 @@ def _write(
     out: Path,
 ) -> None:
     """Write the log, users as numbers if the feedback has numbers."""
-    values = {FEEDBACK: FEEDBACK, **{name: _value(n) for n, name in enumerate(columns)}}
-    largest = "".join(f", max({_value(n)}) AS {_value(n)}" for n in range(len(columns)))
+    values = {FEEDBACK: FEEDBACK, **{name: f"value_{n}" for n, name in enumerate(columns)}}
+    largest = "".join(f", max(value_{n}) AS value_{n}" for n in range(len(columns)))
     again = {name.casefold() for name in values}
     selects = [
         f"{c.alias} AS {quote_name(c.name)}" for key, c in further.items() if key not in again
@@ -344,11 +334,9 @@ def _write(
     for name, value in values.items():
         sql, earlier = f"coalesce({value}, 0)", further.get(name.casefold())
         if earlier is not None and earlier.is_number:
-            sql = (
-                f"{sql} + CAST(coalesce({earlier.alias}, 0) AS BIGINT)"
-                if name == FEEDBACK
-                else f"greatest({sql}, CAST(coalesce({earlier.alias}, 0) AS DOUBLE))"
-            )
+            before, is_count = f"coalesce({earlier.alias}, 0)", name == FEEDBACK
+            larger = f"greatest({sql}, CAST({before} AS DOUBLE))"
+            sql = f"{sql} + CAST({before} AS BIGINT)" if is_count else larger
         selects.append(f"{sql} AS {quote_name(name)}")
     internal = "user_id", "row", *values.values(), *(column.alias for column in further.values())
     ((whole,),) = connection.sql(
@@ -364,10 +352,7 @@ def _write(
         "ORDER BY exposures.row"
     )
     with atomic_file(out) as scratch:
-        batches = connection.sql(query).to_arrow_reader(BATCH_ROWS)
-        with pq.ParquetWriter(scratch, batches.schema) as writer:
-            for batch in batches:
-                writer.write_batch(batch)
+        write_batches(scratch, connection.sql(query).to_arrow_reader(BATCH_ROWS))
 
 
 def _why_unmatched(connection: duckdb.DuckDBPyConnection, joined: Joined) -> str:

@@ -77,11 +77,8 @@ class RowVectors:
     """
 
     def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
-        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation`.
-
-        Args:
-            size: of an observation.
-        """
+        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation` of
+        a size."""
         rows, self._file, memory = 0, file, io.BytesIO()
         with memory if file is None else file.open("xb") as out:
             for batch in batches:
@@ -109,10 +106,9 @@ class RowVectors:
 
 
 class RowFile:
-    """Batches of rows, column by column, in a scratch folder or in memory."""
+    """Batches of rows, column by column, in a new scratch folder or (None) in memory."""
 
     def __init__(self, folder: Path | None) -> None:
-        """Make the folder of the files; None for memory."""
         if folder is not None:
             folder.mkdir()
         self._folder = folder
@@ -176,11 +172,7 @@ class SortedRows:
 
     def add(self, batch: dict[str, Array], duplicates: str, by_session: bool) -> None:
         """Add rows as of `order_rows`, all of their users; leave out duplicates, undefined rewards.
-
-        Args:
-            by_session: whether the rows of a session follow each other, as sessions of one user may
-                overlap.
-        """
+        With `by_session`, rows of a session follow each other: sessions of one user may overlap."""
         keys = (USER, schema.TIMESTAMP, ITEM if ITEM in batch else schema.ACTION)
         repeated = np.append(False, np.all([_equal_before(batch[key]) for key in keys], axis=0))
         if repeated.any():
@@ -233,11 +225,9 @@ class SortedRows:
             some[schema.OBSERVATION] = self.observations.of_rows(some["row"])
         groups = np.cumsum(~repeated)[places]
         order = places[np.lexsort([*order_duplicates(some, duplicates), groups])]
-        ordered = {}
-        for name, values in batch.items():
-            ordered[name] = values.copy()
-            ordered[name][places] = values[order]
-        return ordered
+        source = np.arange(len(repeated))
+        source[places] = order
+        return {name: values[source] for name, values in batch.items()}
 
 
 def _equal_before(values: Array) -> BoolArray:
@@ -441,8 +431,7 @@ def choose_rows(
     ties[tied] = np.fmod(multiplier * (1 + hash_ids(ids.tolist())[items[tied]]), PRIME)
     keys = [users, times, ties, items]
     order = np.lexsort([*order_duplicates(rows, duplicates), *keys[::-1]])
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    first = np.append(True, np.any([np.diff(key[order]) != 0 for key in keys], axis=0))
     return np.asarray(order[first & finite[order]])
 
 

@@ -107,52 +107,40 @@ def _find_time(rows: SortedRows, place: int) -> int:
 def read_episodes(rows: SortedRows, cut: Cut) -> Iterator[Episodes]:
     """Cut the rows into episodes, some thousand rows at a time."""
     for batch in rows.file.read():
-        yield _cut_episodes(batch, cut, rows.last_ms)
-
-
-def _cut_episodes(rows: dict[str, Array], cut: Cut, log_end: int) -> Episodes:
-    """The episodes of all rows of some users."""
-    users, times = rows[USER], rows[schema.TIMESTAMP]
-    user_ends = users[1:] != users[:-1]
-    ends = user_ends
-    if cut.session_by == "gap":
-        ends = user_ends | (times[1:] - times[:-1] > cut.gap_ms)
-    elif cut.session_by == schema.SESSION_ID:
-        ends = user_ends | (rows[SESSION][1:] != rows[SESSION][:-1])
-    user_ends, ends = np.append(user_ends, True), np.append(ends, True)
-    splits = (times >= cut.bounds[0]).astype(np.int64) + (times >= cut.bounds[1])
-    last = np.flatnonzero(ends | np.append(splits[1:] != splits[:-1], True))
-    lengths = np.diff(last, prepend=-1)
-    begins_session = np.append(True, ends[last[:-1]])
-    last_ends = np.full(len(last), cut.session_by == schema.SESSION_ID)
-    if cut.session_by == "gap":
-        last_ends = log_end - times[last] > cut.gap_ms
-    terminated = np.where(user_ends[last], last_ends, ends[last])
-    too_long = lengths > (lengths.max() if cut.max_steps is None else cut.max_steps)
-    fits = (lengths >= cut.min_steps) & ~too_long
-    if not fits.all():
-        steps = np.repeat(fits, lengths)
-        rows = {name: values[steps] for name, values in rows.items()}
-    return Episodes(
-        rows,
-        lengths[fits],
-        users[last][fits],
-        splits[last][fits],
-        begins_session[fits],
-        terminated[fits],
-        int(lengths[too_long].sum()),
-    )
+        users, times = batch[USER], batch[schema.TIMESTAMP]
+        user_ends = np.append(users[1:] != users[:-1], True)
+        ends, last_ends = user_ends, np.full(len(users), cut.session_by == schema.SESSION_ID)
+        if cut.session_by == "gap":
+            ends = user_ends | np.append(times[1:] - times[:-1] > cut.gap_ms, True)
+            last_ends = rows.last_ms - times > cut.gap_ms
+        elif cut.session_by == schema.SESSION_ID:
+            ends = user_ends | np.append(batch[SESSION][1:] != batch[SESSION][:-1], True)
+        splits = (times >= cut.bounds[0]).astype(np.int64) + (times >= cut.bounds[1])
+        last = np.flatnonzero(ends | np.append(splits[1:] != splits[:-1], True))
+        lengths = np.diff(last, prepend=-1)
+        begins_session = np.append(True, ends[last[:-1]])
+        terminated = np.where(user_ends, last_ends, ends)[last]
+        too_long = lengths > (lengths.max() if cut.max_steps is None else cut.max_steps)
+        fits = (lengths >= cut.min_steps) & ~too_long
+        if not fits.all():
+            steps = np.repeat(fits, lengths)
+            batch = {name: values[steps] for name, values in batch.items()}
+        yield Episodes(
+            batch,
+            lengths[fits],
+            users[last][fits],
+            splits[last][fits],
+            begins_session[fits],
+            terminated[fits],
+            int(lengths[too_long].sum()),
+        )
 
 
 class Moments:
-    """Number, mean and squared deviations of vectors of one size, in batches.
-
-    Batches are merged by the formula of Chan, Golub and LeVeque (1983), whose rounding errors do
-    not grow with the mean.
-    """
+    """Number, mean and squared deviations of vectors of one size, in batches, merged by the formula
+    of Chan, Golub and LeVeque (1983), whose rounding errors do not grow with the mean."""
 
     def __init__(self, size: int) -> None:
-        """Of no vectors yet."""
         self.count = 0
         self.mean = np.zeros(size)
         self._deviations = np.zeros((size, size))
@@ -213,7 +201,13 @@ class StepCounts:
         self.first_ms = min(self.first_ms, int(times.min()))
         self.last_ms = max(self.last_ms, int(times.max()))
         self.rewards.add(rewards)
-        self._count_values(rewards)
+        if len(self.values) <= FEW_VALUES:
+            others = rewards
+            for value in self.values:
+                self.values[value] += int(np.count_nonzero(others == value))
+                others = others[others != value]
+            values, counts = (part.tolist() for part in np.unique(others, return_counts=True))
+            self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
         self.lowest = min(self.lowest, float(rewards.min()))
         self.highest = max(self.highest, float(rewards.max()))
         training = np.repeat(episodes.splits == 0, episodes.lengths)
@@ -235,16 +229,6 @@ class StepCounts:
             self.lowest_propensity = float(np.fmin(self.lowest_propensity, lowest))
             self.highest_propensity = float(np.fmax(self.highest_propensity, highest))
 
-    def _count_values(self, rewards: Array) -> None:
-        if len(self.values) > FEW_VALUES:
-            return
-        for value in self.values:
-            same = rewards == value
-            self.values[value] += int(np.count_nonzero(same))
-            rewards = rewards[~same]
-        values, counts = (part.tolist() for part in np.unique(rewards, return_counts=True))
-        self.values |= list(zip(values, counts, strict=True))[: FEW_VALUES + 1]
-
 
 def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
     """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
@@ -256,16 +240,14 @@ def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
     n_items = log.one("SELECT count(*) FROM item_codes")[0] if has_items else 0
     counts = StepCounts(np.zeros(n_items, dtype=np.int64), np.zeros(n_items, dtype=np.int64))
     names = ("user_code", "split", "steps", "begins_session", "terminated")
+    fields = ("users", "splits", "lengths", "begins_session", "terminated")
     whole_numbers = pa.schema([(name, pa.int64()) for name in names])
 
     def count() -> Iterator[pa.RecordBatch]:
         for episodes in read_episodes(rows, cut):
             counts.add(episodes)
-            columns = (
-                *(episodes.users, episodes.splits, episodes.lengths),
-                *(episodes.begins_session, episodes.terminated),
-            )
-            yield pa.record_batch([to_arrow(c) for c in columns], schema=whole_numbers)
+            columns = [to_arrow(getattr(episodes, name)) for name in fields]
+            yield pa.record_batch(columns, schema=whole_numbers)
 
     connection.register("counted", pa.RecordBatchReader.from_batches(whole_numbers, count()))
     connection.execute(
@@ -329,10 +311,8 @@ def number_ids(
     log: TypedLog, features: Mapping[str, Sequence[str]], store: Path | None, grows: bool
 ) -> None:
     """Create the tables `users` and `items`: id, its `number` in sorted order, `train_count`; after
-    `count_steps`.
-
-    Ids are those of the steps and of feature tables (by id column). Those of a `store` have its
-    numbers, and others none; if it `grows`, they follow and counts are added up.
+    `count_steps`. Ids are those of the steps and of feature tables (by id column). Those of a
+    `store` have its numbers, and others none; if it `grows`, they follow and counts are added up.
     """
     for name, table, file in ID_TABLES:
         if name not in log.columns:
@@ -386,7 +366,8 @@ def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
     for name, table, file in ID_TABLES:
         if name not in log.columns:
             continue
-        _copy(log, f"SELECT * EXCLUDE number FROM {table} ORDER BY number", folder / file)
+        rows = log.connection.sql(f"SELECT * EXCLUDE number FROM {table} ORDER BY number")
+        write_batches(folder / file, rows.to_arrow_reader(BATCH_ROWS))
         digest = hashlib.sha256()
         query = f"SELECT {name} FROM {table} ORDER BY number"
         for batch in log.connection.sql(query).to_arrow_reader(BATCH_ROWS):
@@ -398,14 +379,14 @@ def write_ids(log: TypedLog, folder: Path) -> dict[str, list[Any]]:
 def write_episode_users(log: TypedLog, file: Path) -> None:
     """Write the user of every episode, in the order of the store."""
     source = f"{EPISODES} JOIN user_codes ON code = {USER}"
-    _copy(log, f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode", file)
+    users = log.connection.sql(f"SELECT {schema.USER_ID} FROM {source} ORDER BY episode")
+    write_batches(file, users.to_arrow_reader(BATCH_ROWS))
 
 
-def _copy(log: TypedLog, query: str, file: Path) -> None:
-    # DuckDB's COPY cannot write here: its connection may open only the scratch folder.
-    reader = log.connection.sql(query).to_arrow_reader(BATCH_ROWS)
-    with pq.ParquetWriter(file, reader.schema) as writer:
-        for batch in reader:
+def write_batches(file: Path, batches: pa.RecordBatchReader) -> None:
+    """Write rows to a Parquet file, as DuckDB's COPY may only do in the scratch folder."""
+    with pq.ParquetWriter(file, batches.schema) as writer:
+        for batch in batches:
             writer.write_batch(batch)
 
 

@@ -82,9 +82,7 @@ class Task:
     """A query over one file of a log."""
 
     table: Table
-    """Of the file."""
     query: str
-    """SQL."""
     more_files: tuple[Path, ...] = ()
     """Other files that the query reads."""
 
@@ -140,28 +138,26 @@ def _type_rows(
     with explain_errors(tables.connection, tables.tables, scratch):
         every = zip(typed.selects, (table.sql for table in typed.tables), strict=True)
         tables.connection.execute(f"CREATE VIEW {ROWS} AS {number_rows(every)}")
-    files = [replace(table, files=(file,)) for table in typed.tables for file in table.files]
-    rows_of_files = [
-        f"({number_rows([(values, replace(table, files=(file,)).sql)])})"
+    files = [
+        (single := replace(table, files=(file,)), f"({number_rows([(values, single.sql)])})")
         for values, table in zip(typed.selects, typed.tables, strict=True)
         for file in table.files
     ]
     surveys = [
         Task(file, f"SELECT {n}::BIGINT AS file, * FROM ({survey_vectors(typed.names, rows)})")
-        for n, (file, rows) in enumerate(zip(files, rows_of_files, strict=True))
+        for n, (file, rows) in enumerate(files)
     ]
     columns = f"file bigint, {schema.ACTION} bigint, {schema.OBSERVATION} bigint, n bigint"
     survey = _run(spark, surveys, f"{columns}, bad bigint").collect()
     log = describe_log(tables, typed, [row[1:] for row in survey])
     tasks, rows_before = [], 0
-    for number, (file, rows) in enumerate(zip(files, rows_of_files, strict=True)):
+    for number, (file, rows) in enumerate(files):
         faulty = mark_faults(log, rows, known_items)
         query = f"SELECT * REPLACE (row + {rows_before} AS row) FROM ({faulty})"
         tasks.append(Task(file, query, () if known_items is None else (known_items,)))
         rows_before += sum(row["n"] for row in survey if row["file"] == number)
-    types = {"row": "bigint"}
-    types |= {n: _TYPES[n if n in _TYPES else log.id_type(n)] for n in log.columns}
-    types |= {schema.REWARD: "double"}
+    types = {n: _TYPES[n if n in _TYPES else log.id_type(n)] for n in log.columns}
+    types = {"row": "bigint", **types, schema.REWARD: "double"}
     types |= {"action_hash": "bigint"} if schema.ACTION in types else {}
     types |= {"fault": "smallint"}
     frame = _run(spark, tasks, ", ".join(f"{name} {kind}" for name, kind in types.items()))
@@ -169,7 +165,6 @@ def _type_rows(
 
 
 def _run(spark: Any, tasks: Sequence[Task], columns: str) -> Any:
-    """A Spark frame of the results of tasks, which its workers run."""
     numbers = spark.range(0, len(tasks), 1, len(tasks))
     return numbers.mapInArrow(partial(run_tasks, tasks), columns)
 
@@ -250,7 +245,6 @@ def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[in
 def _work_on_part(
     work: Work, mapping: LogMapping, name: str, batches: Iterator[pa.RecordBatch]
 ) -> Iterator[pa.RecordBatch]:
-    """Run `work` on the rows of a part; nothing if none is usable."""
     from pyspark import TaskContext
 
     context = TaskContext.get()

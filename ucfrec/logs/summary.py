@@ -1,6 +1,7 @@
 """Report on what was read of a log, dropped and kept, and warnings that its owner would want."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -64,10 +65,7 @@ right one), and `quantiles` by share, e.g. `{"0.5": 3}`."""
 
 
 def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, Any]:
-    """Counts and statistics of a log, as JSON values.
-
-    Times are in ms, `reward_statistics` in units of the reward.
-    """
+    """Counts and statistics of a log, as JSON values; times are in ms."""
     log = rows.log
     splits = {name: {"episodes": 0, "steps": 0} for name in schema.SPLITS}
     for split, episodes, steps in log.connection.sql(
@@ -117,10 +115,8 @@ def build_report(rows: SortedRows, cut: Cut, counts: StepCounts) -> dict[str, An
 
 
 def _explain_returns(returns: Moments) -> float | None:
-    """Share of the variance of training returns-to-go that the number of steps left explains.
-
-    Of the whole rest of the session; None if either does not vary.
-    """
+    """Share of the variance of training returns-to-go, of the whole rest of the session, that the
+    number of steps left explains; None if either does not vary."""
     (return_to_go, both), (_, ahead) = returns.covariance
     # What is left of the rounding errors of equal returns is not variance.
     if return_to_go <= 1e-24 * returns.mean[0] ** 2 or not ahead:
@@ -131,10 +127,8 @@ def _explain_returns(returns: Moments) -> float | None:
 def _measure_distributions(
     rows: SortedRows, cut: Cut, counts: StepCounts
 ) -> dict[str, Distribution]:
-    """`session_lengths`: episodes by length in steps (each piece of a session that a split cuts
-    counts as one), in bins of doubling width. `rewards`: steps by reward; the first and last bin
-    include the values beyond them. `item_popularity` (logs with items only): items by the number of
-    steps that show them, in bins of doubling width; items that only feature tables list have 0."""
+    """`session_lengths`: episodes by length in steps. `rewards`: steps by reward; the outer bins
+    include the values beyond them. `item_popularity`: items by the steps that show them."""
     connection = rows.log.connection
     result = {"session_lengths": _bin_counts(connection, f"SELECT steps FROM {EPISODES}")}
     if len(counts.values) <= FEW_VALUES:
@@ -179,8 +173,7 @@ def _bin_rewards(rows: SortedRows, cut: Cut, counts: StepCounts) -> Distribution
         sample.append(rewards[mix_bits(keys + times.astype(np.uint64)) % np.uint64(every) == 0])
     ordered = np.sort(np.concatenate(sample))
     quantiles = _weigh_quantiles(ordered, np.ones(len(ordered), dtype=np.int64))
-    ends = list(quantiles.values())
-    low, high = ends[1], ends[-2]
+    low, high = quantiles["0.01"], quantiles["0.99"]
     if not low < high:
         low, high = counts.lowest, counts.highest
     edges = np.linspace(low, high, FEW_VALUES + 1)
@@ -342,18 +335,18 @@ def note_losses(rows: SortedRows, reward: str, where: str | None = None) -> None
 
 def _explain_missing(log: TypedLog, reward: str, where: str) -> str:
     """Why the reward is undefined, and what to do."""
-    counts: dict[str, int] = {}
+    counts = Counter[str]()
     for table in log.tables:
         bound = bind(log.connection, table, "for the reward", reward)
         aggregates = ["count(*)", *(f"count(*) - count({quote_name(n)})" for n in bound.columns)]
         undefined = f"TRY(CAST({bound.sql} AS DOUBLE)) IS NULL AND ({where}\n)"
         (_, *nulls) = log.one(f"SELECT {', '.join(aggregates)} FROM {table.sql} WHERE {undefined}")
         for name, n in zip(bound.columns, nulls, strict=True):
-            counts[name] = counts.get(name, 0) + n
-    most = max(counts, key=lambda name: counts[name], default=None)
-    if most is None or not counts[most]:
-        return "undefined there (NaN, infinite, or a division by zero); give a default by coalesce"
-    return f"null because {most} is, in {counts[most]:,} rows; give a default: coalesce({most}, 0)"
+            counts[name] += n
+    for most, n in counts.most_common(1):
+        if n:
+            return f"null because {most} is, in {n:,} rows; give a default: coalesce({most}, 0)"
+    return "undefined there (NaN, infinite, or a division by zero); give a default by coalesce"
 
 
 def note_undefined(

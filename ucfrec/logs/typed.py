@@ -151,7 +151,16 @@ def type_columns(log: LogTables, as_text: Collection[str] = ()) -> TypedColumns:
     Optional columns that only some of the files have are excluded, with an `InputNote`. Raises
     InputError if a column is missing or of an unsupported type, or an expression cannot be used.
     """
-    columns = _list_present(log)
+    # `bind` reports required columns that are missing.
+    mapped = {name for name, value in log.mapping.columns.items() if value}
+    names = [{column.casefold() for column in table.columns} for table in log.tables]
+    present = mapped | (names[0].intersection(*names) - log.mapping.columns.keys())
+    if log.session_by == schema.SESSION_ID:
+        present.add(log.session_by)
+    vectors_only = schema.ACTION in present and schema.ITEM_ID not in present
+    key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
+    optional = (name for name in OPTIONAL_COLUMNS if name in present)
+    columns = (schema.USER_ID, key, schema.TIMESTAMP, *optional)
     _note_partial(log.tables, {*columns, *log.mapping.columns})
     selects = [_select(log, table, columns) for table in log.tables]
     for name in _IDS:
@@ -242,26 +251,12 @@ def not_finite(vector: str) -> str:
     return f"{vector} IS NULL OR NOT {finite}"
 
 
-def _list_present(log: LogTables) -> tuple[str, ...]:
-    """Log columns that every file has, and the required ones, which `bind` reports if missing."""
-    mapped = {name for name, value in log.mapping.columns.items() if value}
-    names = [{column.casefold() for column in table.columns} for table in log.tables]
-    present = mapped | (names[0].intersection(*names) - log.mapping.columns.keys())
-    if log.session_by == schema.SESSION_ID:
-        present.add(log.session_by)
-    vectors_only = schema.ACTION in present and schema.ITEM_ID not in present
-    key = schema.ACTION if schema.ACTION in mapped or vectors_only else schema.ITEM_ID
-    optional = (name for name in OPTIONAL_COLUMNS if name in present)
-    return (schema.USER_ID, key, schema.TIMESTAMP, *optional)
-
-
 def _note_partial(tables: Sequence[Table], excluded: set[str]) -> None:
     """Warn of optional columns, but those excluded, that only some files have."""
     count = sum(len(table.files) for table in tables)
-    for name in [name for name in OPTIONAL_COLUMNS if name not in excluded]:
-        having = [t for t in tables if name in {column.casefold() for column in t.columns}]
-        files = [file for table in having for file in table.files]
-        if files:
+    for name in (name for name in OPTIONAL_COLUMNS if name not in excluded):
+        having = (t for t in tables if name in map(str.casefold, t.columns))
+        if files := [file for table in having for file in table.files]:
             warn_user(
                 f"{name} is excluded: only {len(files)} of {count} files have it ({files[0]}); add "
                 f"it to the others, or drop it with --column {name}="
@@ -389,11 +384,8 @@ def _unify_ids(
     name: str,
     as_text: bool,
 ) -> None:
-    """Cast ids to BIGINT if every file has integers that fit, else or with `as_text` to text.
-
-    Text of a CSV file is an integer only if written as the integer is: 007, 7.0 and 1e1 are not.
-    Ids that are written as 7 and as 7.0 are two ids, with a note.
-    """
+    """Cast ids to BIGINT if every file has integers that fit and, in a CSV file, are written as
+    integers are (not 007, 7.0 or 1e1), else or with `as_text` to text."""
     whole, some_whole, with_decimals = True, False, None
     for table, values in selects:
         sql, kind = values[name]
@@ -432,7 +424,6 @@ class _Survey(NamedTuple):
     filled: int
     numbers: int
     iso: int
-    """Times that begin with the year."""
     dated: int
     """Times that begin with the day or the month; the next three are of these."""
     first: int | None
@@ -456,9 +447,8 @@ def cast_text_time(
     InputError if none of the text is a time, or the order is not settled.
     """
     if time_format is not None:
-        return (
-            f"epoch_ms(TRY(CAST(try_strptime(trim({sql}), {quote(time_format)}) AS TIMESTAMPTZ)))"
-        )
+        time = f"try_strptime(trim({sql}), {quote(time_format)})"
+        return f"epoch_ms(TRY(CAST({time} AS TIMESTAMPTZ)))"
     with explain_errors(connection, (table,), table.files[0].parent):
         surveys = [_survey(connection, replace(table, files=(f,)), sql) for f in table.files]
     numbers, iso = any(s.numbers for s in surveys), any(s.iso for s in surveys)
@@ -508,8 +498,7 @@ def _survey(connection: duckdb.DuckDBPyConnection, table: Table, sql: str) -> _S
         for n in (1, 2)
     )
     (row,) = connection.sql(
-        f"SELECT count(x), count(*) FILTER ({number}), count(*) FILTER ({iso}), "
-        f"count(*) FILTER ({dated}), "
+        f"SELECT count(x), count_if({number}), count_if({iso}), count_if({dated}), "
         f"max({first}), max({second}), min(CASE WHEN {dated} THEN x END), "
         f"min(CASE WHEN NOT ({number} OR {iso} OR {dated}) THEN x END) "
         f"FROM (SELECT nullif(trim(CAST({sql} AS VARCHAR)), '') AS x FROM {table.sql})"

@@ -149,14 +149,12 @@ class LoggedRewards:
     session, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        parts = [
-            np.unique(rewards, return_counts=True)
-            for (rewards,) in store.column_batches(schema.REWARD)
-        ]
-        rewards, place = np.unique(
-            np.concatenate([distinct for distinct, _ in parts]), return_inverse=True
-        )
-        counts = np.bincount(place, np.concatenate([distinct for _, distinct in parts]))
+        batches = store.column_batches(schema.REWARD)
+        parts = [np.unique(rewards, return_counts=True) for (rewards,) in batches]
+        distinct = np.concatenate([values for values, _ in parts])
+        numbers = np.concatenate([counts for _, counts in parts])
+        rewards, place = np.unique(distinct, return_inverse=True)
+        counts = np.bincount(place, numbers)
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]
         if len(values) > _GROUPS:
             middle = (counts.cumsum() - counts / 2) / counts.sum()

@@ -115,8 +115,7 @@ class Design:
     def select(self, rows: Tensor) -> "Design":
         """The design of the rows where a bool mask (M,) is true."""
         names = ("items", "users", "x", "observed", "exposure", "target", "rows", "weights")
-        parts = {name: getattr(self, name)[rows] for name in (*names, "tastes")}
-        return replace(self, **parts)
+        return replace(self, **{name: getattr(self, name)[rows] for name in (*names, "tastes")})
 
     def forget_users(self) -> "Design":
         """The same rows as if no user were known."""
@@ -141,25 +140,21 @@ class Design:
 
     def predictor(self, effects: Effects) -> Tensor:
         """Linear predictors (M,) as the sum of the given effects."""
+        terms: dict[str, _Map] = {
+            "item": lambda numbers: numbers[self.items],
+            "content": lambda numbers: self.sum_content(numbers)[self.items],
+            "user": lambda numbers: numbers[self.users],
+            "tastes": lambda number: self.tastes * number,
+            "exposure": self.exposure.matmul,
+            "state": self.x.matmul,
+            "affinity": lambda rows: (F.embedding(self.users, rows) * self.rows).sum(1),
+            "interaction": lambda matrix: ((self.x @ matrix) * self.rows).sum(1),
+            "context": lambda matrix: ((self.observed @ matrix) * self.rows).sum(1),
+        }
         total = effects["mean"].expand(len(self.items))
-        if "item" in effects:
-            total = total + effects["item"][self.items]
-        if "content" in effects:
-            total = total + self.sum_content(effects["content"])[self.items]
-        if "user" in effects:
-            total = total + effects["user"][self.users]
-        if "tastes" in effects:
-            total = total + self.tastes * effects["tastes"]
-        if "exposure" in effects:
-            total = total + self.exposure @ effects["exposure"]
-        if "state" in effects:
-            total = total + self.x @ effects["state"]
-        if "affinity" in effects:
-            total = total + (F.embedding(self.users, effects["affinity"]) * self.rows).sum(1)
-        if "interaction" in effects:
-            total = total + ((self.x @ effects["interaction"]) * self.rows).sum(1)
-        if "context" in effects:
-            total = total + ((self.observed @ effects["context"]) * self.rows).sum(1)
+        for name, term in terms.items():
+            if name in effects:
+                total = total + term(effects[name])
         return total
 
     def sum_content(self, content: Tensor) -> Tensor:
@@ -324,9 +319,8 @@ def _moments(design: Design, inputs: Tensor) -> Tensor:
 
 def _factors(moments: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
     """U and its inverse with UᵀU = moments + ridge · I, for square matrices."""
-    whole = moments.double() + (ridge + _SMALLEST) * torch.eye(len(moments), dtype=torch.float64)
-    upper = torch.linalg.cholesky(whole).T
     identity = torch.eye(len(moments), dtype=torch.float64)
+    upper = torch.linalg.cholesky(moments.double() + (ridge + _SMALLEST) * identity).T
     return upper.float(), torch.linalg.solve_triangular(upper, identity, upper=True).float()
 
 
@@ -367,8 +361,8 @@ class EffectSearch:
     """The effects found so far, one after the other, and their loss on held-out rows."""
 
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
-    """Where users are new: the model, whose `tastes` are set on the way, and what the sessions of
-    training and of held-out rows showed before them."""
+    """Where users are new: the model, whose `tastes` are set, and what sessions showed before
+    training and held-out rows."""
 
     def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""
@@ -389,11 +383,8 @@ class EffectSearch:
 
     @property
     def _spreads(self) -> dict[str, float]:
-        return {
-            name: _SPREADS[number]
-            for name, number in self.kept.items()
-            if not (self.new_users and name in LASTING)
-        }
+        left_out = LASTING if self.new_users else ()
+        return {name: _SPREADS[n] for name, n in self.kept.items() if name not in left_out}
 
     @property
     def of_new_users(self) -> bool:
@@ -411,7 +402,14 @@ class EffectSearch:
     def add(self, name: str) -> None:
         """Add the effect `name` with the best spread, if it lowers the held-out loss."""
         if name == "tastes" and self._root is not None:
-            self._scale_tastes(self._root)
+            root = self._root
+
+            def loss(scale: float) -> float:
+                self.set_tastes(scale * root)
+                return float(self._find_best("tastes", _FIRST, ())[2].mean())
+
+            # How much users differ, relative to noise, is chosen by the held-out loss.
+            self.set_tastes(min(_SCALES, key=loss) * root)
         no_one = bool((self.design.users == self.design.n_users).all())
         if not self.design.squares(name).any() or (no_one and name in ("user", "affinity")):
             return
@@ -456,15 +454,6 @@ class EffectSearch:
         self.design = self.design.forget_users()
         self.effects = fit_effects(self.design, self.design.mean_effect(), {}, self._fixed)
         self.losses = self._losses(self.effects)
-
-    def _scale_tastes(self, root: Tensor) -> None:
-        """Choose how much users differ, relative to noise, by the held-out loss."""
-
-        def loss(scale: float) -> float:
-            self.set_tastes(scale * root)
-            return float(self._find_best("tastes", _FIRST, ())[2].mean())
-
-        self.set_tastes(min(_SCALES, key=loss) * root)
 
     def set_tastes(self, root: Tensor) -> None:
         """Let the sessions tell tastes, whose covariance has the root, beside `effects`."""

@@ -1,11 +1,10 @@
 """Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
 Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
-knows: where rewards are drawn from a model that learns tastes from the session, a policy is paid
-for its own guesses. Logs of policies that knew more of their users than the log shows make what
-they showed look better than it is for anybody else. Where the log has all propensities, and users
-are new, rows are therefore weighted (`weigh_by_propensity`). Known users are calibrated on weighted
-validation rows instead (`UserCalibration`): weights would cost their tastes data.
+knows: a model that learns tastes from the session would pay a policy for its own guesses. Policies
+that knew more of their users than the log shows make what they showed look better than it is. Where
+the log has all propensities, and users are new, rows are therefore weighted; known users are
+calibrated on weighted validation rows instead (`UserCalibration`), as weights would cost them data.
 """
 
 from dataclasses import dataclass
@@ -79,13 +78,8 @@ def reward_model_sizes(store: EpisodeStore) -> dict[str, int]:
     """Sizes of the reward model of a store of items, as `ItemRewardModel` takes them."""
     states = store.item_states
     items, dim = states.embeddings.shape
-    return {
-        "state": store.state_size,
-        "action": dim,
-        "items": items,
-        "users": len(states.user_features),
-        "tags": states.tags.shape[1],
-    }
+    sizes = {"state": store.state_size, "action": dim, "items": items}
+    return {**sizes, "users": len(states.user_features), "tags": states.tags.shape[1]}
 
 
 def fit_item_reward_model(

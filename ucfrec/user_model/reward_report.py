@@ -83,11 +83,14 @@ class RewardRows:
 
 def draw_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, IntArray]:
     """Episodes and steps (M,) of all steps of a view; of more than `limit`, so many drawn."""
-    numbers = np.arange(view.n_steps)
-    if view.n_steps > limit:
-        sample = np.random.default_rng(seed).choice(view.n_steps, limit, replace=False)
-        numbers = np.sort(sample)
-    return view.locate(numbers)
+    return view.locate(draw_numbers(view.n_steps, limit, seed))
+
+
+def draw_numbers(count: int, limit: int, seed: int) -> IntArray:
+    """The numbers below `count`; of more than `limit`, so many drawn."""
+    if count <= limit:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(seed).choice(count, limit, replace=False))
 
 
 def weigh_by_propensity(
@@ -288,6 +291,5 @@ class UserCalibration:
 def halve_users(view: EpisodeStore) -> IntArray:
     """Half (E,) of the users, 0 or 1, to which the episodes of a view belong; of the episodes,
     where users are not named."""
-    if not view.has_users:
-        return np.arange(view.n_episodes) % 2
-    return view.episode_values(schema.USER).astype(np.int64) % 2
+    numbers = view.episode_values(schema.USER) if view.has_users else np.arange(view.n_episodes)
+    return numbers.astype(np.int64) % 2

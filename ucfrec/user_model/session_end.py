@@ -20,7 +20,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
-from ucfrec.user_model.reward_report import SAVED
+from ucfrec.user_model.reward_report import SAVED, draw_numbers
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
@@ -44,13 +44,9 @@ _HIGHEST: Final = 20.0
 TREES: Final = 100
 LEAVES: Final = 8
 """Most trees, and leaves of a tree."""
-_SETTINGS: Final = {
-    "learning_rate": 0.2,
-    "max_iter": TREES,
-    "max_leaf_nodes": LEAVES,
-    "early_stopping": True,
-}
+_SETTINGS: Final = {"learning_rate": 0.2, "max_iter": TREES, "max_leaf_nodes": LEAVES}
 _SPLITS: Final = LEAVES - 1
+_LOGISTIC: Final = ("highest", "mean", "scale", "weights", "bias")
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,7 @@ class LoggedEnds:
         last one of a session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
         ends = np.cumsum(usable)
-        numbers = np.arange(int(ends[-1]))
-        if len(numbers) > most:
-            sample = np.random.default_rng(seed).choice(len(numbers), most, replace=False)
-            numbers = np.sort(sample)
+        numbers = draw_numbers(int(ends[-1]), most, seed)
         episodes = np.searchsorted(ends, numbers, side="right")
         steps = numbers - (ends - usable)[episodes]
         items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
@@ -152,7 +145,7 @@ class SessionEnd:
             parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
             _require_trees(**parts)
             return cls(likeness, parts)
-        parts = {name: tensors[name] for name in ("highest", "mean", "scale", "weights", "bias")}
+        parts = {name: tensors[name] for name in _LOGISTIC}
         for name, entry in parts.items():
             shape = () if name == "bias" else (_INPUTS,)
             if entry.shape != shape or entry.dtype != torch.float64:
@@ -223,10 +216,9 @@ class SessionEnd:
         alike = self._likeness.to_candidates(profiles.view(batch, _LAGS, -1), items)
         repeated, number = history.items.unsqueeze(2) == items.unsqueeze(1), steps.unsqueeze(1)
         if self._trees is None:
-            inputs = [
-                torch.stack(_columns(alike, repeated, entry, number), -1) for entry in rewards
-            ]
-            odds = self._log_odds(torch.cat(inputs).flatten(0, 1))
+            each = (_columns(alike, repeated, entry, number) for entry in rewards)
+            inputs = torch.cat([torch.stack(columns, -1) for columns in each])
+            odds = self._log_odds(inputs.flatten(0, 1))
             return [*torch.sigmoid(odds).view(-1, batch, count).unbind(0)]
         columns = torch.stack(_columns(alike, repeated, rewards[0], number)).flatten(1)
         values = [entry.flatten() for entry in rewards]
@@ -234,11 +226,10 @@ class SessionEnd:
         return [torch.sigmoid(odds).view(batch, count) for odds in odds_of_each]
 
     def _log_odds(self, inputs: Tensor) -> Tensor:
-        tensors = self.tensors
         if self._trees is not None:
             return self._trees(inputs)
-        standard = (inputs.minimum(tensors["highest"]) - tensors["mean"]) / tensors["scale"]
-        return standard @ tensors["weights"] + tensors["bias"]
+        highest, mean, scale, weights, bias = map(self.tensors.__getitem__, _LOGISTIC)
+        return (inputs.minimum(highest) - mean) / scale @ weights + bias
 
 
 def load_session_end(folder: Path, reward: ItemRewardModel | None) -> SessionEnd | None:
@@ -342,9 +333,8 @@ class BoostedTrees:
         at_most[first:end] = 0.0
         columns, bits = self._bits @ at_most, self._bits[:, first:end]
         thresholds = self._thresholds[first:end]
-        return [
-            self._sums(columns + bits @ (entry.double() <= thresholds).float()) for entry in values
-        ]
+        below = ((entry.double() <= thresholds).float() for entry in values)
+        return [self._sums(columns + bits @ at_most) for at_most in below]
 
     def _compare(self, inputs: Tensor) -> Tensor:
         """(U, M) float32, 1 where the input of a split is at most its threshold."""
@@ -373,7 +363,8 @@ def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:
     of the rows, drawn by `seed`, decides when to stop."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
-    model = HistGradientBoostingClassifier(random_state=seed, **_SETTINGS).fit(inputs, target)
+    model = HistGradientBoostingClassifier(early_stopping=True, random_state=seed, **_SETTINGS)
+    model.fit(inputs, target)
     tables = [_tabulate(trees[0].nodes) for trees in model._predictors]
     splits, thresholds, leaves = (
         torch.from_numpy(np.stack(entry)) for entry in zip(*tables, strict=True)

@@ -27,7 +27,6 @@ from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 from ucfrec.logs.tables import Table, open_tables
 from ucfrec.runs.trained_policy import TrainedPolicy
-from ucfrec_datasets import kuairand, kuairec, obd
 
 SECRET = "the content of a file that was not named"
 HONEST = (
@@ -140,18 +139,6 @@ def test_honest_expressions_are_values_of_a_log(
     relation = connection.sql(f"SELECT {sql} AS x FROM log")
     assert [str(found) for found in relation.types] == [kind]
     assert relation.to_arrow_table().shape == (300, 1)
-
-
-def test_the_datasets_have_expressions(connection: duckdb.DuckDBPyConnection) -> None:
-    features = (
-        *(*kuairand.USER_COLUMNS, *kuairand.BASIC_COLUMNS, *kuairand.STATISTIC_COLUMNS),
-        *(*kuairec.USER_COLUMNS, *kuairec.CATEGORY_COLUMNS, *kuairec.DAILY_COLUMNS),
-    )
-    assert {len(columns_of(connection, text)) for text in features} == {1, 2}
-    for mapping in (kuairand.MAPPING, kuairec.MAPPING, obd.MAPPING):
-        for text in (*mapping.columns.values(), mapping.reward):
-            assert text is not None
-            assert columns_of(connection, text)
 
 
 def test_columns_are_named_once_in_order(connection: duckdb.DuckDBPyConnection) -> None:

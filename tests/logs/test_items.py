@@ -140,13 +140,6 @@ def test_reward_scale_of_the_training_window(tmp_path: Path) -> None:
     assert states.reward_high == pytest.approx(train.mean() + 2 * train.std(ddof=0))
 
 
-def test_the_same_log_gives_the_same_bits(tmp_path: Path) -> None:
-    log = make_log()
-    first = learn(tmp_path / "a", log).item_states.embeddings
-    again = learn(tmp_path / "b", log.sample(frac=1, random_state=0)).item_states.embeddings
-    assert first.equal(again)
-
-
 def test_few_users_or_items_give_few_dimensions(tmp_path: Path) -> None:
     zero = np.zeros(4, dtype=np.int64)
     one_user = Exposure(tmp_path / "one_user", np.array([2, 2, 0]))

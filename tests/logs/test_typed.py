@@ -111,7 +111,7 @@ def test_iso_times_are_read_with_and_without_zone(
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
+def test_other_text_and_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
     times = days("2024-03-01", 11).strftime("%d %b %Y %H:%M")
     path = write(make_log(times), tmp_path / f"log{suffix}")
     mapping = LogMapping(time_format="%d %b %Y %H:%M")
@@ -119,12 +119,8 @@ def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
     zoned = write(make_log(times + " +0200"), tmp_path / f"zoned{suffix}")
     mapping = LogMapping(time_format="%d %b %Y %H:%M %z")
     assert range_of(zoned, mapping) == ["2024-02-29", "2024-03-11"]
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
-    times = days("2024-03-01", 11).strftime("%Y%m%d%H%M").astype("int64")
-    path = write(make_log(times), tmp_path / f"log{suffix}")
+    numbers = days("2024-03-01", 11).strftime("%Y%m%d%H%M").astype("int64")
+    path = write(make_log(numbers), tmp_path / f"numbers{suffix}")
     assert range_of(path, LogMapping(time_format="%Y%m%d%H%M")) == ["2024-03-01", "2024-03-11"]
 
 

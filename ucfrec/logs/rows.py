@@ -406,13 +406,9 @@ def choose_rows(
 ) -> IntArray:
     """(K,) positions of the rows of a log in memory that count, in order of user and time.
 
-    `order_rows` and `SortedRows.add` do the same for logs of any size.
-
-    Args:
-        rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
-            (position in the log) and perhaps those of `order_duplicates`.
-        duplicates: key of `DUPLICATES`.
-        user_id: the only user, if `user` does not hold identifiers.
+    `order_rows` and `SortedRows.add` do the same for logs of any size. `rows` are (N,) columns in
+    any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row` (position in the log) and
+    perhaps those of `order_duplicates`; `user_id` the only user, if `user` holds no identifiers.
     """
     users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT

@@ -350,12 +350,10 @@ def number_ids(
 
 def list_text_ids(store: Path | None) -> tuple[str, ...]:
     """Id columns that are text in a store; none without one."""
-    if store is None:
-        return ()
     return tuple(
         name
         for name, _, file in ID_TABLES
-        if (store / file).is_file()
+        if store is not None and (store / file).is_file()
         if not pa.types.is_integer(pq.read_schema(store / file).field(name).type)
     )
 

@@ -152,9 +152,11 @@ def test_propensities_and_random_rows_may_begin_with_the_new_logs(
 def test_sessions_of_the_lengths_that_prepare_left_out_stay_out(tmp_path: Path) -> None:
     given = {"reward": "reward", "session_by": "gap", "gap_minutes": 20}
     lengths = {"min_steps": 2, "max_session": 7}
-    store_of(tagged_log(), tmp_path, tagged_mapping(tmp_path), **given, **lengths)
+    store_of(tagged_log(), tmp_path, None, **given, **lengths)
     later_log().to_parquet(tmp_path / "later.parquet")
-    report = append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)  # without features, new ids need none
+        report = append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
     assert report["dropped"]["short_episode"] > 0 < report["dropped"]["long_session"]
     steps = EpisodeStore.open(tmp_path / "grown").lengths
     assert (steps.min(), steps.max()) == (2, 7)
@@ -205,14 +207,6 @@ def test_new_ids_without_features_are_noted(grown: Path, tmp_path: Path) -> None
     items = rf"store was prepared with item features and none .* all {NEW} new items .* --mapping"
     with pytest.warns(InputNote, match=items), pytest.warns(InputNote, match="all 6 new users"):
         append_logs(grown / "store", logs, tmp_path / "none")
-
-
-def test_a_store_without_features_needs_none_for_new_ids(tmp_path: Path) -> None:
-    store_of(tagged_log(), tmp_path)
-    later_log().to_parquet(tmp_path / "later.parquet")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputNote)
-        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])

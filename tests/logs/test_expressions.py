@@ -82,6 +82,14 @@ HONEST = (
     'abs("a column, with ""quotes""")',
     "isfinite(play_ms / duration_ms)",
     "sqrt(abs(play_ms)) + pow(2, is_click)",
+    # What shops write is not taken for growth.
+    "array_to_string(string_split(tag, '|'), ', ')",
+    "concat_ws('-', tag, play_ms::VARCHAR, day)",
+    " || ".join(["play_ms::VARCHAR"] * 60),
+    "+".join(["play_ms"] * 90),
+    "CASE WHEN " + " OR ".join(f"tag = '{n}'" for n in range(200)) + " THEN 1 END",
+    "coalesce(json->>'$.x', json::JSON->>'$.like')::DOUBLE",
+    "strftime(epoch_ms(seconds::BIGINT)::TIMESTAMP, '%Y-%m-%d')::VARCHAR || '!'",
 )
 
 
@@ -428,23 +436,6 @@ def nested(depth: int, template: str) -> str:
 def test_text_cannot_grow_without_bound(text: str) -> None:
     with engine((), None) as connection, pytest.raises(NotScalarError, match=r"text"):
         columns_of(connection, text)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "array_to_string(string_split(a, '|'), ', ')",
-        "concat_ws('-', a, b::VARCHAR, c)",
-        " || ".join(["a::VARCHAR"] * 60),
-        "+".join(["a"] * 90),
-        "CASE WHEN " + " OR ".join(f"a = '{n}'" for n in range(200)) + " THEN 1 END",
-        "coalesce(a->>'$.x', b::JSON->>'$.y')::DOUBLE",
-        "strftime(epoch_ms(a::BIGINT)::TIMESTAMP, '%Y-%m-%d')::VARCHAR || '!'",
-    ],
-)
-def test_what_shops_write_is_not_taken_for_growth(text: str) -> None:
-    with engine((), None) as connection:
-        assert "a" in columns_of(connection, text)
 
 
 def test_the_documentation_lists_every_function() -> None:

@@ -119,14 +119,10 @@ class Histories:
 
     def with_rows(self, rows: BoolArray | IntArray) -> "Histories":
         """The same users with only some rows: their numbers, or (N,) true for them."""
-        return replace(
-            self,
-            owner=self.owner[rows],
-            item_ids=self.item_ids[rows],
-            rewards=self.rewards[rows],
-            timestamps=self.timestamps[rows],
-            session_ids=None if self.session_ids is None else self.session_ids[rows],
-        )
+        names = ("owner", "item_ids", "rewards", "timestamps", "session_ids")
+        columns = {name: getattr(self, name) for name in names}
+        kept = {name: values[rows] for name, values in columns.items() if values is not None}
+        return replace(self, **kept)
 
 
 def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:

@@ -205,13 +205,9 @@ class SortedRows:
         if by_session:
             users, sessions = batch[USER], batch[SESSION]
             # Sessions are in the order of their first times.
-            grouped = np.lexsort((sessions, users))
-            same = _equal_before(users[grouped]) & _equal_before(sessions[grouped])
-            starts = np.flatnonzero(np.append(True, ~same))
-            began = np.empty(len(users), dtype=np.int64)
-            lengths = np.diff(np.append(starts, len(users)))
-            began[grouped] = np.repeat(times[grouped][starts], lengths)
-            order = np.lexsort((sessions, began, users))
+            keys_of_sessions = (users.astype(np.int64) << 32) + sessions
+            _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
+            order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
         self.file.append(batch)
 

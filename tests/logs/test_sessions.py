@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.support.logs import START
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, validate
-
-START = 1_700_000_000_000
 
 
 def write_log(folder: Path, times: np.ndarray, **columns: object) -> Path:

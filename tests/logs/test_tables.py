@@ -265,16 +265,6 @@ def test_keys_of_features_in_a_csv_file_are_their_text(tmp_path: Path) -> None:
 # Empty parts, missing values, truth values
 
 
-def test_empty_parts_and_columns_that_are_null_in_a_part_are_read(tmp_path: Path) -> None:
-    log = random_log(1500, 60)
-    nulls = pd.Series([None] * 700, dtype="float64")
-    write(log[:700].assign(propensity=nulls), tmp_path / "a.parquet")
-    write(log[700:].assign(propensity=0.05), tmp_path / "b.parquet")
-    write(log[:0].assign(propensity=0.05), tmp_path / "c.parquet")
-    report = validate(log_files([tmp_path]), LogMapping())
-    assert (report["steps"], report["unknown_propensities"]) == (1500, 700)
-
-
 @pytest.mark.parametrize(
     ("suffix", "kind"), [(".parquet", "object"), (".parquet", "string"), (".csv", "object")]
 )

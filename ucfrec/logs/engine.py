@@ -190,7 +190,8 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
         for read in columns_of(connection, expression):
             if read.casefold() not in names:
                 raise _missing(table, what, read)
-            types[names[read.casefold()]] = columns[names[read.casefold()]]
+            name = names[read.casefold()]
+            types[name] = columns[name]
         sql = f"({expression}\n)"
         try:
             kind = _find_type(connection, sql, types)

@@ -281,7 +281,8 @@ def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64A
     values, vectors = np.linalg.eigh(symmetric)
     values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
     missing = max(0, rank - len(values))
-    values, vectors = np.pad(values, (0, missing)), np.pad(vectors, ((0, 0), (0, missing)))
+    values = np.pad(values, (0, missing))
+    vectors = np.pad(vectors, ((0, 0), (0, missing)))
     values = np.where(values > _SMALL * max(values[0], 0), values, 0)
     return np.sqrt(values), np.where(values > 0, vectors, 0)
 

@@ -122,7 +122,7 @@ class Exposure:
     def cooccurrence(self, size: int) -> Float64Array:
         """(trained items, ≤ size) unit rows from the SVD of the matrix."""
         by_item = np.sqrt(self._by_item)
-        rank = min(size + 1, *self._rows.shape)
+        rank = min(size + 1, min(self._rows.shape))
         require_blas_memory()
         strength, directions = right_singular_vectors(self._rows, by_item, rank)
         # One direction holds only the popularity of items (the trivial axis of correspondence

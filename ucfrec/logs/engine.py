@@ -121,10 +121,8 @@ def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def anonymous_bytes(process: int | None = None) -> int:
-    """Memory of a process (by number; None for this one) that is not mapped from files.
-
-    The system cannot take it back. 0 where it does not say, or the process has ended.
-    """
+    """Memory of a process (by number; None for this one) that is not mapped from files; 0 where
+    the system does not say, or the process has ended."""
     try:
         lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()
     except OSError:
@@ -142,10 +140,8 @@ def bytes_of(size: str) -> int | None:
 
 
 def to_numpy(column: "pa.Array") -> Array:
-    """A column of numbers or truth values without missing ones, copied only if it must be.
-
-    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
-    """
+    """A column of numbers or truth values without missing ones, copied only if it must be;
+    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log."""
     if str(column.type) == "bool":
         return np.from_dlpack(column.cast("uint8")).view(np.bool_)
     return np.from_dlpack(column)

@@ -153,8 +153,7 @@ class _Further:
 
 
 def _names_of(table: Table) -> dict[str, str]:
-    """Column names in lower case to those of the files, without a pandas index: case does not
-    matter."""
+    """Column names in lower case to those of the files, without a pandas index."""
     return {name.casefold(): name for name in table.columns if not PANDAS_INDEX.fullmatch(name)}
 
 

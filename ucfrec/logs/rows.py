@@ -71,14 +71,11 @@ REASONS: Final = {
 
 
 class RowVectors:
-    """The observation of every row of a log, in a file or in memory.
-
-    Long rows are not sorted: where a row was in the files, its observation is read at the end.
-    """
+    """The observation of every row of a log, in a file or in memory. Long rows are not sorted:
+    where a row was in the files, its observation is read at the end."""
 
     def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
-        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation` of
-        a size."""
+        """Write to a file, or to memory, batches of `row`, from 1 on, and `observation`."""
         rows, self._file, memory = 0, file, io.BytesIO()
         with memory if file is None else file.open("xb") as out:
             for batch in batches:
@@ -301,10 +298,8 @@ def code_ids(name: str, rows: str) -> str:
 
 
 def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
-    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1.
-
-    Actions get a hash. With `known_items`, of a store, other items are a fault.
-    """
+    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
+    get a hash. With `known_items`, of a store, other items are a fault."""
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS

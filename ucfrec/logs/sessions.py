@@ -231,10 +231,8 @@ class StepCounts:
 
 
 def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
-    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
-
-    Raises InputError if no episode is left, none is in the training split, or a propensity is none.
-    """
+    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`. Raises
+    InputError if no episode is left, none is in the training split, or a propensity is none."""
     log, connection = rows.log, rows.log.connection
     has_items = log.key == schema.ITEM_ID
     n_items = log.one("SELECT count(*) FROM item_codes")[0] if has_items else 0

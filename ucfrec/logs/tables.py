@@ -205,8 +205,8 @@ def open_tables(
     """Read the columns of every file and group consecutive files with equal columns.
 
     Files without rows are excluded, if others have some. With `partitions`, names of folders such
-    as `date=2026-08-01` give columns. Raises InputError if a file is truncated or not of the kind that its suffix says, no file has a
-    row, or a file has another value in a column than its folder says.
+    as `date=2026-08-01` give columns. Raises InputError if a file is truncated or not of the kind
+    that its suffix says, no file has a row, or a column has another value than the folder says.
     """
     tables: list[Table] = []
     for file in files:

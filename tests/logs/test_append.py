@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.later import NEW, later_log, later_mapping
-from tests.support.logs import store_of
+from tests.support.logs import store_of, write
 from tests.support.tagged import ITEMS, USERS, tagged_log, tagged_mapping, tagged_store
 from ucfrec import schema
 from ucfrec.commands.cli import main
@@ -152,9 +152,11 @@ def test_propensities_and_random_rows_may_begin_with_the_new_logs(
 def test_sessions_of_the_lengths_that_prepare_left_out_stay_out(tmp_path: Path) -> None:
     given = {"reward": "reward", "session_by": "gap", "gap_minutes": 20}
     lengths = {"min_steps": 2, "max_session": 7}
-    store_of(tagged_log(), tmp_path, tagged_mapping(tmp_path), **given, **lengths)
+    store_of(tagged_log(), tmp_path, None, **given, **lengths)
     later_log().to_parquet(tmp_path / "later.parquet")
-    report = append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputNote)  # without features, new ids need none
+        report = append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
     assert report["dropped"]["short_episode"] > 0 < report["dropped"]["long_session"]
     steps = EpisodeStore.open(tmp_path / "grown").lengths
     assert (steps.min(), steps.max()) == (2, 7)
@@ -180,8 +182,6 @@ def test_a_log_too_short_to_be_split_leaves_no_store(grown: Path, tmp_path: Path
     with pytest.raises(InputError, match=r"\(1, in 1 session\(s\)\) leave no validation rows"):
         append_logs(grown / "store", [tmp_path / "one.parquet"], out)
     assert not out.exists()
-    append_logs(grown / "store", [grown / "later.parquet"], out, later_mapping(grown))
-    assert rows_of(out) == rows_in(tagged_log(), later_log())
 
 
 @pytest.mark.parametrize("name", ["user_id", "item_id"])
@@ -209,14 +209,6 @@ def test_new_ids_without_features_are_noted(grown: Path, tmp_path: Path) -> None
         append_logs(grown / "store", logs, tmp_path / "none")
 
 
-def test_a_store_without_features_needs_none_for_new_ids(tmp_path: Path) -> None:
-    store_of(tagged_log(), tmp_path)
-    later_log().to_parquet(tmp_path / "later.parquet")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputNote)
-        append_logs(tmp_path / "store", [tmp_path / "later.parquet"], tmp_path / "grown")
-
-
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])
 def test_integers_follow_text_as_their_text(tmp_path: Path, suffix: str) -> None:
     old, new = tagged_log(), later_log()
@@ -226,11 +218,7 @@ def test_integers_follow_text_as_their_text(tmp_path: Path, suffix: str) -> None
     in_text[0].loc[0, "user_id"] = "guest"
     options = {"reward": "reward", "session_by": "gap", "gap_minutes": 120, "embedding_size": 6}
     store_of(in_text[0], tmp_path, tagged_mapping(tmp_path), **options)
-    file = tmp_path / f"later.{suffix}"
-    if suffix == "csv":
-        new.to_csv(file, index=False)
-    else:
-        new.to_parquet(file)
+    file = write(new, tmp_path / f"later.{suffix}")
     report = append_logs(tmp_path / "store", [file], tmp_path / "grown", later_mapping(tmp_path))
     assert (report["new_users"], report["new_items"]) == (NEW, NEW)
     assert rows_of(tmp_path / "grown") == rows_in(*in_text)

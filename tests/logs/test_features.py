@@ -2,6 +2,7 @@
 
 import warnings
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -12,14 +13,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.support.logs import START, random_log, store_of
 from ucfrec.episodes.states import DISTINCT_TAGS, TAGS_PER_ITEM, ItemStates
-from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.logs.features import item_tags
 from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare, validate
 
-START = 1_700_000_000_000
 OPTIONS = PrepareOptions(split=(1.0, 0.0, 0.0), embedding_size=2)
 
 
@@ -83,26 +83,22 @@ def test_many_items_without_a_row_are_noted(tmp_path: Path) -> None:
         validate([tmp_path / "log.parquet"], mapping, OPTIONS)
 
 
-@pytest.mark.parametrize(
-    ("name", "key", "kind"),
-    [("items.csv", "item_id", "item_features"), ("users.parquet", "user_id", "user_features")],
-)
-def test_features_beside_a_log_that_is_named_alone_are_noted(
-    tmp_path: Path, name: str, key: str, kind: str
-) -> None:
+def test_features_beside_a_log_that_is_named_alone_are_noted(tmp_path: Path) -> None:
     log = pd.DataFrame({"user_id": [1, 1, 2, 2], "item_id": [1, 2, 1, 2], "reward": [0, 1, 0, 1.0]})
     log.assign(timestamp=START + log.index).to_parquet(tmp_path / "log.parquet")
-    table, file = pd.DataFrame({key: [1, 2], "age": [3, 4]}), tmp_path / name
-    if name.endswith("csv"):
-        table.to_csv(file, index=False)
-    else:
-        table.to_parquet(file)
-    logs = [tmp_path / "log.parquet"]
-    with pytest.warns(InputNote, match=f"{name} lies beside the log and is not read"):
-        validate(logs, LogMapping(), OPTIONS)
+    logs, items, users = (tmp_path / n for n in ("log.parquet", "items.csv", "users.parquet"))
+    pd.DataFrame({"item_id": [1, 2], "age": [3, 4]}).to_csv(items, index=False)
+    pd.DataFrame({"user_id": [1, 2], "age": [3, 4]}).to_parquet(users)
+    given = LogMapping(
+        item_features=(FeatureTable((items,), "item_id"),),
+        user_features=(FeatureTable((users,), "user_id"),),
+    )
+    for kind, file in (("item_features", items), ("user_features", users)):
+        with pytest.warns(InputNote, match=f"{file.name} lies beside the log and is not read"):
+            validate([logs], replace(given, **{kind: ()}), OPTIONS)
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputNote)
-        validate(logs, LogMapping(**{kind: (FeatureTable((file,), key, ("age",)),)}), OPTIONS)
+        validate([logs], given, OPTIONS)
 
 
 Lists = list[list[str | None] | None]
@@ -192,21 +188,12 @@ def test_a_catalogue_of_empty_lists_has_no_tags() -> None:
 
 @pytest.mark.parametrize("column", ["tags", "price"])
 def test_a_store_keeps_the_tags_of_its_catalogue(tmp_path: Path, column: str) -> None:
-    log = pd.DataFrame({"user_id": np.arange(60) % 7, "item_id": np.arange(60) % 6})
-    log["timestamp"] = 1_700_000_000_000 + np.arange(60) * 1000
-    log["reward"] = np.arange(60) % 2 * 1.0
-    log.to_parquet(tmp_path / "log.parquet")
     lists = [["a"], ["a", "b"], ["b"], [], ["c"], ["c", "a"]]
     frame = pd.DataFrame({"item_id": range(6), "tags": lists, "price": range(6)})
     frame.to_parquet(tmp_path / "items.parquet")
     table = FeatureTable((tmp_path / "items.parquet",), "item_id", (column,))
-    prepare(
-        [tmp_path / "log.parquet"],
-        LogMapping(item_features=(table,)),
-        tmp_path / "store",
-        PrepareOptions(embedding_size=4),
-    )
-    states = EpisodeStore.open(tmp_path / "store").item_states
+    given = LogMapping(item_features=(table,))
+    states = store_of(random_log(items=6), tmp_path, given, embedding_size=4).item_states
     if column == "price":
         assert states.tags.shape[1] == 0
     else:

@@ -9,12 +9,10 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from tests.support.logs import list_users
+from tests.support.logs import START, list_users
 from ucfrec.errors import InputError, InputNote
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
-
-START = 1_700_000_000_000
 
 
 def make_log(text: bool) -> pd.DataFrame:

@@ -12,9 +12,7 @@ import pytest
 from tests.support.equal_times import tie_key
 from tests.support.logs import START, faulty_log, list_users
 from ucfrec import schema
-from ucfrec.commands.cli import main
 from ucfrec.errors import InputNote
-from ucfrec.files.atomic import read_json
 from ucfrec.logs.engine import engine
 from ucfrec.logs.histories import Histories, frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping
@@ -206,19 +204,3 @@ def test_a_log_of_days_is_reported(tmp_path: Path, apart: int, warned: bool) -> 
         report = validate([tmp_path / "log.parquet"], LogMapping())
     assert report["equal_times"] == (len(log) if warned else 0)
     assert any("100% of the rows share their time" in str(note.message) for note in notes) == warned
-
-
-@pytest.mark.slow
-def test_a_policy_learns_nothing_of_the_order_of_equal_times(tmp_path: Path) -> None:
-    """Of 200 random items, ten hold the next one in 5% of the cases; by item id it is in 33%."""
-    days(users=80, days=10, a_day=12).to_parquet(tmp_path / "log.parquet")
-    store, run, rows = (str(tmp_path / name) for name in ("store", "run", "rows.json"))
-    bounds = ",".join(f"{pd.Timestamp(MIDNIGHT + n * DAY, unit='ms'):%Y-%m-%d}" for n in (8, 9))
-    log = str(tmp_path / "log.parquet")
-    assert main(["prepare", log, "--out", store, "--session-by", "user", "--split", bounds]) == 0
-    small = ["--set", "train.steps=600", "--set", "policy.dim=32"]
-    assert main(["train", store, "--policy", "sasrec", "--out", run, *small]) == 0
-    rule = ["--temperature", "0", "--reward-weight", "0"]
-    assert main(["rank", run, *rule, "--json", rows]) == 0
-    (row,) = [each for each in read_json(Path(rows)) if each["policy"] == "sasrec"]
-    assert row["metrics"]["hit_rate_shown"] < 0.08

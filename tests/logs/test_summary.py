@@ -13,11 +13,10 @@ import pytest
 from tests.support.logs import START, random_log, store_of, write
 from ucfrec import schema
 from ucfrec.arrays import Array
-from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputNote
 from ucfrec.logs import summary
-from ucfrec.logs.mapping import FeatureTable, LogMapping, read_mapping
+from ucfrec.logs.mapping import FeatureTable, LogMapping
 from ucfrec.logs.prepare import PrepareOptions, parse_split, prepare, validate
 from ucfrec.logs.sessions import Moments
 
@@ -142,20 +141,6 @@ def test_long_sessions_are_left_out_and_counted(tmp_path: Path) -> None:
     dropped = report["dropped"]
     assert dropped["long_session"] >= 800
     assert report["steps"] + dropped["long_session"] + dropped["short_episode"] == 4800
-
-
-def test_a_condition_comes_from_the_command_or_the_mapping(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write(make_log(), tmp_path / "log.parquet")
-    given = ["prepare", str(path), "--validate", "--where", "item_id < 10 OR NULL"]
-    assert main(given) == 0
-    shown = capsys.readouterr().out
-    (tmp_path / "mapping.toml").write_text('where = "item_id < 10"\n')
-    mapping = read_mapping(tmp_path / "mapping.toml")
-    left_out = validate([path], mapping)["dropped"]["left_out"]
-    assert 1500 < left_out < 2500
-    assert f"dropped: left_out  {left_out:,}  does not fulfil --where" in shown
 
 
 @pytest.mark.parametrize("name", ["log.parquet", "log.csv"])

@@ -6,25 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.support.logs import write
+from tests.support.logs import random_log, write
 from ucfrec.logs.histories import frame_histories, read_histories
 from ucfrec.logs.mapping import LogMapping, read_mapping
-from ucfrec.logs.prepare import PrepareOptions, validate
-
-DAY = 86_400_000
+from ucfrec.logs.prepare import validate
 
 
 def make_log(times: "pd.Series[str] | pd.DatetimeIndex | pd.Index[str]") -> pd.DataFrame:
-    generator = np.random.default_rng(0)
-    n = len(times)
-    return pd.DataFrame(
-        {
-            "user_id": generator.integers(10, size=n),
-            "item_id": generator.integers(20, size=n),
-            "timestamp": times,
-            "reward": generator.integers(0, 2, n),
-        }
-    )
+    return random_log(len(times), users=10).assign(timestamp=times)
 
 
 def days(begin: str, n: int, rows: int = 3000) -> pd.DatetimeIndex:
@@ -111,7 +100,7 @@ def test_iso_times_are_read_with_and_without_zone(
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
+def test_other_text_and_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
     times = days("2024-03-01", 11).strftime("%d %b %Y %H:%M")
     path = write(make_log(times), tmp_path / f"log{suffix}")
     mapping = LogMapping(time_format="%d %b %Y %H:%M")
@@ -119,12 +108,8 @@ def test_other_text_needs_its_format(tmp_path: Path, suffix: str) -> None:
     zoned = write(make_log(times + " +0200"), tmp_path / f"zoned{suffix}")
     mapping = LogMapping(time_format="%d %b %Y %H:%M %z")
     assert range_of(zoned, mapping) == ["2024-02-29", "2024-03-11"]
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_whole_numbers_are_read_by_their_format(tmp_path: Path, suffix: str) -> None:
-    times = days("2024-03-01", 11).strftime("%Y%m%d%H%M").astype("int64")
-    path = write(make_log(times), tmp_path / f"log{suffix}")
+    numbers = days("2024-03-01", 11).strftime("%Y%m%d%H%M").astype("int64")
+    path = write(make_log(numbers), tmp_path / f"numbers{suffix}")
     assert range_of(path, LogMapping(time_format="%Y%m%d%H%M")) == ["2024-03-01", "2024-03-11"]
 
 
@@ -136,13 +121,3 @@ def test_times_before_2000_are_read_when_asked_for(tmp_path: Path) -> None:
     assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected
     (tmp_path / "m.toml").write_text('earliest = "1990-01-01"\ntime_format = "%Y"\n')
     assert range_of(path, read_mapping(tmp_path / "m.toml")) == expected
-
-
-def test_a_column_of_dates_in_an_expression_is_text_if_their_order_is_not_certain(
-    tmp_path: Path,
-) -> None:
-    log = make_log(pd.Index(map(str, 1_700_000_000_000 + np.arange(3000))))
-    log["made"] = days("2024-03-01", 11).strftime("%m/%d/%Y")
-    path = write(log, tmp_path / "log.csv")
-    options = PrepareOptions(reward="day(strptime(made, '%m/%d/%Y'))")
-    assert validate([path], LogMapping(), options)["reward_statistics"]["max"] == 11

@@ -65,19 +65,14 @@ def append_logs(
 
     Args:
         store: folder of a store of items that `prepare` or this function wrote.
-        paths: log files, folders and globs.
         out: new folder; a store that the same call wrote there earlier is left as it is.
         mapping: log columns to the files' columns; what it leaves open is as in the logs of the
             store. Its feature tables give vectors and tags to new items.
-        options: None for the defaults.
 
-    Returns:
-        The counts of `prepare` on the new logs, with `new_users` and `new_items` (numbers of ids),
-        `new_user_steps` and `new_item_steps` (steps that have them), and `expired_steps`.
-
-    Raises:
-        InputError: the logs cannot be used or leave nothing to validate or test on, or `out` is
-            another store.
+    Returns the counts of `prepare` on the new logs, with `new_users` and `new_items` (numbers of
+    ids), `new_user_steps` and `new_item_steps` (steps that have them), and `expired_steps`. Raises
+    InputError if the logs cannot be used or leave nothing to validate or test on, or `out` is
+    another store.
     """
     options, mapping = options or AppendOptions(), mapping or LogMapping()
     files, old = log_files(paths), StoreRecord.read(store)

@@ -56,18 +56,10 @@ def engine(
     """A DuckDB connection that can open only the inputs and files in its scratch folder.
 
     It loads no extension, and its configuration is locked. Every DuckDB connection of ucfrec is
-    made here.
-
-    Args:
-        folder: parent of the scratch folder, which is removed at the end; so is the scratch of
-            killed processes in it. None for a database in memory that never uses the disk.
-        memory_limit: size such as "2GB", of the engine or with `shared` of the process, beyond
-            which rows spill to disk; None for DuckDB's default.
-        shared: whether the rest of the process keeps to the limit too, with at most half of it.
-        threads: most threads; None for one per core.
-
-    Raises:
-        InputError: `memory_limit` is not a size.
+    made here. `folder` is the parent of the scratch folder, which is removed at the end; so is the
+    scratch of killed processes in it. None for a database in memory that never uses the disk.
+    Beyond `memory_limit`, such as "2GB", of the engine or with `shared` of the process, whose rest
+    may take half of it, rows spill to disk. Raises InputError if it is not a size.
     """
     with scratch_folder(folder, "rows") if folder else nullcontext() as work:
         spill = str(work / "spill") if work else ""
@@ -129,10 +121,8 @@ def _set_semantics(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def anonymous_bytes(process: int | None = None) -> int:
-    """Memory of a process (by number; None for this one) that is not mapped from files.
-
-    The system cannot take it back. 0 where it does not say, or the process has ended.
-    """
+    """Memory of a process (by number; None for this one) that is not mapped from files; 0 where
+    the system does not say, or the process has ended."""
     try:
         lines = Path(f"/proc/{process or os.getpid()}/status").read_text().splitlines()
     except OSError:
@@ -150,10 +140,8 @@ def bytes_of(size: str) -> int | None:
 
 
 def to_numpy(column: "pa.Array") -> Array:
-    """A column of numbers or truth values without missing ones, copied only if it must be.
-
-    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log.
-    """
+    """A column of numbers or truth values without missing ones, copied only if it must be;
+    `pyarrow.Array.to_numpy` would import pandas, which takes longer than reading a small log."""
     if str(column.type) == "bool":
         return np.from_dlpack(column.cast("uint8")).view(np.bool_)
     return np.from_dlpack(column)
@@ -183,10 +171,7 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
     """Resolve a column name (in any case) or a scalar SQL expression against a table's columns.
 
     An expression that computes with truth values, such as `is_click + 2 * is_like`, takes them as 0
-    and 1.
-
-    Raises:
-        InputError: a name is not a column of the table, or `expression` is no scalar expression.
+    and 1. Raises InputError if a name is not a column of the table, or `expression` no scalar one.
     """
     columns = table.columns
     names = {name.casefold(): name for name in columns}
@@ -197,14 +182,14 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
         raise _missing(table, what, expression)
     try:
         # DuckDB would read some names that are not columns as the current user or time.
-        reads = columns_of(connection, expression)
-        for name in reads:
-            if name.casefold() not in names:
-                raise _missing(table, what, name)
-        read_columns = tuple(dict.fromkeys(names[name.casefold()] for name in reads))
-        types = {name: columns[name] for name in read_columns}
+        types = {}
+        for read in columns_of(connection, expression):
+            if read.casefold() not in names:
+                raise _missing(table, what, read)
+            name = names[read.casefold()]
+            types[name] = columns[name]
+        sql = f"({expression}\n)"
         try:
-            sql = f"({expression}\n)"
             kind = _find_type(connection, sql, types)
         except duckdb.BinderException:
             truth = {name for name, kind in types.items() if kind == "BOOLEAN"}
@@ -214,7 +199,7 @@ def bind(connection: duckdb.DuckDBPyConnection, table: Table, what: str, express
             kind = _find_type(connection, sql, types)
     except (duckdb.Error, NotScalarError) as error:
         raise refusal(what, expression, str(table.files[0]), first_line(error)) from None
-    return Bound(sql, kind, read_columns, False)
+    return Bound(sql, kind, tuple(types), False)
 
 
 def _find_type(connection: duckdb.DuckDBPyConnection, sql: str, columns: Mapping[str, str]) -> str:
@@ -287,10 +272,8 @@ def settle_mapping(
 
     What is mapped counts. Otherwise a remembered column, condition or reward counts if all files
     have the columns that it needs; if not, the plain name does, and no condition. The column
-    `reward` stands for the reward of a log whose columns were mapped.
-
-    Raises:
-        InputError: a file has neither the remembered column nor the plain one that it must have.
+    `reward` stands for the reward of a log whose columns were mapped. Raises InputError if a file
+    has neither the remembered column nor the plain one that it must have.
     """
     remembered = mapping.remembered
     if remembered is None:

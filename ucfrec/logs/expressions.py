@@ -93,6 +93,7 @@ _QUOTES: Final = 3
 _DATE_PARTS: Final = 12
 """Characters for two of the format of `strftime`."""
 _TEXTS_AND_LISTS: Final = ("VARCHAR", "TEXT", "STRING", "BPCHAR", "NVARCHAR", "JSON", "LIST")
+_PLACES: Final = ("query_location", "query_location_length")
 _SIMPLE_CASE: Final = re.compile(r"\bcase\b(?!\s+when\b)", re.IGNORECASE)
 _WHEN: Final = re.compile(r"\bwhen\b", re.IGNORECASE)
 _ALLOWED: Final = (
@@ -157,8 +158,10 @@ def columns_of(connection: "duckdb.DuckDBPyConnection", expression: str) -> tupl
         )
     # Parsed alone and in the brackets in which it will be used: a text with an unmatched bracket,
     # quote or comment cannot give the same tree both times.
-    alone = _parse(connection, f"{expression}\n")
-    if alone != _parse(connection, f"({expression}\n)"):
+    query, alone = _select(connection, f"{expression}\n")
+    if query != _select(connection, "1")[0] or alone["alias"]:
+        raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
+    if (query, alone) != _select(connection, f"({expression}\n)"):
         raise NotScalarError(f"it is not one whole expression; {_ALLOWED}")
     columns: dict[str, None] = {}
     if _walk(alone, 0, columns) > MAX_SIZE:
@@ -210,26 +213,22 @@ def _too_large() -> NotScalarError:
     return NotScalarError(f"it is too large; nest fewer of CASE x WHEN, {copying}")
 
 
-def _parse(connection: "duckdb.DuckDBPyConnection", expression: str) -> dict[str, Any]:
-    """Syntax tree of the single value of `SELECT expression`."""
-    node, value = _select(connection, expression)
-    if node != _select(connection, "1")[0] or value["alias"]:
-        raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
-    return value
-
-
 def _select(
     connection: "duckdb.DuckDBPyConnection", expression: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Syntax trees of `SELECT expression`: the query without its value, and the value."""
+    """Syntax trees of `SELECT expression`: the query without its value, and the value; without
+    places in the text, so that equal expressions have equal trees."""
     from duckdb import Error
+
+    def drop_places(node: dict[str, Any]) -> dict[str, Any]:
+        return {name: part for name, part in node.items() if name not in _PLACES}
 
     try:
         query = "SELECT json_serialize_sql(?)"
         (tree,) = connection.execute(query, [f"SELECT {expression}"]).fetchall()[0]
         if len(tree) > _MAX_TREE:
             raise _too_large()
-        parsed = _remove_locations(json.loads(tree))
+        parsed = json.loads(tree, object_hook=drop_places)
     except RecursionError:
         raise _too_deep() from None
     except (Error, UnicodeError) as error:
@@ -243,16 +242,6 @@ def _select(
     if len(values) != 1:
         raise NotScalarError(f"it is more than one expression; {_ALLOWED}")
     return {**node, "statement": parsed["statements"][0]}, values[0]
-
-
-def _remove_locations(tree: Any) -> Any:
-    """A tree without locations in the text, so that equal expressions have equal trees."""
-    if isinstance(tree, list):
-        return [_remove_locations(part) for part in tree]
-    if isinstance(tree, dict):
-        locations = ("query_location", "query_location_length")
-        return {k: _remove_locations(part) for k, part in tree.items() if k not in locations}
-    return tree
 
 
 def _walk(tree: Any, depth: int, columns: dict[str, None]) -> int:

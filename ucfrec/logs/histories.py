@@ -119,14 +119,10 @@ class Histories:
 
     def with_rows(self, rows: BoolArray | IntArray) -> "Histories":
         """The same users with only some rows: their numbers, or (N,) true for them."""
-        return replace(
-            self,
-            owner=self.owner[rows],
-            item_ids=self.item_ids[rows],
-            rewards=self.rewards[rows],
-            timestamps=self.timestamps[rows],
-            session_ids=None if self.session_ids is None else self.session_ids[rows],
-        )
+        names = ("owner", "item_ids", "rewards", "timestamps", "session_ids")
+        columns = {name: getattr(self, name) for name in names}
+        kept = {name: values[rows] for name, values in columns.items() if values is not None}
+        return replace(self, **kept)
 
 
 def _find_rows(owner: IntArray, numbers: IntArray) -> tuple[IntArray, IntArray]:
@@ -160,18 +156,11 @@ def read_histories(
     session_by: str = "user",
     duplicates: str = "highest",
 ) -> Iterator[Histories]:
-    """Read the history of each user of a log, cleaned as `prepare` cleans it, with a warning.
+    """Read the most recent rows, at most `last`, of each user of a log, cleaned as `prepare` cleans
+    it, with a warning; yields batches of users in sorted order.
 
-    Args:
-        last: most rows of each user, the most recent ones.
-        memory_limit: as of `PrepareOptions`, and so is `duplicates`.
-        session_by: with "session_id", batches have `session_ids`, equal where the session is.
-
-    Yields:
-        Batches of users in sorted order.
-
-    Raises:
-        InputError: the input cannot be used.
+    Of `PrepareOptions` are `memory_limit` and `duplicates`; with `session_by` "session_id", batches
+    have `session_ids`, equal where the session is. Raises InputError if the input cannot be used.
     """
     files = log_files(paths)
     with (
@@ -195,8 +184,9 @@ def frame_histories(
     columns = log_table(frame, HISTORIES)
     with engine((), None) as connection:
         connection.register(HISTORIES, columns)
-        described = connection.sql(f"DESCRIBE {HISTORIES}").fetchall()
-        table = FrameTable((Path(HISTORIES),), tuple((row[0], row[1]) for row in described))
+        found = connection.table(HISTORIES)
+        types = zip(found.columns, map(str, found.types), strict=True)
+        table = FrameTable((Path(HISTORIES),), tuple(types))
         mapping, reward = settle_mapping(connection, (table,), mapping, reward)
         tables = LogTables(connection, (table,), mapping, reward, session_by)
         yield from _read_users(tables, last, duplicates, None)
@@ -302,18 +292,16 @@ def _gather_histories(
     users = np.asarray(log.connection.sql(query).to_arrow_table().column(0))
     # Codes of items are in the order of their ids.
     seen_owner, seen = np.divmod(np.unique(owner * len(items) + rows[ITEM]), len(items))
-    sessions = rows[SESSION][recent] if log.session_by == schema.SESSION_ID else None
-    observations = None
-    if sorted_rows.observations is not None:
-        observations = sorted_rows.observations.of_rows(rows["row"][ends - 1]).astype(np.float32)
+    by_session, observations = log.session_by == schema.SESSION_ID, sorted_rows.observations
+    newest = rows["row"][ends - 1]
     return Histories(
         users=users[codes[first].astype(np.int64) - codes[0]],
         owner=owner[recent],
         item_ids=items[rows[ITEM][recent]],
         rewards=rows[schema.REWARD][recent].astype(np.float32),
         timestamps=rows[schema.TIMESTAMP][recent].astype(np.int64),
-        session_ids=sessions,
+        session_ids=rows[SESSION][recent] if by_session else None,
         seen_owner=seen_owner,
         seen_ids=items[seen],
-        observations=observations,
+        observations=None if observations is None else observations.of_rows(newest),
     )

@@ -122,7 +122,7 @@ class Exposure:
     def cooccurrence(self, size: int) -> Float64Array:
         """(trained items, ≤ size) unit rows from the SVD of the matrix."""
         by_item = np.sqrt(self._by_item)
-        rank = min(size + 1, *self._rows.shape)
+        rank = min(size + 1, min(self._rows.shape))
         require_blas_memory()
         strength, directions = right_singular_vectors(self._rows, by_item, rank)
         # One direction holds only the popularity of items (the trivial axis of correspondence
@@ -281,7 +281,8 @@ def _largest(symmetric: Float64Array, rank: int) -> tuple[Float64Array, Float64A
     values, vectors = np.linalg.eigh(symmetric)
     values, vectors = values[::-1][:rank], vectors[:, ::-1][:, :rank]
     missing = max(0, rank - len(values))
-    values, vectors = np.pad(values, (0, missing)), np.pad(vectors, ((0, 0), (0, missing)))
+    values = np.pad(values, (0, missing))
+    vectors = np.pad(vectors, ((0, 0), (0, missing)))
     values = np.where(values > _SMALL * max(values[0], 0), values, 0)
     return np.sqrt(values), np.where(values > 0, vectors, 0)
 

@@ -105,11 +105,9 @@ def join_feedback(
             the exposures are a log of this function, `feedback` counts both, and of a number that
             both have it is the larger value.
         mapping: log columns to the columns of the feedback, and which of its rows count.
-        memory_limit: of the engine; rows spill to disk.
 
-    Raises:
-        InputError: a file or column is missing, or of a wrong type; a file of feedback is one of
-            exposures; or `out` is one of them.
+    Raises InputError if a file or column is missing, or of a wrong type; a file of feedback is one
+    of exposures; or `out` is one of them.
     """
     shown_files, feedback_files = log_files(exposures), log_files(feedback)
     files = [*shown_files, *feedback_files]
@@ -155,8 +153,7 @@ class _Further:
 
 
 def _names_of(table: Table) -> dict[str, str]:
-    """Column names in lower case to those of the files, without a pandas index: case does not
-    matter."""
+    """Column names in lower case to those of the files, without a pandas index."""
     return {name.casefold(): name for name in table.columns if not PANDAS_INDEX.fullmatch(name)}
 
 

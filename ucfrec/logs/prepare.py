@@ -123,21 +123,15 @@ def prepare(
 
     Args:
         paths: log files, folders and globs.
-        mapping: log columns to the files' columns.
-        out: new folder for the store.
-        options: None for the defaults.
         like: a store, or a run trained on it, whose users, items and item states are reused, to
             evaluate the policy on other logs. Rows with other items are dropped, other users have
             number −1 (`episode_users.parquet` has the user of every episode), and every session is
             one episode of the split "train".
         keep_unknown: with `like`, keep rows with other items, as item −1.
 
-    Returns:
-        Counts of what was read, dropped and written, for `format_report`; also in the store's
-        `meta.json` under "source".
-
-    Raises:
-        InputError: the input cannot be used, `out` exists, or the disk is full.
+    Returns counts of what was read, dropped and written, for `format_report`; they are in the
+    store's `meta.json`, too, under "source". Raises InputError if the input cannot be used, `out`
+    exists, or the disk is full.
     """
     options, out = options or PrepareOptions(), Path(out)
     if hasattr(paths, "columns"):
@@ -179,11 +173,7 @@ def prepare(
 def validate(
     paths: Sequence[str | Path], mapping: LogMapping, options: PrepareOptions | None = None
 ) -> dict[str, Any]:
-    """Check the logs as `prepare` does, without writing a store; returns its report.
-
-    Raises:
-        InputError: the input cannot be used.
-    """
+    """Check the logs as `prepare` does, without writing a store; returns its report."""
     options = options or PrepareOptions()
     spill = options.temp_folder or Path(gettempdir())
     with read_log(log_files(paths), mapping, options, spill) as log:
@@ -213,12 +203,10 @@ def read_log(
     grows: bool = False,
     keep_unknown: bool = False,
 ) -> Iterator[PreparedLog]:
-    """Sort and count a log.
+    """Sort and count a log; users and items of a `store` keep their numbers.
 
-    Args:
-        store: one whose users and items keep their numbers; None for none.
-        grows: whether the log is added to the store, so that other ids follow. If not, it is
-            evaluated on: a single split, no features, and other items only with `keep_unknown`.
+    If it `grows`, the log is added to it, and other ids follow; if not, it is evaluated on: a
+    single split, no features, and other items only with `keep_unknown`.
     """
     reward = options.reward or mapping.reward or schema.REWARD
     session_by = options.session_by or mapping.session_by

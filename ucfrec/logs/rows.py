@@ -71,14 +71,11 @@ REASONS: Final = {
 
 
 class RowVectors:
-    """The observation of every row of a log, in a file or in memory.
-
-    Long rows are not sorted: where a row was in the files, its observation is read at the end.
-    """
+    """The observation of every row of a log, in a file or in memory. Long rows are not sorted:
+    where a row was in the files, its observation is read at the end."""
 
     def __init__(self, batches: Iterable[pa.RecordBatch], size: int, file: Path | None) -> None:
-        """Write to a file, or to memory, batches of `row`, from 1 on in order, and `observation` of
-        a size."""
+        """Write to a file, or to memory, batches of `row`, from 1 on, and `observation`."""
         rows, self._file, memory = 0, file, io.BytesIO()
         with memory if file is None else file.open("xb") as out:
             for batch in batches:
@@ -205,13 +202,9 @@ class SortedRows:
         if by_session:
             users, sessions = batch[USER], batch[SESSION]
             # Sessions are in the order of their first times.
-            grouped = np.lexsort((sessions, users))
-            same = _equal_before(users[grouped]) & _equal_before(sessions[grouped])
-            starts = np.flatnonzero(np.append(True, ~same))
-            began = np.empty(len(users), dtype=np.int64)
-            lengths = np.diff(np.append(starts, len(users)))
-            began[grouped] = np.repeat(times[grouped][starts], lengths)
-            order = np.lexsort((sessions, began, users))
+            keys_of_sessions = (users.astype(np.int64) << 32) + sessions
+            _, first, place = np.unique(keys_of_sessions, return_index=True, return_inverse=True)
+            order = np.lexsort((sessions, times[first][place], users))
             batch = {name: values[order] for name, values in batch.items()}
         self.file.append(batch)
 
@@ -305,10 +298,8 @@ def code_ids(name: str, rows: str) -> str:
 
 
 def mark_faults(log: TypedLog, rows: str, known_items: Path | None) -> str:
-    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1.
-
-    Actions get a hash. With `known_items`, of a store, other items are a fault.
-    """
+    """DuckDB's SQL of typed rows with `fault`: 0, or the number of the first fault, from 1. Actions
+    get a hash. With `known_items`, of a store, other items are a fault."""
     keys = [schema.USER_ID, log.key, schema.TIMESTAMP]
     keys += [schema.SESSION_ID] if log.session_by == schema.SESSION_ID else []
     latest = int(time.time() * 1000) + DAY_MS
@@ -406,13 +397,9 @@ def choose_rows(
 ) -> IntArray:
     """(K,) positions of the rows of a log in memory that count, in order of user and time.
 
-    `order_rows` and `SortedRows.add` do the same for logs of any size.
-
-    Args:
-        rows: (N,) columns in any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row`
-            (position in the log) and perhaps those of `order_duplicates`.
-        duplicates: key of `DUPLICATES`.
-        user_id: the only user, if `user` does not hold identifiers.
+    `order_rows` and `SortedRows.add` do the same for logs of any size. `rows` are (N,) columns in
+    any order: `user`, `timestamp`, `item` (identifiers), `reward`, `row` (position in the log) and
+    perhaps those of `order_duplicates`; `user_id` the only user, if `user` holds no identifiers.
     """
     users, times, rewards = rows["user"], rows[schema.TIMESTAMP], rows[schema.REWARD]
     finite = np.abs(rewards) <= MAX_FLOAT

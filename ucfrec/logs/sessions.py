@@ -231,10 +231,8 @@ class StepCounts:
 
 
 def count_steps(rows: SortedRows, cut: Cut) -> StepCounts:
-    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`.
-
-    Raises InputError if no episode is left, none is in the training split, or a propensity is none.
-    """
+    """Go through all episodes once, and create `EPISODES`, `USED_USERS` and `USED_ITEMS`. Raises
+    InputError if no episode is left, none is in the training split, or a propensity is none."""
     log, connection = rows.log, rows.log.connection
     has_items = log.key == schema.ITEM_ID
     n_items = log.one("SELECT count(*) FROM item_codes")[0] if has_items else 0
@@ -350,12 +348,10 @@ def number_ids(
 
 def list_text_ids(store: Path | None) -> tuple[str, ...]:
     """Id columns that are text in a store; none without one."""
-    if store is None:
-        return ()
     return tuple(
         name
         for name, _, file in ID_TABLES
-        if (store / file).is_file()
+        if store is not None and (store / file).is_file()
         if not pa.types.is_integer(pq.read_schema(store / file).field(name).type)
     )
 

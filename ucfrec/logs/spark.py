@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from math import ceil
 from pathlib import Path
 from tempfile import gettempdir
@@ -42,6 +43,7 @@ from ucfrec.logs.rows import (
     mark_faults,
     order_rows,
 )
+from ucfrec.logs.sessions import write_batches
 from ucfrec.logs.summary import NoRowsError, note_dropped, require_rows
 from ucfrec.logs.tables import Table
 from ucfrec.logs.typed import (
@@ -114,7 +116,7 @@ def sort_with_spark(
             codes = _save(spark, spark.sql(code_ids(name, FAULTY)), scratch / table)
             codes.createOrReplaceTempView(table)
         _save(spark, spark.sql(order_rows(log, FAULTY)), scratch / _SORTED)
-        counts = {row[0]: row[1] for row in spark.sql(FAULT_COUNTS).collect()}
+        counts = dict(spark.sql(FAULT_COUNTS).collect())
     for table in code_tables(log).values():
         parts = (batch for batch in _read_parts(scratch / table) if batch.num_rows)
         columns = pq.read_schema(_list_parts(scratch / table)[0])
@@ -226,7 +228,7 @@ def map_users(source: UserLog, folder: Path, master: str, work: Work) -> list[in
         )
         log, rows = _type_rows(spark, tables, known_items, scratch)
         log.require_items()
-        faults = {row[0]: row[1] for row in rows.groupBy("fault").count().collect()}
+        faults = dict(rows.groupBy("fault").count().collect())
         dropped = {reason: faults.get(number, 0) for number, reason in enumerate(REASONS, 1)}
         require_rows(log, faults.get(0, 0), dropped)
         note_dropped(log.name, dropped, sum(faults.values()))
@@ -253,10 +255,8 @@ def _work_on_part(
         file, first = folder / "rows.parquet", next(batches, None)
         if first is None:
             return
-        with pq.ParquetWriter(file, first.schema) as writer:
-            writer.write_batch(first)
-            for batch in batches:
-                writer.write_batch(batch)
+        every = pa.RecordBatchReader.from_batches(first.schema, chain([first], batches))
+        write_batches(file, every)
         try:
             with warnings.catch_warnings():
                 # `map_users` says it of all parts.

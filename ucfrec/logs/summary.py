@@ -31,8 +31,6 @@ from ucfrec.logs.sessions import (
 from ucfrec.logs.tables import Table, first_and_more, quote, quote_name
 from ucfrec.logs.typed import ROWS, TypedLog
 
-CONFLICT: Final = "duplicates with a different reward from the kept row"
-"""Describes `conflicting_duplicates` of the report."""
 SAMPLE_ROWS: Final = 100_000
 """Quantiles of rewards of many values are of a sample of about this many steps; a smaller log is
 used whole."""
@@ -202,7 +200,8 @@ def format_report(report: Mapping[str, Any]) -> str:
             lines.append((label, f"{n:,}{text}"))
 
     rule = DUPLICATES[report.get("duplicates", "highest")]
-    add("  conflicting duplicates", report["conflicting_duplicates"], f"  {CONFLICT}, which {rule}")
+    kept = f"  duplicates with a different reward from the kept row, which {rule}"
+    add("  conflicting duplicates", report["conflicting_duplicates"], kept)
     add("  at equal times", report["equal_times"], " (in no order that could be learned)")
     add("  out of order", report["unsorted_rows"], " (sorted, none dropped)", always=True)
     add("steps kept", report["steps"], always=True)

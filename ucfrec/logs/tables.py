@@ -148,9 +148,8 @@ def _folder_value(name: str, kind: str = "VARCHAR") -> str:
 
 
 def _wider_type(kind: str) -> str:
-    """The DuckDB type that expressions compute with: DuckDB multiplies columns of 8 bits in 8 bits,
-    and subtracts unsigned numbers without a sign; where that overflows, a reward would be
-    undefined."""
+    """The type that expressions compute with: DuckDB multiplies 8 bits in 8 bits, and subtracts
+    unsigned numbers without a sign; where that overflows, a reward would be undefined."""
     if kind == "UBIGINT":
         return "HUGEINT"
     return _NARROW.sub(r"BIGINT\2", kind) if _NARROW.fullmatch(kind) else kind
@@ -206,10 +205,8 @@ def open_tables(
     """Read the columns of every file and group consecutive files with equal columns.
 
     Files without rows are excluded, if others have some. With `partitions`, names of folders such
-    as `date=2026-08-01` give columns.
-
-    Raises InputError if a file is truncated or not of the kind that its suffix says, no file has a
-    row, or a file has another value in a column than its folder says.
+    as `date=2026-08-01` give columns. Raises InputError if a file is truncated or not of the kind
+    that its suffix says, no file has a row, or a column has another value than the folder says.
     """
     tables: list[Table] = []
     for file in files:
@@ -357,9 +354,8 @@ def _types_of_all_rows(
     """Types of the columns of a CSV file, given those that DuckDB inferred from its first rows.
 
     In later rows it would round 0.25 to a whole number, take 007 for 7, and cut the hour off a
-    date, without an error. For values of another kind there is one, when they are read. Dates that
-    do not begin with the year stay text: DuckDB guesses their order. A column without any value has
-    the type `NOTHING`.
+    date, without an error. Dates that do not begin with the year stay text: DuckDB guesses their
+    order. A column without any value has the type `NOTHING`.
     """
     kinds = dict(types)
     # A column without a value is text; most columns of text have one in the first rows.

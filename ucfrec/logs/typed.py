@@ -189,9 +189,9 @@ def open_log(log: LogTables, folder: Path, as_text: Collection[str] = ()) -> Typ
         columnar = all(table.columnar for table in log.tables)
         rows = number_rows(zip(typed.selects, (t.sql for t in typed.tables), strict=True))
         log.connection.execute(f"CREATE {'VIEW' if columnar else 'TABLE'} {ROWS} AS {rows}")
-        survey = []
-        if {*_VECTORS} & {*typed.names}:
-            survey = log.connection.sql(survey_vectors(typed.names, ROWS)).fetchall()
+        has_vectors = {*_VECTORS} & {*typed.names}
+        query = survey_vectors(typed.names, ROWS)
+        survey = log.connection.sql(query).fetchall() if has_vectors else []
     return describe_log(log, typed, survey)
 
 

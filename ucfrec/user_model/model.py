@@ -151,7 +151,8 @@ class LoggedRewards:
     def __init__(self, store: EpisodeStore) -> None:
         batches = store.column_batches(schema.REWARD)
         parts = [np.unique(rewards, return_counts=True) for (rewards,) in batches]
-        distinct, numbers = (np.concatenate(part) for part in zip(*parts, strict=True))
+        distinct = np.concatenate([values for values, _ in parts])
+        numbers = np.concatenate([counts for _, counts in parts])
         rewards, place = np.unique(distinct, return_inverse=True)
         counts = np.bincount(place, numbers)
         values, counts = rewards[::-1].astype(np.float64), counts[::-1]

@@ -105,8 +105,7 @@ def test_texts_of_others_are_no_markup(explorer: Explorer) -> None:
     listed = got(explorer, "/results", history="3, 1", k="30").text
     assert HOSTILE not in listed
     assert "javascript:" not in listed
-    refused = got(explorer, "/", host="evil.example")
-    assert refused.status_code == 400
+    assert got(explorer, "/", host="evil.example").status_code == 400
 
 
 @pytest.mark.parametrize(
@@ -140,8 +139,14 @@ def test_without_the_store_a_history_can_be_pasted(explorer: Explorer) -> None:
 def test_one_run_or_two(explorer: Explorer) -> None:
     with pytest.raises(InputError, match="0 runs are named"):
         Explorer([])
-    alone = Explorer(explorer.runs[:1])
-    assert "only here" not in alone.results({"user": "7"})
+    assert "only here" not in Explorer(explorer.runs[:1]).results({"user": "7"})
+
+
+def fill(browser: Browser, field: str, value: str) -> None:
+    browser.run(
+        f"(() => {{ const f = document.getElementById('{field}'); f.value = {json.dumps(value)};"
+        "f.dispatchEvent(new Event('input', {bubbles: true})); })()"
+    )
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
@@ -152,24 +157,15 @@ def test_a_visitor_moves_a_slider_and_pastes_a_history(address: str, tmp_path: P
         browser.open(f"{address}/?user=7&k=6&keep_seen=on")
         before = browser.run(first)
         assert len(before) == 6
-        browser.run(
-            "(() => { const s = document.getElementById('reward_weight'); s.value = 32;"
-            "s.dispatchEvent(new Event('input', {bubbles: true})); })()"
-        )
+        fill(browser, "reward_weight", "32")
         browser.until(f"JSON.stringify({first}) !== JSON.stringify({json.dumps(before)})")
         assert browser.run("form.elements.custom.checked")
         assert browser.run("document.querySelector('output[for=reward_weight]').value") == "32"
         assert "reward_weight=32" in browser.run("location.search")
-        browser.run(
-            "(() => { const t = document.getElementById('history'); t.value = '3, 1\\n4, much';"
-            "t.dispatchEvent(new Event('input', {bubbles: true})); })()"
-        )
+        fill(browser, "history", "3, 1\n4, much")
         browser.until("document.querySelector('[role=alert]') !== null")
         assert "line 2" in browser.run("document.querySelector('[role=alert]').textContent")
-        browser.run(
-            "(() => { const t = document.getElementById('history'); t.value = '3, 1\\n4, 0';"
-            "t.dispatchEvent(new Event('input', {bubbles: true})); })()"
-        )
+        fill(browser, "history", "3, 1\n4, 0")
         browser.until("document.querySelectorAll('.card').length === 12")
         browser.view(375, 800, dark=True)
         assert browser.run("document.documentElement.scrollWidth") <= 375

@@ -17,8 +17,8 @@ from ucfrec.errors import InputError
 from ucfrec.provenance import config_hash
 from ucfrec.results.rows import (
     CONFIGURATIONS,
-    Measured,
     ResultRow,
+    ResultTable,
     RowKey,
     append_rows,
     benchmarking,
@@ -255,9 +255,9 @@ ROWS = [replace(_BARE, method="<b>", metrics=_OWN, interval=(1.0, 2.5), details=
 
 
 def test_a_frame_has_metrics_with_their_intervals_and_is_saved(tmp_path: Path) -> None:
-    Measured(ROWS).save(tmp_path / "rows.json")
+    ResultTable(ROWS, ()).save(tmp_path / "rows.json")
     assert read_results(tmp_path / "rows.json") == ROWS
-    frame = Measured(ROWS).to_frame().set_index("method")
+    frame = ResultTable(ROWS, ()).to_frame().set_index("method")
     found = frame.loc["<b>", ["R", "R_low", "R_high", "S", "S_low", "S_high"]]
     assert found.tolist() == [1.5, 1.0, 2.5, 0.25, 0.125, 0.5]
     assert frame.loc["popular", ["S", "R_low"]].isna().all()
@@ -265,21 +265,21 @@ def test_a_frame_has_metrics_with_their_intervals_and_is_saved(tmp_path: Path) -
 
 
 def test_a_notebook_shows_rows_and_warnings_and_no_markup_of_names() -> None:
-    html = Measured(ROWS, ["mind <this>"])._repr_html_()
+    html = ResultTable(ROWS, ["mind <this>"])._repr_html_()
     assert "&lt;b&gt;" in html
     assert "<b>" not in html
     assert "mind &lt;this&gt;" in html
-    shown = repr(Measured(ROWS, ["mind <this>"])).splitlines()
+    shown = repr(ResultTable(ROWS, ["mind <this>"])).splitlines()
     assert "popular" in shown[-2]
     assert shown[-1] == "warning: mind <this>"
 
 
 def test_a_chart_has_a_point_and_an_interval_for_each_method() -> None:
-    axes = Measured(ROWS).plot()
+    axes = ResultTable(ROWS, ()).plot()
     assert [label.get_text() for label in axes.get_yticklabels()] == ["popular", "<b>"]
     assert axes.lines[0].get_xdata().tolist() == [1.0, 1.5]  # type: ignore[union-attr]
-    again = Measured(ROWS).plot("S", ax=axes)
+    again = ResultTable(ROWS, ()).plot("S", ax=axes)
     assert again is axes
     for name in ("T", "method", "k"):
         with pytest.raises(InputError, match=f"no row has the metric '{name}'; they have R, S"):
-            Measured(ROWS).plot(name)
+            ResultTable(ROWS, ()).plot(name)

@@ -70,9 +70,6 @@ def explain(
 ) -> Explained:
     """The recommendations of `ucfrec recommend` for one user, with their reasons.
 
-    Args:
-        filter_seen: whether items that the user has seen are excluded.
-
     Raises:
         InputError: the rule does not fit the policy, or an item of the history is not known.
     """

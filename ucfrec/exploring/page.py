@@ -1,7 +1,6 @@
 """The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
-from ucfrec.reporting.page import template, write_report
+from ucfrec.reporting.page import render_report, template
 from ucfrec.reporting.results import find_quoted, read_evidence
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -68,7 +67,6 @@ class Explorer:
     ) -> None:
         """
         Args:
-            runs: one policy of items, or two that are compared.
             features: of items, with a column `item_id`; None for none.
             results: files of `ucfrec ope --json` and `ucfrec evaluate --json`, for the report.
 
@@ -84,11 +82,7 @@ class Explorer:
         self._features = {str(row[schema.ITEM_ID]): row for row in rows}
 
     def page(self, fields: Mapping[str, str]) -> str:
-        """The whole page.
-
-        Args:
-            fields: of the form, by name; unknown ones are ignored.
-        """
+        """The whole page, for the fields of the form by name; unknown ones are ignored."""
         runs = []
         for run in self.runs:
             card, text = run.folder / CARD, "There is no model card."
@@ -133,13 +127,7 @@ class Explorer:
     @cached_property
     def reports(self) -> list[str]:
         """The report of each run: verdict, curves and samples, as an HTML page."""
-        pages = []
-        for trained in self.runs:
-            with tempfile.TemporaryDirectory() as scratch:
-                file = Path(scratch) / "report.html"
-                write_report(file, [trained.folder], self._results)
-                pages.append(file.read_text(encoding="utf-8"))
-        return pages
+        return [render_report([trained.folder], self._results) for trained in self.runs]
 
     def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
@@ -254,11 +242,7 @@ def _read_number(
 
 
 def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
-    """The application, which keeps no state of its visitors.
-
-    Args:
-        allowed_hosts: values of the header `Host` that are answered.
-    """
+    """The application, which answers the given values of `Host` and keeps no state of visitors."""
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")

@@ -168,13 +168,10 @@ def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> 
 
 @page_style()
 def interval_chart(title: str, intervals: Sequence[Interval], logged: float | None = None) -> Chart:
-    """Draw values with their intervals one below the other.
+    """Draw values with their intervals one below the other, that of logged sessions as a line.
 
     Values without a verdict are bars from 0; others are dots, hollow and dashed where the verdict
     forbids to rely on them.
-
-    Args:
-        logged: value of the logged sessions, drawn as a vertical line.
     """
     from matplotlib.figure import Figure
 

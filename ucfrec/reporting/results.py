@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import COLUMNS
@@ -100,52 +99,63 @@ def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
     for environment, rows in results.environments.items():
-        names, lines = [], [evaluation_line(row) for row in rows]
-        for line in lines:
+        lines, named = [evaluation_line(row) for row in rows], []
+        for row, line in zip(rows, lines, strict=True):
             # The policy, with the fields that differ if it has several rows.
             same = [other for other in lines if other["policy"] == line["policy"]]
             fields = ("run", "checkpoint", *_SEEDS)
             differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-            parts = (f"{key} {_format_cell(line, key)}" for key in differing)
-            names.append(", ".join([line["policy"], *parts]))
+            parts = (f"{key} {format_value(line.get(key))}" for key in differing)
+            named.append((", ".join([line["policy"], *parts]), row))
         columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
-        body = [
-            (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
-            for name, row, line in zip(names, rows, lines, strict=True)
-        ]
-        table = Table(f"{environment}: means of episodes", ["R_cum", *columns], body, "policy")
-        title = f"R_cum in {environment}, with 95% intervals"
-        pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
+        title, caption = f"R_cum in {environment}", f"{environment}: means of episodes"
+        heads = {column: column for column in columns}
+        pictures.append(_draw_rows(title, caption, {"R_cum": "R_cum"} | heads, named, "policy"))
     return pictures
 
 
 def draw_estimates(results: Results) -> list[tuple[list[tuple[Chart, Table]], Sequence[str]]]:
-    """Charts and tables, and warnings, of each policy with estimates from logs."""
+    """Charts and tables, per session and step, and warnings of each policy with estimates."""
+    largest = {"largest_weight": "share of the largest weight"}
+    by_session = {"R_cum": "mean return of a session", "effective_sessions": "effective sample"}
+    by_session |= {**largest, "sessions": "sessions", "overlap": "overlap"}
+    by_step = {_STEP: "mean reward of a step", "effective_steps": "effective sample", **largest}
     pictures: list[tuple[list[tuple[Chart, Table]], Sequence[str]]] = []
     for estimates in results.estimates:
-        parts = [_draw_rows(estimates.rows, "sessions", estimates.name)]
-        if estimates.steps:
-            parts.append(_draw_rows(estimates.steps, "steps", estimates.name))
+        parts, name = [], estimates.name
+        for rows, unit, columns, title, caption in (
+            (estimates.rows, "sessions", by_session, "Mean return of a session", "Estimates"),
+            (estimates.steps, "steps", by_step, "Mean reward of a step with a propensity",
+             "Estimates per step"),
+        ):  # fmt: skip
+            named = [(f"logged {unit}" if r.method == LOGGED else r.method, r) for r in rows]
+            if named:
+                parts.append(
+                    _draw_rows(f"{title}: {name}", f"{caption} for {name}", columns, named)
+                )
         pictures.append((parts, estimates.warnings))
     return pictures
 
 
-def _draw_rows(rows: Sequence[ResultRow], unit: str, policy: str) -> tuple[Chart, Table]:
-    """Chart and table of the estimates for a policy per `unit`, "sessions" or "steps"."""
-    effective, largest = "effective sample", "share of the largest weight"
-    columns = {f"effective_{unit}": effective, "largest_weight": largest}
-    head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
-    if unit == "sessions":
-        columns |= {"sessions": "sessions", "overlap": "overlap"}
-        head, of, caption = "mean return of a session", "", "Estimates for"
-    names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
-    body = [
-        (name, [format_interval(row), *(row.as_line().get(key) for key in columns)])
-        for name, row in zip(names, rows, strict=True)
-    ]
-    title = f"{head.capitalize()}{of}: {policy}, with 95% intervals"
-    chart = interval_chart(title, _list_intervals(names, rows))
-    return chart, Table(f"{caption} {policy}", [head, *columns.values()], body)
+def _draw_rows(
+    title: str,
+    caption: str,
+    columns: Mapping[str, str],
+    named: Sequence[tuple[str, ResultRow]],
+    corner: str = "",
+) -> tuple[Chart, Table]:
+    """Chart of the intervals, and table of the columns, {value: head}, the first with intervals."""
+    intervals, body = [], []
+    for name, row in named:
+        first, *values = (evaluation_line(row).get(key) for key in columns)
+        ends = "–"
+        if row.interval is not None:
+            low, high = row.interval
+            intervals.append(Interval(name, row.value, low, high))
+            ends = f"{format_value(low)}, {format_value(high)}"
+        body.append((name, [f"{format_value(first)} [{ends}]", *values]))
+    chart = interval_chart(f"{title}, with 95% intervals", intervals)
+    return chart, Table(caption, list(columns.values()), body, corner)
 
 
 def draw_forest(results: Results) -> Chart | None:
@@ -163,25 +173,6 @@ def draw_forest(results: Results) -> Chart | None:
     # The line is of one set of logs; several have a line each in their own charts.
     title = "Mean return of a session by policy, with 95% intervals; dashed: do not rely on it"
     return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
-
-
-def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Interval]:
-    return [
-        Interval(name, row.value, row.interval[0], row.interval[1])
-        for name, row in zip(names, rows, strict=True)
-        if row.interval is not None
-    ]
-
-
-def format_interval(row: ResultRow) -> str:
-    """The value with its 95% interval, if it has one."""
-    ends = "–" if row.interval is None else ", ".join(map(format_value, row.interval))
-    return f"{format_value(row.value)} [{ends}]"
-
-
-def _format_cell(line: Mapping[str, Any], column: str) -> str:
-    value = line.get(column)
-    return str(value) if column in _SEEDS and value is not None else format_value(value)
 
 
 def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
@@ -232,9 +223,8 @@ class _Return:
     value: float
     """Mean R_cum over rows."""
     low: float
-    """Lowest end of the rows' 95% intervals."""
     high: float
-    """Highest end of the rows' 95% intervals."""
+    """Lowest and highest end of the rows' 95% intervals."""
 
     def above(self, reference: "_Return") -> bool:
         """Whether all intervals are above all intervals of `reference`."""

@@ -56,7 +56,8 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> st
 def evaluation_line(row: ResultRow) -> dict[str, Any]:
     """A row with its values by the column names of tables of evaluations."""
     seeds = {"seed": row.evaluation_seed, "train_seed": row.training_seed}
-    return {**row.as_line(), "policy": row.method, **seeds}
+    texts = {name: None if seed is None else str(seed) for name, seed in seeds.items()}
+    return {**row.as_line(), "policy": row.method, **texts}
 
 
 def evaluation_table(rows: Iterable[ResultRow]) -> str:

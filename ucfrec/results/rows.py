@@ -166,10 +166,7 @@ _ROWS: Final = TypeAdapter(ResultRow)
 
 
 def row_from_json(value: object, where: str) -> ResultRow:
-    """Inverse of `ResultRow.to_json`.
-
-    Args:
-        where: origin of `value` (file and line), for messages.
+    """Inverse of `ResultRow.to_json`; messages name the origin `where` (file and line).
 
     Raises:
         InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
@@ -243,10 +240,6 @@ def append_rows(
     Atomic: after an interruption either all rows are in the file or none. Other processes that
     append to a file of the folder wait.
 
-    Args:
-        path: file of result rows; made if missing.
-        config: configuration with the rows' `config_hash`; None for rows without one.
-
     Raises:
         InputError: a row has a number that is not finite, or another `config_hash` than `config`.
     """
@@ -317,10 +310,13 @@ _IDENTITY: Final = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint
 """Fields that a frame leaves out; a file of the rows has them."""
 
 
+@dataclass(frozen=True, repr=False)
 class ResultTable:
-    """What is shown of result rows, and how they are kept."""
+    """Results of one measurement of several methods."""
 
     rows: Sequence[ResultRow]
+    warnings: Sequence[str]
+    """What makes the numbers less reliable."""
     shown: ClassVar[tuple[str, ...]] = ()
     """Columns of the table, after `method`; empty for those of the rows' own metrics."""
 
@@ -335,7 +331,7 @@ class ResultTable:
 
     def _said(self) -> list[str]:
         """What to know of the rows, shown below them."""
-        return []
+        return [f"warning: {text}" for text in self.warnings]
 
     def to_frame(self) -> "pd.DataFrame":
         """One row per method: its metrics, each with the ends of its 95% interval where it has one
@@ -357,11 +353,7 @@ class ResultTable:
         return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Draw one metric of every method with its 95% interval.
-
-        Args:
-            metric: name of a metric; None for the one that the rows are about.
-            ax: matplotlib axes to draw on; None for new ones.
+        """Draw a metric of every method, by default that of the rows, with its 95% interval.
 
         Raises:
             InputError: no row has the metric.
@@ -399,25 +391,13 @@ class ResultTable:
         return str(table) + "".join(f"<p>{escape(text)}</p>" for text in self._said())
 
 
-@dataclass(frozen=True, repr=False)
-class Measured(ResultTable):
-    """Results of one measurement of several methods."""
-
-    rows: Sequence[ResultRow]
-    warnings: Sequence[str] = ()
-    """What makes the numbers less reliable."""
-
-    def _said(self) -> list[str]:
-        return [f"warning: {text}" for text in self.warnings]
-
-
-class Evaluation(Measured):
+class Evaluation(ResultTable):
     """Returns in a simulator, one row per policy."""
 
     shown = ("R_cum", "R_cum_low", "R_cum_high", "R_avg_pooled", "length", "coverage", "diversity")
 
 
-class Ranking(Measured):
+class Ranking(ResultTable):
     """How policies and baselines rank what users were shown and liked later."""
 
     shown = (

@@ -51,11 +51,7 @@ _COMPARED: Final = 4
 
 
 def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
-    """The metric of a finished run, one of `METRICS`; higher is better.
-
-    Args:
-        store: the store that it was trained on.
-        k: items recommended, of "ndcg".
+    """The metric of a finished run on its store, one of `METRICS`; higher is better.
 
     Raises:
         InputError: the run or its validation rows do not have the metric.
@@ -105,14 +101,10 @@ class Plan:
 
 
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
-    """Search until the study has so many finished trials; goes on where an earlier call ended.
+    """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
     settings, `tuning.md` all trials.
-
-    Args:
-        trials: number of finished trials that the study has at the end, those ended early too.
-        workers: processes that train trials side by side.
 
     Raises:
         InputError: the folder holds another search, the numbers are out of range, the policies have

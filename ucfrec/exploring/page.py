@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -41,19 +41,6 @@ _HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
 }
-
-
-@dataclass
-class Slider:
-    """One number of the rule that a visitor can change."""
-
-    name: str
-    """Field of `DecisionRule`."""
-    label: str
-    low: float
-    high: float
-    step: float
-    value: float = 0.0
 
 
 class Explorer:
@@ -109,7 +96,7 @@ class Explorer:
         values = []
         for estimates in read_evidence(self._results).estimates:
             row = find_quoted(estimates.rows)
-            if row is not None and row.target_return is not None and row.interval is not None:
+            if row is not None and row.target_return is not None:
                 values.append((row.target_return, estimates.name, row))
         return sorted(values, key=lambda value: value[:2])
 
@@ -156,23 +143,27 @@ class Explorer:
             "item": self._item,
         }
 
-    def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
+    def _sliders(self, fields: Mapping[str, str]) -> list[dict[str, Any]]:
+        """The numbers of the rule that a visitor can change, fields of `DecisionRule`."""
         trained, states = self.runs[0], self.runs[0].item_states
-        low, high = float(trained.training_returns[0]), float(trained.training_returns[-1])
-        span = max(high - low, abs(high), 1e-6)
-        sliders = [Slider("target", "Target return", low, high + span / 2, span / 100)]
+        lowest, highest = float(trained.training_returns[0]), float(trained.training_returns[-1])
+        span = max(highest - lowest, abs(highest), 1e-6)
+        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100)]
         if trained.reward_model is not None:
-            sliders.append(Slider("reward_weight", "Reward weight", 0, 32, 0.25))
-        sliders.append(Slider("temperature", "Temperature", 0, 2, 0.05))
+            sliders.append(("reward_weight", "Reward weight", 0, 32, 0.25))
+        sliders.append(("temperature", "Temperature", 0, 2, 0.05))
         if states is not None and bool((states.tags >= 0).any()):
-            sliders.append(Slider("tag_window", "Exclude tags of the last items", 0, 10, 1))
-        for slider in sliders:
-            value, text = getattr(trained.rule, slider.name), fields.get(slider.name, "")
-            slider.value = high if value is None else value
+            sliders.append(("tag_window", "Exclude tags of the last items", 0, 10, 1))
+        shown = []
+        for name, label, low, high, step in sliders:
+            value, text = getattr(trained.rule, name), fields.get(name, "")
+            value = highest if value is None else value
             # Where a number is wrong, the list says so.
             if fields.get("custom") is not None and _NUMBER.fullmatch(text):
-                slider.value = float(text)
-        return sliders
+                value = float(text)
+            own = {"name": name, "label": label, "low": low, "high": high, "step": step}
+            shown.append({**own, "value": value})
+        return shown
 
     def _item(self, item_id: Any) -> dict[str, Any]:
         """Title, picture and other features of an item."""

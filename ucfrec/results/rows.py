@@ -349,7 +349,7 @@ class ResultTable:
                 if ends := intervals.get(name):
                     line[f"{name}_low"], line[f"{name}_high"] = ends
             lines.append({**line, **row.as_line(), **line})
-        frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY))
+        frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY), errors="ignore")
         return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":

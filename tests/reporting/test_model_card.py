@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +98,3 @@ def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
     assert len(json.loads((folder / MEASURED).read_text())) == 2
     write_card(folder)  # training on keeps what was measured
     assert text_of(folder) == card
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_run_that_may_not_be_written_is_left_alone(tmp_path: Path) -> None:
-    folder = run(tmp_path / "run")
-    folder.chmod(0o555)
-    add_measurement(folder, "ucfrec ope", "DR", {"R_cum": 1.0})
-    assert not (folder / CARD).exists()

@@ -18,17 +18,7 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import (
-    BEST,
-    BEST_TOML,
-    PAGE,
-    STUDY,
-    Plan,
-    format_toml,
-    list_finished,
-    measure_run,
-    tune,
-)
+from ucfrec.tuning.study import BEST, Plan, format_toml, list_finished, measure_run, tune
 
 FIXED = {
     **{"train.validate_every": 2, "policy.context": 3, "rule.sessions": 2},
@@ -72,7 +62,7 @@ def test_the_best_trial_is_the_run_that_is_kept(store: Path, tmp_path: Path) -> 
     assert len(list_finished(study)) == 4
     best = searched.out / BEST
     left = {path.name for path in searched.out.iterdir()}
-    assert left == {BEST, BEST_TOML, PAGE, STUDY, "stages"}
+    assert left == {BEST, "best.toml", "tuning.md", "study.db", "stages"}
     trained = TrainedPolicy.load(best)
     assert measure_run(trained, EpisodeStore.open(store), "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
@@ -102,7 +92,9 @@ def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
 def test_a_killed_trial_is_run_again(store: Path, tmp_path: Path) -> None:
     searched = plan(store, tmp_path / "tuned")
     tune(searched, 1)
-    with sqlite3.connect(searched.out / STUDY) as study:  # as a process that was killed leaves it
+    with sqlite3.connect(
+        searched.out / "study.db"
+    ) as study:  # as a process that was killed leaves it
         study.execute("UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
         study.execute("DELETE FROM trial_values")
     resumed = tune(searched, 1)

@@ -90,10 +90,13 @@ def _measure_all(
 ) -> dict[str, list[ResultRow]]:
     """The rows of each task; raises an error at the end if one of them failed."""
     errors, rows, workers = [], {}, min(workers, len(tasks))
+
+    def place(name: str) -> int:
+        seed = tasks[name].key.training_seed
+        return -1 if seed is None else seed
+
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
-    seeds = {name: task.key.training_seed for name, task in tasks.items()}
-    names = sorted(tasks, key=lambda name: -1 if (seed := seeds[name]) is None else seed)
-    ordered = {name: tasks[name] for name in names}
+    ordered = {name: tasks[name] for name in sorted(tasks, key=place)}
     outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
     with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
         for name, outcome in outcomes:

@@ -1,6 +1,7 @@
 """Tables and plots of result rows: means and spreads over logs and seeds, and differences to a
 method."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -9,7 +10,7 @@ import numpy as np
 
 from ucfrec.reporting.charts import LIGHT, PLAIN, file_style, save
 from ucfrec.reporting.charts import OURS as OURS_COLOR
-from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd, signed_difference
+from ucfrec.reporting.tables import NONE, markdown_table, mean_and_sd
 from ucfrec.results.rows import ResultRow
 from ucfrec.results.statistics import Summary, grouped, summary
 
@@ -26,7 +27,7 @@ NEAR: Final = 0.05
 """Share of the best score by which scores may be lower and still count as level with it."""
 _Column = str | Callable[[Sequence[ResultRow]], str]
 """A metric, whose mean and spread is shown, or what makes the text for the rows of a line."""
-_BySeed = Mapping[tuple[int | None, int | None], float]
+_BySeed = dict[tuple[int | None, int | None], float]
 """Values by the seeds of the log and of the training."""
 
 
@@ -120,14 +121,14 @@ def score_table(rows: Sequence[ResultRow], checkpoint: str) -> list[dict[str, st
     values, tasks = _group_by_seed(rows, "score"), list(dict.fromkeys(row.task for row in rows))
     cells: dict[str, dict[str, Summary]] = {}
     for method in dict.fromkeys(row.method for row in rows):
-        of_tasks = [values.get((method, task), {}) for task in tasks]
+        of_tasks = [values[method, task] for task in tasks]
         scores = [summary(seeds.values()) for seeds in of_tasks]
         scores.append(_summarise_tasks(of_tasks))
         cells[method] = dict(zip((*tasks, MEAN), scores, strict=True))
-    best = {
-        name: max((c[name].mean for c in cells.values() if c[name].count), default=0.0)
-        for name in (*tasks, MEAN)
-    }
+    best = {}
+    for name in (*tasks, MEAN):
+        means = [of[name].mean for of in cells.values() if of[name].count]
+        best[name] = max(means, default=0.0)
     lines = []
     for method, of_method in cells.items():
         counts = [of_method[task].count for task in tasks]
@@ -179,10 +180,7 @@ def difference_table(
     values, tasks = _group_by_seed(rows, metric), list(dict.fromkeys(row.task for row in rows))
     lines = []
     for method in dict.fromkeys(row.method for row in rows if row.method != first):
-        of_tasks = [
-            _subtract(values.get((method, task), {}), values.get((first, task), {}))
-            for task in tasks
-        ]
+        of_tasks = [_subtract(values[method, task], values[first, task]) for task in tasks]
         if any(of_tasks):
             texts = dict(zip(tasks, map(_format_difference, of_tasks), strict=True))
             texts[MEAN] = _format_signed(_summarise_tasks(of_tasks))
@@ -190,16 +188,19 @@ def difference_table(
     return lines
 
 
-def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> dict[tuple[str, str], _BySeed]:
+def _group_by_seed(rows: Sequence[ResultRow], metric: str) -> Mapping[tuple[str, str], _BySeed]:
     """The metric, where a row has it, by seeds, of each method and task."""
-    rows = [row for row in rows if metric in row.metrics]
-    groups = grouped(rows, lambda row: (row.method, row.task))
-    return {pair: _index_by_seeds(group, metric) for pair, group in groups.items()}
+    groups: defaultdict[tuple[str, str], _BySeed] = defaultdict(dict)
+    for row in rows:
+        if metric in row.metrics:
+            seeds = row.log_seed, row.training_seed
+            groups[row.method, row.task][seeds] = row.metrics[metric]
+    return groups
 
 
-def _index_by_seeds(rows: Sequence[ResultRow], metric: str | None = None) -> _BySeed:
-    """A metric, or None for what a row is about, by the seeds of the log and of the training."""
-    return {(r.log_seed, r.training_seed): r.metrics[metric or r.metric] for r in rows}
+def _index_by_seeds(rows: Sequence[ResultRow]) -> _BySeed:
+    """What rows are about, by the seeds of the log and of the training."""
+    return {(row.log_seed, row.training_seed): row.value for row in rows}
 
 
 def _summarise_tasks(of_tasks: Sequence[_BySeed]) -> Summary:
@@ -230,9 +231,11 @@ def _format_difference(differences: _BySeed) -> str:
 
 
 def _format_signed(differences: Summary) -> str:
-    if differences.count > 1:
-        return signed_difference(differences)
-    return f"{differences.mean:+.3g}" if differences.count else NONE
+    """Mean difference with its sign ± its standard error; a dash for none."""
+    if not differences.count:
+        return NONE
+    error = f" ± {differences.standard_error:.2g}" if differences.count > 1 else ""
+    return f"{differences.mean:+.3g}{error}"
 
 
 def plot_methods(rows: Sequence[ResultRow], folder: Path, kind: str = "methods") -> list[Path]:
@@ -246,32 +249,30 @@ def plot_distractor(rows: Sequence[ResultRow], folder: Path) -> list[Path]:
     of rows whose target return is the largest training return."""
     rows = [row for row in rows if row.conditions["quantiles"] == "1"]
     planted = {row.environment for row in rows if row.conditions["distractor"] is not None}
-    return _plot_environments(
-        "distractor", _draw_triples, [r for r in rows if r.environment in planted], folder
-    )
+    rows = [row for row in rows if row.environment in planted]
+    return _plot_environments("distractor", _draw_triples, rows, folder)
 
 
-def _draw_bars(axes: "Axes", rows: Sequence[ResultRow]) -> None:
-    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
-    returns = [summary(row.value for row in group) for _, group in by_method]
-    colors = [OURS_COLOR if name == OURS else PLAIN for name, _ in by_method]
-    means, spreads = [r.mean for r in returns], [r.sd for r in returns]
-    axes.barh([name for name, _ in by_method], means, xerr=spreads, color=colors, height=0.7)
+_ByMethod = Mapping[str, Sequence[ResultRow]]
+
+
+def _draw_bars(axes: "Axes", by_method: _ByMethod) -> None:
+    for name, group in by_method.items():
+        returns, color = summary(row.value for row in group), OURS_COLOR if name == OURS else PLAIN
+        axes.barh(name, returns.mean, xerr=returns.sd, color=color, height=0.7)
     axes.set_xlabel("return per session (mean ± sd over training seeds)")
 
 
-def _draw_triples(axes: "Axes", rows: Sequence[ResultRow]) -> None:
-    by_method = list(grouped(rows, lambda row: row.method).items())[::-1]
+def _draw_triples(axes: "Axes", by_method: _ByMethod) -> None:
     conditions = zip(DISTRACTOR_RATES, DISTRACTOR_NAMES, (PLAIN, OURS_COLOR, LIGHT), strict=True)
     for index, (rate, label, color) in enumerate(conditions):
-        returns = [
-            summary(row.value for row in group if row.conditions["distractor"] == rate)
-            for _, group in by_method
-        ]
+        means = []
+        for group in by_method.values():
+            returns = (row.value for row in group if row.conditions["distractor"] == rate)
+            means.append(summary(returns).mean)
         positions = np.arange(len(by_method)) + 0.25 * (1 - index)
-        means = [r.mean for r in returns]
         axes.barh(positions, means, height=0.25, color=color, label=label)
-    axes.set_yticks(range(len(by_method)), [name for name, _ in by_method])
+    axes.set_yticks(range(len(by_method)), list(by_method))
     axes.set_xlabel("return per session (mean over training seeds)")
     axes.legend()
 
@@ -279,7 +280,7 @@ def _draw_triples(axes: "Axes", rows: Sequence[ResultRow]) -> None:
 @file_style()
 def _plot_environments(
     kind: str,
-    draw: Callable[["Axes", Sequence[ResultRow]], None],
+    draw: Callable[["Axes", _ByMethod], None],
     rows: Sequence[ResultRow],
     folder: Path,
 ) -> list[Path]:
@@ -291,6 +292,7 @@ def _plot_environments(
         figure, name = Figure(figsize=(5.2, 4.2)), f"{kind}-{environment}"
         axes = figure.add_subplot()
         axes.set_title(name)
-        draw(axes, group)
+        by_method = grouped(group, lambda row: row.method)
+        draw(axes, dict(reversed(by_method.items())))
         files += save(figure, folder, name)
     return files

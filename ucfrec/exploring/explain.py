@@ -84,7 +84,8 @@ def explain(
     for number, row in zip(numbers, frame.to_dict("records"), strict=True):
         own = {name: float(part[number]) for name, part in parts.items()}
         cards.append(Card(row[schema.ITEM_ID], row[RANK], row[schema.PROPENSITY], own))
-    rows = list(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
+    shown, rewards = user.item_ids[::-1].tolist(), user.rewards[::-1].tolist()
+    rows = list(zip(shown, rewards, strict=True))
     excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
     return Explained(rows, cards, excluded)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from ucfrec.errors import one_line
 from ucfrec.results.rows import ResultRow
-from ucfrec.results.statistics import Summary, summary
+from ucfrec.results.statistics import summary
 
 NONE = "–"
 """Cell of a missing value."""
@@ -86,11 +86,6 @@ def mean_and_sd(values: Iterable[float]) -> str:
     if not sample.count:
         return NONE
     return f"{sample.mean:.4g}" + (f" ± {sample.sd:.2g}" if sample.count > 1 else "")
-
-
-def signed_difference(differences: Summary) -> str:
-    """Mean difference with its sign ± its standard error."""
-    return f"{differences.mean:+.3g} ± {differences.standard_error:.2g}"
 
 
 def format_value(value: Any) -> str:

@@ -165,15 +165,14 @@ def _optuna() -> Any:
 def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
-    spaces = {policy: search.space(policy) for policy in search.policies}
+    own: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
+    for policy in search.policies:
+        own[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
     identity = {
         "store": store.record.fingerprint,
         "metric": plan.metric,
         "k": plan.k,
-        "search": config_hash(
-            {"fixed": dict(search.fixed), "seed": search.seed}
-            | {name: {n: asdict(d) for n, d in space.items()} for name, space in spaces.items()}
-        ),
+        "search": config_hash(own),
     }
     earlier = study.user_attrs.get("about")
     if earlier is None:

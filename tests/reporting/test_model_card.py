@@ -54,8 +54,7 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
     ):  # fmt: skip
         assert what in card, what
     assert "log.parquet" in card
-    assert "secret" not in card  # no folder of any machine
-    assert "learned nothing" not in card
+    assert not any(what in card for what in ("secret", "learned nothing"))
 
 
 def test_limits_follow_the_record(tmp_path: Path) -> None:
@@ -81,7 +80,7 @@ def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
     assert "2019-11-24 00:00 to 2019-12-01 00:00" in card
     assert "not trained on anything after 2019-12-01 00:00 UTC" in card
     assert "It was trained on all rows of its store: only later logs can evaluate it." in card
-    assert "is not below that of showing items" not in card
+    assert "is not below" not in card
 
 
 def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:

@@ -43,10 +43,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_numbers_are_those_of_the_record(runs: Path, tmp_path: Path) -> None:
     tables = page_of(tmp_path / "report.html", runs / "ucf", runs / "dt").tables
-    record, dt = record_of(runs / "ucf"), record_of(runs / "dt")
     best = tables["Runs"]["best validation loss"]
-    assert number(best["ucf"]) == pytest.approx(record["policy"]["best_validation"], rel=1e-3)
-    assert number(best["dt"]) == pytest.approx(dt["policy"]["best_validation"], rel=1e-3)
+    for name in ("dt", "ucf"):
+        record = record_of(runs / name)
+        assert number(best[name]) == pytest.approx(record["policy"]["best_validation"], rel=1e-3)
     data = {name: cells["value"] for name, cells in tables["Training data"].items()}
     train = EpisodeStore.open(runs / "store").split("train")
     assert number(data["training sessions"]) == train.n_episodes == 90
@@ -121,9 +121,8 @@ def test_the_page_stands_alone(runs: Path, tmp_path: Path) -> None:
 
 def test_names_from_outside_are_shown_and_never_run(runs: Path, tmp_path: Path) -> None:
     hostile = rewritten(runs / "ucf", tmp_path / HOSTILE.replace("/", "∕"), store=HOSTILE)
-    record = record_of(hostile)
+    record = record_of(hostile) | {"reward": HOSTILE}
     record["augmentation"]["warnings"] = [HOSTILE]
-    record["reward"] = HOSTILE
     (hostile / "run.json").write_text(json.dumps(record))
     results = tmp_path / "rows.jsonl"
     append_rows(results, [row(HOSTILE, HOSTILE, 1.0)])
@@ -219,11 +218,10 @@ def test_other_files_are_refused(
 def test_a_folder_that_is_no_run_is_named(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "report.html"
-    assert main(["report", str(runs / "dt"), str(runs / "store"), "--out", str(out)]) == 2
+    given, out = ["report", str(runs / "dt"), "--out"], tmp_path / "report.html"
+    assert main([*given, str(out), str(runs / "store")]) == 2
     assert f"{runs / 'store'} is not a run folder" in capsys.readouterr().err
-    assert not out.exists()
-    assert main(["report", str(runs / "dt"), "--out", str(tmp_path)]) == 2
+    assert main([*given, str(tmp_path)]) == 2
     assert "is a folder" in capsys.readouterr().err
-    assert main(["report", str(runs / "dt"), "--out", str(out)]) == 0
+    assert main([*given, str(out)]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

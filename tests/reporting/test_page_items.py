@@ -119,10 +119,10 @@ def test_features_come_beside_samples_and_never_run(folder: Path, tmp_path: Path
     assert all(text in page for text in ("&lt;script&gt;", "fresh 1"))
     assert not any(text in page for text in ("<script", "fresh 0"))
     features.write_text("id\n1\n")
-    with pytest.raises(InputError, match="has no column 'item_id'"):
-        write_report(out, [folder / "ucf"], items=features)
-    with pytest.raises(InputError, match="cannot be read as Parquet or CSV"):
-        write_report(out, [folder / "ucf"], items=folder / "ucf" / "run.json")
+    unread = folder / "ucf" / "run.json"
+    for items, says in ((features, "no column 'item_id'"), (unread, "be read as Parquet or CSV")):
+        with pytest.raises(InputError, match=says):
+            write_report(out, [folder / "ucf"], items=items)
 
 
 def test_data_quality_comes_from_the_run_folder(folder: Path, tmp_path: Path) -> None:

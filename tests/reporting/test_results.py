@@ -7,7 +7,6 @@ from ucfrec.off_policy.estimators import LOGGED
 from ucfrec.reporting.results import (
     NO_RESULTS,
     Estimates,
-    Results,
     conclude,
     draw_forest,
     find_quoted,
@@ -19,7 +18,7 @@ def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
     """The forest of policies a, b, … with the logged return and the rows of each."""
     named = zip("ab", policies, strict=False)
     estimates = [Estimates(name, [estimate(LOGGED, own), *rows]) for name, (own, rows) in named]
-    return draw_forest(Results({}, estimates))
+    return draw_forest(estimates)
 
 
 def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
@@ -52,7 +51,7 @@ def earned(policy: str, value: float, **more: Any) -> ResultRow:
 
 
 def of_environment(*rows: ResultRow) -> str:
-    (said,) = conclude(Results({"a": rows}, ()))
+    (said,) = conclude({"a": rows}, ())
     return said
 
 
@@ -71,7 +70,7 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
     assert "to compare it with" in said
     said = of_environment(earned("random", 1.0))
     assert said == "In a, only built-in policies were evaluated: random (1)."
-    assert conclude(Results({}, ())) == [NO_RESULTS]
+    assert conclude({}, ()) == [NO_RESULTS]
 
 
 def test_seeds_of_training_are_taken_together() -> None:
@@ -91,7 +90,7 @@ def test_seeds_of_training_are_taken_together() -> None:
 
 def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
     rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
-    (said,) = conclude(Results({}, [Estimates("ucf", rows)]))
+    (said,) = conclude({}, [Estimates("ucf", rows)])
     assert said == "For ucf: higher."
-    (said,) = conclude(Results({}, [Estimates("ucf", rows[:1])]))
+    (said,) = conclude({}, [Estimates("ucf", rows[:1])])
     assert "no verdict" in said

@@ -94,7 +94,7 @@ class Explorer:
     def values(self) -> list[tuple[float, str, ResultRow]]:
         """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
         values = []
-        for estimates in read_evidence(self._results).estimates:
+        for estimates in read_evidence(self._results)[1]:
             row = find_quoted(estimates.rows)
             if row is not None and row.target_return is not None:
                 values.append((row.target_return, estimates.name, row))

@@ -100,13 +100,13 @@ def render_report(
         InputError: a folder is not a run, or a file has no such rows or features.
     """
     by_data = grouped(_read_runs(runs), lambda run: run.record.fingerprint)
-    evidence = read_evidence(results)
+    environments, estimates = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
-            "verdict": conclude(evidence),
-            "environments": draw_environments(evidence),
-            "estimates": draw_estimates(evidence),
-            "forest": draw_forest(evidence),
+            "verdict": conclude(environments, estimates),
+            "environments": draw_environments(environments),
+            "estimates": draw_estimates(estimates),
+            "forest": draw_forest(estimates),
         }
     features = None if items is None else read_features(items)
     warnings, sections = [], []

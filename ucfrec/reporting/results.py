@@ -36,16 +36,11 @@ class Estimates:
     """Rows per step, with that of the logged steps."""
 
 
-@dataclass(frozen=True)
-class Results:
-    """The result rows of a report."""
-
-    environments: Mapping[str, Sequence[ResultRow]]
-    """Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
-    estimates: Sequence[Estimates]
+Environments = Mapping[str, Sequence[ResultRow]]
+"""Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
 
 
-def read_evidence(paths: Sequence[Path]) -> Results:
+def read_evidence(paths: Sequence[Path]) -> tuple[Environments, Sequence[Estimates]]:
     """Read result rows from JSON lines (files named `.jsonl`) or JSON.
 
     Raises:
@@ -71,7 +66,7 @@ def read_evidence(paths: Sequence[Path]) -> Results:
                 calls.append([])
             calls[-1].append(row)
         estimates += map(_group_estimates, calls)
-    return Results(environments, estimates)
+    return environments, estimates
 
 
 def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
@@ -95,10 +90,10 @@ def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
     return next(quoted, None)
 
 
-def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
+def draw_environments(environments: Environments) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
-    for environment, rows in results.environments.items():
+    for environment, rows in environments.items():
         lines, named = [evaluation_line(row) for row in rows], []
         for row, line in zip(rows, lines, strict=True):
             # The policy, with the fields that differ if it has several rows.
@@ -114,14 +109,16 @@ def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
     return pictures
 
 
-def draw_estimates(results: Results) -> list[tuple[list[tuple[Chart, Table]], Sequence[str]]]:
+def draw_estimates(
+    all_estimates: Sequence[Estimates],
+) -> list[tuple[list[tuple[Chart, Table]], tuple[str, ...]]]:
     """Charts and tables, per session and step, and warnings of each policy with estimates."""
     largest = {"largest_weight": "share of the largest weight"}
     by_session = {"R_cum": "mean return of a session", "effective_sessions": "effective sample"}
     by_session |= {**largest, "sessions": "sessions", "overlap": "overlap"}
     by_step = {_STEP: "mean reward of a step", "effective_steps": "effective sample", **largest}
-    pictures: list[tuple[list[tuple[Chart, Table]], Sequence[str]]] = []
-    for estimates in results.estimates:
+    pictures = []
+    for estimates in all_estimates:
         parts, name = [], estimates.name
         for rows, unit, columns, title, caption in (
             (estimates.rows, "sessions", by_session, "Mean return of a session", "Estimates"),
@@ -158,10 +155,10 @@ def _draw_rows(
     return chart, Table(caption, list(columns.values()), body, corner)
 
 
-def draw_forest(results: Results) -> Chart | None:
+def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
     """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
     intervals, logged = [], set()
-    for estimates in results.estimates:
+    for estimates in all_estimates:
         logged |= {row.value for row in estimates.rows if row.method == LOGGED}
         row = find_quoted(estimates.rows)
         if row is not None and row.interval is not None:
@@ -176,10 +173,8 @@ def draw_forest(results: Results) -> Chart | None:
 
 
 def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
-    """The highest estimated value of the rules that leave so many effective users of the log.
-
-    None where the log has no propensities.
-    """
+    """The highest estimated value of the rules that leave so many effective users of the log; None
+    where the log has no propensities."""
     if record.rule is None:
         return None
     known = [
@@ -234,27 +229,25 @@ class _Return:
         return f"{self.policy} ({format_value(self.value)})"
 
 
-def conclude(results: Results) -> list[str]:
+def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> list[str]:
     """One paragraph per environment, then one per policy with estimates from logs."""
-    conclusions = [_conclude(name, rows) for name, rows in results.environments.items()]
-    return conclusions + [_quote(estimates) for estimates in results.estimates] or [NO_RESULTS]
+    conclusions = [_conclude(name, rows) for name, rows in environments.items()]
+    return conclusions + [_quote(estimates) for estimates in all_estimates] or [NO_RESULTS]
 
 
 def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
     """One summary per policy and checkpoint, in order of first appearance."""
     groups = grouped(rows, lambda row: (row.method, row.checkpoint))
-    policies = [policy for policy, _ in groups]
-    return [
-        _Return(
-            policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}",
-            any(row.training_seed is not None for row in group),
-            len({row.training_seed for row in group}),
-            sum(row.value for row in group) / len(group),
-            min(row.interval[0] for row in group if row.interval),
-            max(row.interval[1] for row in group if row.interval),
-        )
-        for (policy, checkpoint), group in groups.items()
-    ]
+    policies, returns = [policy for policy, _ in groups], []
+    for (policy, checkpoint), group in groups.items():
+        name = policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}"
+        seeds = {row.training_seed for row in group}
+        value = sum(row.value for row in group) / len(group)
+        lows = [row.interval[0] for row in group if row.interval]
+        highs = [row.interval[1] for row in group if row.interval]
+        trained = seeds != {None}
+        returns.append(_Return(name, trained, len(seeds), value, min(lows), max(highs)))
+    return returns
 
 
 def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:

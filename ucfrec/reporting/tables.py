@@ -68,10 +68,8 @@ def evaluation_table(rows: Iterable[ResultRow]) -> str:
 
 
 def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
-    """The `columns` of rows as an aligned text table.
-
-    A value `x` of a row that also has `x_low` and `x_high`, such as R_cum, gets its interval.
-    """
+    """The `columns` of rows as an aligned text table; a value `x` of a row that has `x_low` and
+    `x_high`, such as R_cum, gets its interval."""
     return text_table(columns, [[_format_cell(row, name) for name in columns] for row in rows])
 
 

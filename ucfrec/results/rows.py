@@ -1,7 +1,5 @@
-"""Result rows of all measurements: what was measured, its numbers and their origin.
-
-Rows are lines of JSON in files that several processes may append to; in Python they are a table.
-"""
+"""Result rows of all measurements: what was measured, its numbers and their origin. They are lines
+of JSON in files that several processes may append to, and a table in Python."""
 
 import json
 import math
@@ -278,11 +276,8 @@ def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 @contextmanager
 def benchmarking(path: Path) -> Iterator[None]:
-    """Let no other command measure for the file `path` of result rows.
-
-    Raises:
-        InputError: another command does; the message names it.
-    """
+    """Let no other command measure for the file `path` of result rows; an `InputError` names one
+    that does."""
     with atomic.lock_path(path, "filled", part="benchmark"):
         atomic.remove_leftovers(path.parent)
         yield

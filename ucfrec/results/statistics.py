@@ -56,10 +56,8 @@ def effective_number(weights: Float64Array) -> float:
 
 
 def average_ranks(values: Array) -> Float64Array:
-    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean.
-
-    As `scipy.stats.rankdata`; that module takes a second to import.
-    """
+    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean, as by
+    `scipy.stats.rankdata`, which takes a second to import."""
     _, level, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks: Float64Array = (counts.cumsum() - (counts - 1) / 2)[level]
     return ranks

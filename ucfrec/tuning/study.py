@@ -1,6 +1,5 @@
-"""The search: trials of an Optuna study in a folder, in one or several processes, each measured on
-validation rows; the best settings as TOML, and a page of all trials.
-"""
+"""The search: trials of an Optuna study, in one or several processes, measured on validation rows;
+the best settings as TOML, and a page of all trials."""
 
 import json
 import math
@@ -281,11 +280,8 @@ def _keep_best(study: "Study", plan: Plan) -> None:
 
 
 def importances(study: "Study") -> dict[str, float]:
-    """Share of the metric's variance that each setting explains (fANOVA: Hutter et al., ICML 2014),
-    most important first; empty with fewer than four trials or none that differ.
-
-    Of several policies, only settings that all trials have.
-    """
+    """Share of the metric's variance that each setting of all trials explains (fANOVA: Hutter et
+    al., ICML 2014), most important first; empty with fewer than four trials that differ."""
     import optuna
 
     if len(set(_list_values(study))) < 4:

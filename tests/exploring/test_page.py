@@ -24,14 +24,9 @@ from ucfrec.errors import InputError  # noqa: E402
 from ucfrec.exploring.page import Explorer, application  # noqa: E402
 
 HOSTILE = "<script>alert(1)</script>"
-FEATURES = pa.table(
-    {
-        "item_id": list(range(30)),
-        "title": [HOSTILE, *(f"Film {n}" for n in range(1, 30))],
-        "image_url": ["javascript:alert(1)", *("https://example.org/x.png",) * 29],
-        "genre": ["drama"] * 30,
-    }
-)
+TITLES = [HOSTILE, *(f"Film {n}" for n in range(1, 30))]
+IMAGES = ["javascript:alert(1)", *("https://example.org/x.png",) * 29]
+FEATURES = pa.table({"item_id": list(range(30)), "title": TITLES, "image_url": IMAGES})
 
 
 @pytest.fixture(scope="module")

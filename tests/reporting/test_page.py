@@ -114,9 +114,8 @@ def test_the_page_stands_alone(runs: Path, tmp_path: Path) -> None:
     assert not re.search(r"url\((?!#)|https?:|@import", page.raw, re.IGNORECASE)
     policy = next(g for _, g in page.elements if "Security" in str(g.get("http-equiv")))
     assert str(policy["content"]).startswith("default-src 'none'")
-    for tag, attributes in page.elements:
-        if tag == "svg":
-            assert attributes.get("aria-label") or attributes.get("aria-hidden") == "true"
+    pictures = [given for tag, given in page.elements if tag == "svg"]
+    assert all(p.get("aria-label") or p.get("aria-hidden") == "true" for p in pictures)
 
 
 def test_names_from_outside_are_shown_and_never_run(runs: Path, tmp_path: Path) -> None:

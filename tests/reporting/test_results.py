@@ -4,13 +4,7 @@ from typing import Any
 
 from tests.support.report_page import estimate, row
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.reporting.results import (
-    NO_RESULTS,
-    Estimates,
-    conclude,
-    draw_forest,
-    find_quoted,
-)
+from ucfrec.reporting.results import NO_RESULTS, Estimates, conclude, draw_forest, find_quoted
 from ucfrec.results.rows import ResultRow
 
 

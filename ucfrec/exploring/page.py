@@ -157,12 +157,11 @@ class Explorer:
         shown = []
         for name, label, low, high, step in sliders:
             value, text = getattr(trained.rule, name), fields.get(name, "")
-            value = highest if value is None else value
             # Where a number is wrong, the list says so.
             if fields.get("custom") is not None and _NUMBER.fullmatch(text):
                 value = float(text)
-            own = {"name": name, "label": label, "low": low, "high": high, "step": step}
-            shown.append({**own, "value": value})
+            slider = {"name": name, "label": label, "low": low, "high": high, "step": step}
+            shown.append({**slider, "value": highest if value is None else value})
         return shown
 
     def _item(self, item_id: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
@@ -291,11 +292,10 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
+    write = partial(json.dumps, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    text = "".join(f"{write(value)}\n" for value in values)
     with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
-        file.write(head)
-        for value in values:
-            line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-            file.write(line.encode() + b"\n")
+        file.write(head + text.encode())
         file.flush()
         os.fsync(file.fileno())
 

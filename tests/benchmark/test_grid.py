@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from tests.support.result_rows import read_configurations
 from ucfrec.benchmark.cells import Cell, Evaluation, Measurement
@@ -27,15 +28,13 @@ def _square(cell: Cell, key: RowKey) -> list[ResultRow]:
         file.write(f"{number}\n")
     if number < 0:
         raise ValueError("negative")
-    metrics = {"square": float(number**2), "process": os.getpid(), "threads": _threads()}
+    metrics = {
+        "square": float(number**2),
+        "process": os.getpid(),
+        "threads": torch.get_num_threads(),
+    }
     row = ResultRow(**vars(key), metric="square", metrics=metrics)
     return [replace(row, checkpoint=name) for name in ("last", "best")]
-
-
-def _threads() -> int:
-    import torch  # a process of the test that prints needs none
-
-    return torch.get_num_threads()
 
 
 HOW = Measurement(_square, _config)
@@ -54,8 +53,6 @@ def _marks(folder: Path) -> list[str]:
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    import torch
-
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -95,8 +92,7 @@ def test_rows_and_folders_of_a_cell_are_replaced_when_it_is_measured_again(tmp_p
     assert _Measurement(rows) == {os.getpid()}, "one worker needs no process of its own"
     assert _marks(tmp_path) == ["2", "2", "3"]
     assert read_rows(results) == [*first[2:], *rows], "rows of other cells stay"
-    assert not (tmp_path / "run-2").exists()
-    assert (tmp_path / "run-3" / "policy").exists()
+    assert [(tmp_path / name).exists() for name in ("run-2", "run-3/policy")] == [False, True]
 
 
 def test_a_failed_cell_costs_only_itself(tmp_path: Path) -> None:

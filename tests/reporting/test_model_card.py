@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +54,7 @@ def test_it_says_data_reward_rule_and_limits(tmp_path: Path) -> None:
     ):  # fmt: skip
         assert what in card, what
     assert "log.parquet" in card
-    assert "secret" not in card  # no folder of any machine
-    assert "learned nothing" not in card
+    assert not any(what in card for what in ("secret", "learned nothing"))
 
 
 def test_limits_follow_the_record(tmp_path: Path) -> None:
@@ -82,7 +80,7 @@ def test_a_refit_knows_all_rows_of_its_store(tmp_path: Path) -> None:
     assert "2019-11-24 00:00 to 2019-12-01 00:00" in card
     assert "not trained on anything after 2019-12-01 00:00 UTC" in card
     assert "It was trained on all rows of its store: only later logs can evaluate it." in card
-    assert "is not below that of showing items" not in card
+    assert "is not below" not in card
 
 
 def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
@@ -99,11 +97,3 @@ def test_the_newest_of_each_measurement_is_kept(tmp_path: Path) -> None:
     assert len(json.loads((folder / MEASURED).read_text())) == 2
     write_card(folder)  # training on keeps what was measured
     assert text_of(folder) == card
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_run_that_may_not_be_written_is_left_alone(tmp_path: Path) -> None:
-    folder = run(tmp_path / "run")
-    folder.chmod(0o555)
-    add_measurement(folder, "ucfrec ope", "DR", {"R_cum": 1.0})
-    assert not (folder / CARD).exists()

@@ -10,15 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tests.support import killed_run
-from tests.support.episodes import (
-    N_ITEMS,
-    episode_columns,
-    lengths_of,
-    random_episodes,
-    some_states,
-    step_columns,
-)
+from tests.support import episodes, killed_run
+from tests.support.episodes import N_ITEMS
 from tests.support.report_page import (
     HOSTILE,
     SOURCE,
@@ -45,11 +38,11 @@ SETTINGS = (*killed_run.SETTINGS, "train.steps=20", "train.learning_rate=1e-3")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of items and runs `ucf` and `greedy` on it; treat as read-only."""
     folder = tmp_path_factory.mktemp("items")
-    episodes = random_episodes([2 + n % 6 for n in range(150)], seed=1)
-    columns, lengths = step_columns(episodes), lengths_of(episodes)
-    own = episode_columns(episodes)
+    sessions = episodes.random_episodes([2 + n % 6 for n in range(150)], seed=1)
+    columns, own = episodes.step_columns(sessions), episodes.episode_columns(sessions)
+    lengths = episodes.lengths_of(sessions)
     EpisodeStore.write(folder / "store", columns, lengths, own, source=SOURCE)
-    some_states().save(folder / "store" / ITEM_STATES)
+    episodes.some_states().save(folder / "store" / ITEM_STATES)
     ids = pa.table({"item_id": [f"item {n}" for n in range(N_ITEMS)], "train_count": [7] * N_ITEMS})
     pq.write_table(ids, folder / "store" / "items.parquet")
     for run, policy_name in (("ucf", "ucf"), ("greedy", "crm-greedy")):
@@ -119,10 +112,10 @@ def test_features_come_beside_samples_and_never_run(folder: Path, tmp_path: Path
     assert all(text in page for text in ("&lt;script&gt;", "fresh 1"))
     assert not any(text in page for text in ("<script", "fresh 0"))
     features.write_text("id\n1\n")
-    with pytest.raises(InputError, match="has no column 'item_id'"):
-        write_report(out, [folder / "ucf"], items=features)
-    with pytest.raises(InputError, match="cannot be read as Parquet or CSV"):
-        write_report(out, [folder / "ucf"], items=folder / "ucf" / "run.json")
+    unread = folder / "ucf" / "run.json"
+    for items, says in ((features, "no column 'item_id'"), (unread, "be read as Parquet or CSV")):
+        with pytest.raises(InputError, match=says):
+            write_report(out, [folder / "ucf"], items=items)
 
 
 def test_data_quality_comes_from_the_run_folder(folder: Path, tmp_path: Path) -> None:

@@ -4,31 +4,20 @@ from typing import Any
 
 from tests.support.report_page import estimate, row
 from ucfrec.off_policy.estimators import LOGGED
-from ucfrec.reporting.results import (
-    NO_RESULTS,
-    Estimates,
-    Results,
-    conclude,
-    draw_forest,
-    find_quoted,
-)
+from ucfrec.reporting.results import NO_RESULTS, Estimates, conclude, draw_forest, find_quoted
 from ucfrec.results.rows import ResultRow
 
 
 def forest_of(*policies: tuple[float, list[ResultRow]]) -> Any:
     """The forest of policies a, b, … with the logged return and the rows of each."""
-    estimates = [
-        Estimates(name, [estimate(LOGGED, logged), *rows])
-        for name, (logged, rows) in zip("ab", policies, strict=False)
-    ]
-    return draw_forest(Results({}, estimates))
+    named = zip("ab", policies, strict=False)
+    estimates = [Estimates(name, [estimate(LOGGED, own), *rows]) for name, (own, rows) in named]
+    return draw_forest(estimates)
 
 
 def test_a_line_a_policy_hollow_where_the_verdict_forbids() -> None:
-    good = [
-        estimate("IPS", 3.0),
-        estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True}),
-    ]
+    doubly = estimate("DR", 4.0, details={"verdict_of": "DR", "reliable": True})
+    good = [estimate("IPS", 3.0), doubly]
     bad = [estimate("DR", 9.0, details={"verdict_of": "DR", "reliable": False})]
     first, second, _ = forest_of((2.0, good), (2.0, bad)).summary.split(". ")
     assert first == "a: DR: 4, 95% interval 3.5 to 5.5, the estimate stands"
@@ -56,13 +45,8 @@ def earned(policy: str, value: float, **more: Any) -> ResultRow:
 
 
 def of_environment(*rows: ResultRow) -> str:
-    (said,) = conclude(Results({"a": rows}, ()))
+    (said,) = conclude({"a": rows}, ())
     return said
-
-
-def test_without_results_nothing_is_said_of_returns() -> None:
-    assert conclude(Results({}, ())) == [NO_RESULTS]
-    assert "the returns of these policies are unknown" in NO_RESULTS
 
 
 def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
@@ -75,12 +59,12 @@ def test_the_best_is_named_with_its_interval_and_what_it_lies_above() -> None:
     assert "higher than that of random (1), and lower than that of optimal (9)" in said
     assert "Whether it is higher or lower than that of logging (2.95) is open" in said
     assert "Each policy was trained once" in said
-
-
-def test_intervals_that_overlap_leave_it_open() -> None:
     said = of_environment(earned("dt", 2.9, training_seed=0), earned("ucf", 3.0, training_seed=0))
     assert "overlaps that of dt (2.9): which of them has the higher return is open" in said
     assert "to compare it with" in said
+    said = of_environment(earned("random", 1.0))
+    assert said == "In a, only built-in policies were evaluated: random (1)."
+    assert conclude({}, ()) == [NO_RESULTS]
 
 
 def test_seeds_of_training_are_taken_together() -> None:
@@ -90,25 +74,17 @@ def test_seeds_of_training_are_taken_together() -> None:
     assert "higher than that of bad (1)" in said
     assert "lower than that of random (3.5) is open" in said
     assert "trained once" not in said
-
-
-def test_checkpoints_of_one_run_are_no_seeds() -> None:
-    rows = [earned("ucf", 3.0, training_seed=0, checkpoint="best"),
-            earned("ucf", 2.0, training_seed=0, checkpoint="last")]  # fmt: skip
-    said = of_environment(*rows)
+    # Checkpoints of one run are no seeds.
+    best, last = (earned("ucf", value, training_seed=0, checkpoint=name)
+                  for name, value in (("best", 3.0), ("last", 2.0)))  # fmt: skip
+    said = of_environment(best, last)
     assert "ucf, checkpoint best has the highest return of 2 trained policies: 3 (" in said
     assert "trained once" in said
 
 
-def test_built_in_policies_alone_say_nothing_of_trained_ones() -> None:
-    assert of_environment(earned("random", 1.0)) == (
-        "In a, only built-in policies were evaluated: random (1)."
-    )
-
-
 def test_of_logs_the_verdict_of_ope_is_quoted() -> None:
     rows = [estimate("DM", 9.0), estimate("DR", 2.0, details={"verdict": "higher"})]
-    (said,) = conclude(Results({}, [Estimates("ucf", rows)]))
+    (said,) = conclude({}, [Estimates("ucf", rows)])
     assert said == "For ucf: higher."
-    (said,) = conclude(Results({}, [Estimates("ucf", rows[:1])]))
+    (said,) = conclude({}, [Estimates("ucf", rows[:1])])
     assert "no verdict" in said

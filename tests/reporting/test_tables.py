@@ -17,9 +17,6 @@ def test_columns_are_aligned_names_left_and_numbers_right() -> None:
         "long name  x       1.500",
         "y          longer      –",
     ]
-
-
-def test_markdown_has_a_line_a_row() -> None:
     assert markdown_table(("a", "b"), [("x", 0.5)]) == "| a | b |\n| --- | --- |\n| x | 0.500 |"
 
 

@@ -18,24 +18,11 @@ from ucfrec.runs.config import resolve_config
 from ucfrec.runs.record import RunRecord
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import Dimension, Search
-from ucfrec.tuning.study import (
-    BEST,
-    BEST_TOML,
-    PAGE,
-    STUDY,
-    Plan,
-    format_toml,
-    list_finished,
-    measure_run,
-    tune,
-)
+from ucfrec.tuning.study import BEST, Plan, format_toml, list_finished, measure_run, tune
 
 FIXED = {
-    "train.validate_every": 2,
-    "policy.context": 3,
-    "rule.sessions": 2,
-    "rule.quantiles": [1.0],
-    "rule.temperatures": [0.0],
+    **{"train.validate_every": 2, "policy.context": 3, "rule.sessions": 2},
+    **{"rule.quantiles": [1.0], "rule.temperatures": [0.0]},
 }
 SPACE = {
     "train.learning_rate": Dimension(low=1e-3, high=1e-1, log=True),
@@ -60,12 +47,6 @@ def values(study: optuna.Study) -> list[tuple[float | None, Mapping[str, object]
     return [(trial.value, trial.params) for trial in list_finished(study)]
 
 
-@pytest.fixture(scope="module")
-def found(store: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, optuna.Study]:
-    searched = plan(store, tmp_path_factory.mktemp("found") / "tuned", ("dt", "item-rate"), "ndcg")
-    return searched, tune(searched, 4)
-
-
 def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
     searched = Search(("dt",), FIXED, False, 0, SPACE)
     rule = searched.config("dt", {"rule.reward_weights": 2.0}).rule
@@ -75,20 +56,15 @@ def test_the_reward_weight_of_a_trial_is_the_only_one_of_its_rules() -> None:
     assert given.config("dt", {"rule.reward_weights": 2.0}).rule.lookaheads == (4.0,)
 
 
-def test_the_best_trial_is_the_run_that_is_kept(found: tuple[Plan, optuna.Study]) -> None:
-    searched, study = found
+def test_the_best_trial_is_the_run_that_is_kept(store: Path, tmp_path: Path) -> None:
+    searched = plan(store, tmp_path / "tuned", ("dt", "item-rate"), "ndcg")
+    study = tune(searched, 4)
     assert len(list_finished(study)) == 4
     best = searched.out / BEST
-    assert {path.name for path in searched.out.iterdir()} == {
-        BEST,
-        BEST_TOML,
-        PAGE,
-        STUDY,
-        "stages",
-    }
+    left = {path.name for path in searched.out.iterdir()}
+    assert left == {BEST, "best.toml", "tuning.md", "study.db", "stages"}
     trained = TrainedPolicy.load(best)
-    store = EpisodeStore.open(searched.store)
-    assert measure_run(trained, store, "ndcg", 5) == study.best_value
+    assert measure_run(trained, EpisodeStore.open(store), "ndcg", 5) == study.best_value
     assert study.best_value == max(t.value for t in study.trials if t.state.name == "COMPLETE")
 
 
@@ -116,7 +92,9 @@ def test_two_workers_share_the_trials(store: Path, tmp_path: Path) -> None:
 def test_a_killed_trial_is_run_again(store: Path, tmp_path: Path) -> None:
     searched = plan(store, tmp_path / "tuned")
     tune(searched, 1)
-    with sqlite3.connect(searched.out / STUDY) as study:  # as a process that was killed leaves it
+    with sqlite3.connect(
+        searched.out / "study.db"
+    ) as study:  # as a process that was killed leaves it
         study.execute("UPDATE trials SET state = 'RUNNING', datetime_complete = NULL")
         study.execute("DELETE FROM trial_values")
     resumed = tune(searched, 1)
@@ -126,10 +104,8 @@ def test_a_killed_trial_is_run_again(store: Path, tmp_path: Path) -> None:
 
 
 def test_hopeless_trials_end_early(store: Path, tmp_path: Path) -> None:
-    rates = {
-        "train.learning_rate": Dimension((0.03, 1e-6)),
-        "policy.dropout": Dimension(low=0.0, high=0.5),
-    }
+    rates = {"train.learning_rate": Dimension((0.03, 1e-6))}
+    rates["policy.dropout"] = Dimension(low=0.0, high=0.5)
     fixed = {**FIXED, "train.steps": 12, "policy.dim": 8, "rule.choose": False}
     search = Search(("dt",), fixed, False, 0, rates)
     study = tune(Plan(store, tmp_path / "tuned", search, "gauc", 5), 9)
@@ -159,9 +135,7 @@ def test_the_command_writes_settings_that_train_takes(
     assert settings["policy"]["dim"] == 8
     config = resolve_config("dt", out / "best.toml")
     assert config == RunRecord.read(out / BEST).config
-    page = (out / "tuning.md").read_text(encoding="utf-8")
-    assert "## Importance" in page
-    assert page.count("\n| ") >= 4
+    assert (out / "tuning.md").read_text(encoding="utf-8").count("\n| ") >= 4
 
 
 def test_what_cannot_be_searched(store: Path, tmp_path: Path) -> None:

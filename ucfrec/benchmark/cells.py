@@ -244,12 +244,7 @@ class Plan:
         conditions: Mapping[str, Scalar] | None = None,
     ) -> Iterator[Cell]:
         """One cell for each training seed of each method that supports the actions of the task.
-
-        Cells of equal trainings share a run.
-
-        Args:
-            evaluation: None for the budget's.
-        """
+        Cells of equal trainings share a run."""
         store = EpisodeStore.open(task.store)
         for name, method in methods.items():
             if not method.supports(store):
@@ -286,11 +281,8 @@ class Plan:
     def list_built_in(
         self, table: str, task: Task, methods: Mapping[str, Method]
     ) -> Iterator[Cell]:
-        """One cell for each built-in policy of the task's environments.
-
-        Args:
-            methods: of the table; a built-in policy of the same name is distinguished from it.
-        """
+        """One cell for each built-in policy of the task's environments, told apart from one of
+        `methods` with its name."""
         for name in task.behaviors:
             yield Cell(
                 suite=self.suite,

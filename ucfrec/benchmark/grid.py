@@ -44,22 +44,18 @@ def run_grid(
     describe: str = "benchmark",
     again: bool = False,
 ) -> list[ResultRow]:
-    """Measure every cell that has no row in `results` yet, and those with the same key once.
+    """The rows of cells, in their order; measures those that have none in `results`.
 
     The rows of a cell are appended as soon as it is measured, so an interruption loses none. A cell
     that fails does not stop the others and is reported at the end. One worker, or an only cell, is
     measured in this process.
 
     Args:
-        results: file of result rows (JSON lines); its other rows are kept. No other process may
-            fill it (`ucfrec.results.rows.benchmarking`).
+        results: file of result rows (JSON lines), which no other process may fill
+            (`ucfrec.results.rows.benchmarking`).
         workers: number of cells that are measured at a time, each in a process of its own.
         describe: name of the benchmark in progress output.
-        again: remove the rows, runs and shared stages of `cells` first. An interrupted call is
-            resumed without it.
-
-    Returns:
-        The rows of all cells, in the order of `cells`.
+        again: remove the rows, runs and shared stages of `cells` first.
 
     Raises:
         InputError: `workers` is below 1, a line of `results` is not a result row, or at least one
@@ -94,10 +90,13 @@ def _measure_all(
 ) -> dict[str, list[ResultRow]]:
     """The rows of each task; raises an error at the end if one of them failed."""
     errors, rows, workers = [], {}, min(workers, len(tasks))
+
+    def place(name: str) -> int:
+        seed = tasks[name].key.training_seed
+        return -1 if seed is None else seed
+
     # Seed by seed: when it is interrupted, its rows are whole tables of fewer seeds.
-    seeds = {name: task.key.training_seed for name, task in tasks.items()}
-    names = sorted(tasks, key=lambda name: -1 if (seed := seeds[name]) is None else seed)
-    ordered = {name: tasks[name] for name in names}
+    ordered = {name: tasks[name] for name in sorted(tasks, key=place)}
     outcomes = _measure_in_processes(ordered, workers) if workers > 1 else _measure_here(ordered)
     with closing(outcomes), progress(len(tasks), describe, "cells") as bar:
         for name, outcome in outcomes:
@@ -115,8 +114,7 @@ def _measure_all(
 
 
 _Outcomes = Generator[tuple[str, list[ResultRow] | BaseException], None, None]
-"""Name of a task, and its rows or why it has none. An interrupted benchmark ends at once; its cells
-resume from their checkpoints."""
+"""Name of a task, and its rows or why it has none."""
 
 
 def _measure_in_processes(tasks: Mapping[str, _Task], workers: int) -> _Outcomes:
@@ -153,10 +151,7 @@ def _use_one_thread() -> None:
 
 
 def select_names(names: Iterable[str], selected: Sequence[str], what: str) -> list[str]:
-    """Those of `names` that are in `selected`, in their order; all if it is empty.
-
-    Args:
-        what: what the names stand for, for the message: "method", "table".
+    """Those of `names`, which stand for `what`, that are in `selected`; all if it is empty.
 
     Raises:
         InputError: `selected` has a name that `names` lacks.

@@ -89,9 +89,7 @@ class BenchmarkRequest:
 
 
 def measure(suite: Benchmark, request: BenchmarkRequest) -> str:
-    """Measure the cells of the tables that have no row yet.
-
-    Plots are written to `out/budget/plots`.
+    """The tables; measures their cells that have no row yet, and plots into `out/budget/plots`.
 
     Raises:
         InputError: the budget, a task or a method is unknown, another table than main is requested

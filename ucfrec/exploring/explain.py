@@ -1,8 +1,9 @@
 """Why a policy recommends what it does to one user: parts of the scores, and excluded items."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -19,8 +20,7 @@ from ucfrec.logs.histories import Histories
 from ucfrec.recommending.recommend import RANK, recommend, sessions_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 
-POLICY, EXPOSURE, REWARD, LOOKAHEAD = "policy", "exposure", "reward weight", "lookahead"
-PARTS: Final = (POLICY, EXPOSURE, REWARD, LOOKAHEAD)
+PARTS: Final = ("policy", "exposure", "reward weight", "lookahead")
 _ALMOST_NONE: Final = 1e-9
 """A lookahead that changes no score, but has rewards counted in the units of a lookahead."""
 _EXCLUDED: Final = 10
@@ -58,10 +58,10 @@ class Excluded:
 class Explained:
     """What one user is recommended, and why."""
 
-    rows: tuple[tuple[Any, float], ...]
+    rows: Sequence[tuple[Any, float]]
     """Items that the user was shown, with their rewards, the latest first."""
-    cards: tuple[Card, ...]
-    excluded: tuple[Excluded, ...]
+    cards: Sequence[Card]
+    excluded: Sequence[Excluded]
     """Those of the best items by score that are not recommended, best first."""
 
 
@@ -69,9 +69,6 @@ def explain(
     trained: TrainedPolicy, rule: DecisionRule, user: Histories, k: int, filter_seen: bool
 ) -> Explained:
     """The recommendations of `ucfrec recommend` for one user, with their reasons.
-
-    Args:
-        filter_seen: whether items that the user has seen are excluded.
 
     Raises:
         InputError: the rule does not fit the policy, or an item of the history is not known.
@@ -83,18 +80,14 @@ def explain(
     sessions = sessions_of(trained, latest, trained.scorer().length)
     parts = _parts(trained.scorer(rule), sessions)
     numbers = trained.items.numbers(frame[schema.ITEM_ID].to_numpy())
-    cards = tuple(
-        Card(
-            row[schema.ITEM_ID],
-            row[RANK],
-            row[schema.PROPENSITY],
-            {name: float(part[number]) for name, part in parts.items()},
-        )
-        for number, row in zip(numbers, frame.to_dict("records"), strict=True)
-    )
-    rows = tuple(zip(user.item_ids[::-1].tolist(), user.rewards[::-1].tolist(), strict=True))
+    cards = []
+    for number, row in zip(numbers, frame.to_dict("records"), strict=True):
+        own = {name: float(part[number]) for name, part in parts.items()}
+        cards.append(Card(row[schema.ITEM_ID], row[RANK], row[schema.PROPENSITY], own))
+    shown, rewards = user.item_ids[::-1].tolist(), user.rewards[::-1].tolist()
+    rows = list(zip(shown, rewards, strict=True))
     excluded = _find_excluded(trained, rule, user, sessions, filter_seen, sum(parts.values()))
-    return Explained(rows, cards, tuple(excluded))
+    return Explained(rows, cards, excluded)
 
 
 def read_pasted(text: str) -> pd.DataFrame:
@@ -138,22 +131,17 @@ def _parts(scorer: Scorer, sessions: Sessions) -> dict[str, Tensor]:
     def scores(**changes: Any) -> Tensor:
         return scorer.under(_plain(rule, **changes)).scores(sessions, empty=True)[0].double()
 
-    of_policy = scores(reward_weight=0.0, lookahead=0.0)
-    with_rewards = scores(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
-    parts = {
-        POLICY: of_policy,
-        EXPOSURE: torch.zeros_like(of_policy),
-        REWARD: with_rewards - of_policy,
-        LOOKAHEAD: scores() - with_rewards,
-    }
     alone = scorer.under(_plain(rule, reward_weight=0.0, lookahead=0.0))
     query = alone.query(sessions)
+    exposed = unexposed = alone.scores_of(query, empty=True)[0].double()
     if query.policy is not None:
         none = torch.zeros_like(query.policy.repeated)
         query = query._replace(policy=query.policy._replace(repeated=none, alike=none))
-        parts[POLICY] = alone.scores_of(query, empty=True)[0].double()
-        parts[EXPOSURE] = of_policy - parts[POLICY]
-    return {name: part - part.mean() for name, part in parts.items()}
+        unexposed = alone.scores_of(query, empty=True)[0].double()
+    rewarded = scores(lookahead=_ALMOST_NONE if rule.looks_ahead else 0.0)
+    sums = (torch.zeros_like(exposed), unexposed, exposed, rewarded, scores())
+    parts = [after - before for before, after in pairwise(sums)]
+    return {name: part - part.mean() for name, part in zip(PARTS, parts, strict=True)}
 
 
 def _find_excluded(
@@ -165,25 +153,20 @@ def _find_excluded(
     scores: Any,
 ) -> list[Excluded]:
     """The best of the items that filters exclude."""
-    reasons: dict[int, str] = {}
-
-    def exclude(numbers: Any, reason: str) -> None:
-        for number in np.asarray(numbers).tolist():
-            reasons.setdefault(number, reason)
-
-    if filter_seen:
-        seen = trained.items.numbers(user.seen_ids)
-        exclude(seen[seen >= 0], "the user has seen it")
-    if rule.exclude_seen:
-        items = sessions.actions[0]
-        exclude(items[items >= 0], "this session has shown it")
+    excluded: dict[str, Any] = {}
     for name, words in (
-        ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),
         ("tag_run", f"the last {rule.tag_run} items had its main tag"),
+        ("tag_window", f"it shares a tag with one of the last {rule.tag_window} items"),
     ):
         if limit := getattr(rule, name):
             filtered = trained.scorer(_plain(rule, **{name: limit})).scores(sessions, empty=True)[0]
-            exclude(torch.isneginf(filtered).nonzero()[:, 0], words)
+            excluded[words] = torch.isneginf(filtered).nonzero()[:, 0]
+    if rule.exclude_seen:
+        excluded["this session has shown it"] = sessions.actions[0]
+    if filter_seen:
+        excluded["the user has seen it"] = trained.items.numbers(user.seen_ids)
+    # Of several reasons, the last one here.
+    reasons = {n: words for words, numbers in excluded.items() for n in numbers.tolist()}
     order = torch.argsort(scores, descending=True).tolist()
     ids = trained.items.ids
     ranked = [(rank, number) for rank, number in enumerate(order, start=1) if number in reasons]

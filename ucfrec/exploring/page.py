@@ -1,9 +1,8 @@
 """The explorer: its page as HTML, from what a visitor asked for, and its web application."""
 
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +22,7 @@ from ucfrec.logs.histories import Histories
 from ucfrec.python_api.given_data import read_histories
 from ucfrec.recommending.recommend import name_some
 from ucfrec.reporting.charts import Chart, line_chart
-from ucfrec.reporting.page import template, write_report
+from ucfrec.reporting.page import render_report, template
 from ucfrec.reporting.results import find_quoted, read_evidence
 from ucfrec.results.rows import ResultRow
 from ucfrec.runs.trained_policy import TrainedPolicy
@@ -44,19 +43,6 @@ _HEADERS: Final = {
 }
 
 
-@dataclass
-class Slider:
-    """One number of the rule that a visitor can change."""
-
-    name: str
-    """Field of `DecisionRule`."""
-    label: str
-    low: float
-    high: float
-    step: float
-    value: float = 0.0
-
-
 class Explorer:
     """Runs that are tried out, and what the page shows of them."""
 
@@ -68,7 +54,6 @@ class Explorer:
     ) -> None:
         """
         Args:
-            runs: one policy of items, or two that are compared.
             features: of items, with a column `item_id`; None for none.
             results: files of `ucfrec ope --json` and `ucfrec evaluate --json`, for the report.
 
@@ -84,11 +69,7 @@ class Explorer:
         self._features = {str(row[schema.ITEM_ID]): row for row in rows}
 
     def page(self, fields: Mapping[str, str]) -> str:
-        """The whole page.
-
-        Args:
-            fields: of the form, by name; unknown ones are ignored.
-        """
+        """The whole page, for the fields of the form by name; unknown ones are ignored."""
         runs = []
         for run in self.runs:
             card, text = run.folder / CARD, "There is no model card."
@@ -113,9 +94,9 @@ class Explorer:
     def values(self) -> list[tuple[float, str, ResultRow]]:
         """Off-policy estimates by target return: the target, the policy, the row of the verdict."""
         values = []
-        for estimates in read_evidence(self._results).estimates:
+        for estimates in read_evidence(self._results)[1]:
             row = find_quoted(estimates.rows)
-            if row is not None and row.target_return is not None and row.interval is not None:
+            if row is not None and row.target_return is not None:
                 values.append((row.target_return, estimates.name, row))
         return sorted(values, key=lambda value: value[:2])
 
@@ -133,13 +114,7 @@ class Explorer:
     @cached_property
     def reports(self) -> list[str]:
         """The report of each run: verdict, curves and samples, as an HTML page."""
-        pages = []
-        for trained in self.runs:
-            with tempfile.TemporaryDirectory() as scratch:
-                file = Path(scratch) / "report.html"
-                write_report(file, [trained.folder], self._results)
-                pages.append(file.read_text(encoding="utf-8"))
-        return pages
+        return [render_report([trained.folder], self._results) for trained in self.runs]
 
     def _fill(self, fields: Mapping[str, str]) -> dict[str, Any]:
         """Lists and error, for the templates."""
@@ -168,23 +143,26 @@ class Explorer:
             "item": self._item,
         }
 
-    def _sliders(self, fields: Mapping[str, str]) -> list[Slider]:
+    def _sliders(self, fields: Mapping[str, str]) -> list[dict[str, Any]]:
+        """The numbers of the rule that a visitor can change, fields of `DecisionRule`."""
         trained, states = self.runs[0], self.runs[0].item_states
-        low, high = float(trained.training_returns[0]), float(trained.training_returns[-1])
-        span = max(high - low, abs(high), 1e-6)
-        sliders = [Slider("target", "Target return", low, high + span / 2, span / 100)]
+        lowest, highest = float(trained.training_returns[0]), float(trained.training_returns[-1])
+        span = max(highest - lowest, abs(highest), 1e-6)
+        sliders = [("target", "Target return", lowest, highest + span / 2, span / 100)]
         if trained.reward_model is not None:
-            sliders.append(Slider("reward_weight", "Reward weight", 0, 32, 0.25))
-        sliders.append(Slider("temperature", "Temperature", 0, 2, 0.05))
+            sliders.append(("reward_weight", "Reward weight", 0, 32, 0.25))
+        sliders.append(("temperature", "Temperature", 0, 2, 0.05))
         if states is not None and bool((states.tags >= 0).any()):
-            sliders.append(Slider("tag_window", "Exclude tags of the last items", 0, 10, 1))
-        for slider in sliders:
-            value, text = getattr(trained.rule, slider.name), fields.get(slider.name, "")
-            slider.value = high if value is None else value
+            sliders.append(("tag_window", "Exclude tags of the last items", 0, 10, 1))
+        shown = []
+        for name, label, low, high, step in sliders:
+            value, text = getattr(trained.rule, name), fields.get(name, "")
             # Where a number is wrong, the list says so.
             if fields.get("custom") is not None and _NUMBER.fullmatch(text):
-                slider.value = float(text)
-        return sliders
+                value = float(text)
+            slider = {"name": name, "label": label, "low": low, "high": high, "step": step}
+            shown.append({**slider, "value": highest if value is None else value})
+        return shown
 
     def _item(self, item_id: Any) -> dict[str, Any]:
         """Title, picture and other features of an item."""
@@ -254,11 +232,7 @@ def _read_number(
 
 
 def application(explorer: Explorer, allowed_hosts: Sequence[str]) -> FastAPI:
-    """The application, which keeps no state of its visitors.
-
-    Args:
-        allowed_hosts: values of the header `Host` that are answered.
-    """
+    """The application, which answers the given values of `Host` and keeps no state of visitors."""
     app = FastAPI(title="ucfrec explorer", docs_url=None, redoc_url=None, openapi_url=None)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*allowed_hosts], www_redirect=False)
     script = files(_PACKAGE).joinpath("explore.js").read_text(encoding="utf-8")

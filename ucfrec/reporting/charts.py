@@ -168,13 +168,10 @@ def name_bins(edges: Sequence[float] | None, values: Sequence[float] | None) -> 
 
 @page_style()
 def interval_chart(title: str, intervals: Sequence[Interval], logged: float | None = None) -> Chart:
-    """Draw values with their intervals one below the other.
+    """Draw values with their intervals one below the other, that of logged sessions as a line.
 
     Values without a verdict are bars from 0; others are dots, hollow and dashed where the verdict
     forbids to rely on them.
-
-    Args:
-        logged: value of the logged sessions, drawn as a vertical line.
     """
     from matplotlib.figure import Figure
 
@@ -233,10 +230,8 @@ def _short(value: float) -> str:
 
 
 def render(figure: "Figure", title: str, summary: str) -> Chart:
-    """The figure as an `<svg>` of a page, with variables for its colors; matplotlib escapes texts.
-
-    Its style sheet, which would be one of the whole page, and names of groups are left out.
-    """
+    """The figure as an `<svg>` of a page, with variables for its colors, without style sheet and
+    names of groups, which would be of the whole page; matplotlib escapes texts."""
     file = io.StringIO()
     none = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     figure.savefig(file, format="svg", metadata=none)
@@ -283,10 +278,8 @@ def file_style() -> Iterator[None]:
 
 @file_style()
 def save(figure: "Figure", folder: Path, name: str) -> list[Path]:
-    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; returns both paths.
-
-    Of the name, which may be a dataset's, characters that a path gives a meaning become "-".
-    """
+    """Write `figure` as `name.png` and `name.svg` in `folder`, atomically; characters of the name
+    that a path gives a meaning become "-"."""
     files = []
     for kind in ("png", "svg"):
         path = folder / f"{_NOT_IN_NAMES.sub('-', name)}.{kind}"

@@ -40,10 +40,7 @@ def rank_policies(
         logs: their name in model cards; `TEST_SPLIT` for that of the store.
         liked: condition on the reward; None for the run's own.
         seed: of the bootstrap over users and of the random baseline.
-        checkpoint: name of the policies' weights, for the rows.
-
-    Raises:
-        InputError: `liked` cannot be used.
+        checkpoint: name of the policies' weights, here and below.
     """
     from ucfrec.evaluation.ranking import Later, LikedExpression
     from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
@@ -90,10 +87,6 @@ def estimate_return(
     Args:
         logs: their names in the model card.
         seed: of the folds and the bootstrap.
-        checkpoint: name of the policy's weights, for the rows.
-
-    Raises:
-        InputError: the logs cannot be used.
     """
     from ucfrec.off_policy.evaluate import evaluate_off_policy
     from ucfrec.off_policy.score import LoggedSessions
@@ -122,13 +115,7 @@ def evaluate_in(
     seed: int,
     checkpoint: str,
 ) -> Evaluation:
-    """Measure the return of policies, and of built-in policies, in a simulator.
-
-    Args:
-        candidates: by run folder, as the rows name it.
-        behaviors: built-in policies of the simulator.
-        seed: of the episodes.
-        checkpoint: name of the policies' weights, for the rows.
+    """Measure the return of policies, by run folder, and of built-in policies in a simulator.
 
     Raises:
         InputError: a policy does not fit the environment, or it has no such behavior.
@@ -142,4 +129,4 @@ def evaluate_in(
         rows.append(replace(row, conditions=conditions, checkpoint=checkpoint))
         add_evaluation(trained.folder, rows[-1])
     rows += [evaluate_behavior(environment, name, episodes, seed) for name in behaviors]
-    return Evaluation(rows)
+    return Evaluation(rows, ())

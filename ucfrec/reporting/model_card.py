@@ -69,7 +69,6 @@ def add_measurement(
         run: the run folder; one that this process may not write to is left as it is.
         how: the command, e.g. "ucfrec ope".
         of: what was measured on what, e.g. "DR on sessions.parquet, target return 5".
-        values: name to number or text, in the order of the table.
     """
     if not os.access(run, os.W_OK):
         return

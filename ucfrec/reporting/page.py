@@ -74,31 +74,39 @@ class _Run:
 def write_report(
     out: Path, runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
 ) -> None:
-    """Write a self-contained HTML page about `runs`, atomically.
-
-    Runs on the same data share a section and charts. A run that is still in training is shown up to
-    its last logged step.
-
-    Args:
-        results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`; JSON, or
-            JSON lines if the name ends in `.jsonl`.
-        items: item features to show with the sample recommendations, Parquet or CSV with a column
-            `item_id`; None for none.
+    """Write `render_report` to a file, atomically.
 
     Raises:
-        InputError: a folder is not a run, a file has no such rows or features, or `out` is a
-            folder.
+        InputError: `out` is a folder, or as `render_report`.
     """
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file with --out, e.g. {out / 'report.html'}")
+    page = render_report(runs, results, items)
+    with atomic_file(out) as scratch:
+        # Folder names may have bytes that are not valid Unicode.
+        scratch.write_text(page, encoding="utf-8", errors="backslashreplace")
+
+
+def render_report(
+    runs: Sequence[Path], results: Sequence[Path] = (), items: Path | None = None
+) -> str:
+    """A self-contained HTML page about `runs`; those on the same data share a section and charts.
+
+    Args:
+        results: rows of `ucfrec evaluate --json`, `ucfrec ope --json` or `ucfrec demo`.
+        items: item features to show with the sample recommendations, for `read_features`.
+
+    Raises:
+        InputError: a folder is not a run, or a file has no such rows or features.
+    """
     by_data = grouped(_read_runs(runs), lambda run: run.record.fingerprint)
-    evidence = read_evidence(results)
+    environments, estimates = read_evidence(results)
     with damage_explained(Path(", ".join(map(str, results))), "write its rows again"):
         evaluated = {
-            "verdict": conclude(evidence),
-            "environments": draw_environments(evidence),
-            "estimates": draw_estimates(evidence),
-            "forest": draw_forest(evidence),
+            "verdict": conclude(environments, estimates),
+            "environments": draw_environments(environments),
+            "estimates": draw_estimates(estimates),
+            "forest": draw_forest(estimates),
         }
     features = None if items is None else read_features(items)
     warnings, sections = [], []
@@ -108,12 +116,9 @@ def write_report(
                 warnings += [(run.name, text) for text in _warnings(run)]
         with damage_explained(group[0].folder / RUN, _REMEDY):
             sections.append(_section(group, features))
-    page = template("ucfrec.reporting", "report.html").render(
+    return template("ucfrec.reporting", "report.html").render(
         version=__version__, warnings=warnings, sections=sections, points=POINTS, **evaluated
     )
-    with atomic_file(out) as scratch:
-        # Folder names may have bytes that are not valid Unicode.
-        scratch.write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
 @cache

@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import COLUMNS
@@ -37,16 +36,11 @@ class Estimates:
     """Rows per step, with that of the logged steps."""
 
 
-@dataclass(frozen=True)
-class Results:
-    """The result rows of a report."""
-
-    environments: Mapping[str, Sequence[ResultRow]]
-    """Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
-    estimates: Sequence[Estimates]
+Environments = Mapping[str, Sequence[ResultRow]]
+"""Environment to its rows of `ucfrec evaluate` or `ucfrec demo`."""
 
 
-def read_evidence(paths: Sequence[Path]) -> Results:
+def read_evidence(paths: Sequence[Path]) -> tuple[Environments, Sequence[Estimates]]:
     """Read result rows from JSON lines (files named `.jsonl`) or JSON.
 
     Raises:
@@ -72,7 +66,7 @@ def read_evidence(paths: Sequence[Path]) -> Results:
                 calls.append([])
             calls[-1].append(row)
         estimates += map(_group_estimates, calls)
-    return Results(environments, estimates)
+    return environments, estimates
 
 
 def _group_estimates(group: Sequence[ResultRow]) -> Estimates:
@@ -96,62 +90,75 @@ def find_quoted(rows: Sequence[ResultRow]) -> ResultRow | None:
     return next(quoted, None)
 
 
-def draw_environments(results: Results) -> list[tuple[Chart, Table]]:
+def draw_environments(environments: Environments) -> list[tuple[Chart, Table]]:
     """Bar chart and table of each environment."""
     pictures = []
-    for environment, rows in results.environments.items():
-        names, lines = [], [evaluation_line(row) for row in rows]
-        for line in lines:
+    for environment, rows in environments.items():
+        lines, named = [evaluation_line(row) for row in rows], []
+        for row, line in zip(rows, lines, strict=True):
             # The policy, with the fields that differ if it has several rows.
             same = [other for other in lines if other["policy"] == line["policy"]]
             fields = ("run", "checkpoint", *_SEEDS)
             differing = [key for key in fields if any(o.get(key) != line.get(key) for o in same)]
-            parts = (f"{key} {_format_cell(line, key)}" for key in differing)
-            names.append(", ".join([line["policy"], *parts]))
+            parts = (f"{key} {format_value(line.get(key))}" for key in differing)
+            named.append((", ".join([line["policy"], *parts]), row))
         columns = [c for c in (*_METRICS, *_SEEDS) if any(ln.get(c) is not None for ln in lines)]
-        body = [
-            (name, [format_interval(row), *(_format_cell(line, column) for column in columns)])
-            for name, row, line in zip(names, rows, lines, strict=True)
-        ]
-        table = Table(f"{environment}: means of episodes", ["R_cum", *columns], body, "policy")
-        title = f"R_cum in {environment}, with 95% intervals"
-        pictures.append((interval_chart(title, _list_intervals(names, rows)), table))
+        title, caption = f"R_cum in {environment}", f"{environment}: means of episodes"
+        heads = {column: column for column in columns}
+        pictures.append(_draw_rows(title, caption, {"R_cum": "R_cum"} | heads, named, "policy"))
     return pictures
 
 
-def draw_estimates(results: Results) -> list[tuple[list[tuple[Chart, Table]], Sequence[str]]]:
-    """Charts and tables, and warnings, of each policy with estimates from logs."""
-    pictures: list[tuple[list[tuple[Chart, Table]], Sequence[str]]] = []
-    for estimates in results.estimates:
-        parts = [_draw_rows(estimates.rows, "sessions", estimates.name)]
-        if estimates.steps:
-            parts.append(_draw_rows(estimates.steps, "steps", estimates.name))
+def draw_estimates(
+    all_estimates: Sequence[Estimates],
+) -> list[tuple[list[tuple[Chart, Table]], tuple[str, ...]]]:
+    """Charts and tables, per session and step, and warnings of each policy with estimates."""
+    largest = {"largest_weight": "share of the largest weight"}
+    by_session = {"R_cum": "mean return of a session", "effective_sessions": "effective sample"}
+    by_session |= {**largest, "sessions": "sessions", "overlap": "overlap"}
+    by_step = {_STEP: "mean reward of a step", "effective_steps": "effective sample", **largest}
+    pictures = []
+    for estimates in all_estimates:
+        parts, name = [], estimates.name
+        for rows, unit, columns, title, caption in (
+            (estimates.rows, "sessions", by_session, "Mean return of a session", "Estimates"),
+            (estimates.steps, "steps", by_step, "Mean reward of a step with a propensity",
+             "Estimates per step"),
+        ):  # fmt: skip
+            named = [(f"logged {unit}" if r.method == LOGGED else r.method, r) for r in rows]
+            if named:
+                parts.append(
+                    _draw_rows(f"{title}: {name}", f"{caption} for {name}", columns, named)
+                )
         pictures.append((parts, estimates.warnings))
     return pictures
 
 
-def _draw_rows(rows: Sequence[ResultRow], unit: str, policy: str) -> tuple[Chart, Table]:
-    """Chart and table of the estimates for a policy per `unit`, "sessions" or "steps"."""
-    effective, largest = "effective sample", "share of the largest weight"
-    columns = {f"effective_{unit}": effective, "largest_weight": largest}
-    head, of, caption = "mean reward of a step", " with a propensity", "Estimates per step for"
-    if unit == "sessions":
-        columns |= {"sessions": "sessions", "overlap": "overlap"}
-        head, of, caption = "mean return of a session", "", "Estimates for"
-    names = [f"logged {unit}" if row.method == LOGGED else row.method for row in rows]
-    body = [
-        (name, [format_interval(row), *(row.as_line().get(key) for key in columns)])
-        for name, row in zip(names, rows, strict=True)
-    ]
-    title = f"{head.capitalize()}{of}: {policy}, with 95% intervals"
-    chart = interval_chart(title, _list_intervals(names, rows))
-    return chart, Table(f"{caption} {policy}", [head, *columns.values()], body)
+def _draw_rows(
+    title: str,
+    caption: str,
+    columns: Mapping[str, str],
+    named: Sequence[tuple[str, ResultRow]],
+    corner: str = "",
+) -> tuple[Chart, Table]:
+    """Chart of the intervals, and table of the columns, {value: head}, the first with intervals."""
+    intervals, body = [], []
+    for name, row in named:
+        first, *values = (evaluation_line(row).get(key) for key in columns)
+        ends = "–"
+        if row.interval is not None:
+            low, high = row.interval
+            intervals.append(Interval(name, row.value, low, high))
+            ends = f"{format_value(low)}, {format_value(high)}"
+        body.append((name, [f"{format_value(first)} [{ends}]", *values]))
+    chart = interval_chart(f"{title}, with 95% intervals", intervals)
+    return chart, Table(caption, list(columns.values()), body, corner)
 
 
-def draw_forest(results: Results) -> Chart | None:
+def draw_forest(all_estimates: Sequence[Estimates]) -> Chart | None:
     """Draw the estimate that each verdict is of; None if no policy has one with an interval."""
     intervals, logged = [], set()
-    for estimates in results.estimates:
+    for estimates in all_estimates:
         logged |= {row.value for row in estimates.rows if row.method == LOGGED}
         row = find_quoted(estimates.rows)
         if row is not None and row.interval is not None:
@@ -165,30 +172,9 @@ def draw_forest(results: Results) -> Chart | None:
     return interval_chart(title, intervals, logged.pop() if len(logged) == 1 else None)
 
 
-def _list_intervals(names: Sequence[str], rows: Sequence[ResultRow]) -> list[Interval]:
-    return [
-        Interval(name, row.value, row.interval[0], row.interval[1])
-        for name, row in zip(names, rows, strict=True)
-        if row.interval is not None
-    ]
-
-
-def format_interval(row: ResultRow) -> str:
-    """The value with its 95% interval, if it has one."""
-    ends = "–" if row.interval is None else ", ".join(map(format_value, row.interval))
-    return f"{format_value(row.value)} [{ends}]"
-
-
-def _format_cell(line: Mapping[str, Any], column: str) -> str:
-    value = line.get(column)
-    return str(value) if column in _SEEDS and value is not None else format_value(value)
-
-
 def draw_frontier(record: RunRecord, candidates: Sequence[Candidate]) -> tuple[Chart, Table] | None:
-    """The highest estimated value of the rules that leave so many effective users of the log.
-
-    None where the log has no propensities.
-    """
+    """The highest estimated value of the rules that leave so many effective users of the log; None
+    where the log has no propensities."""
     if record.rule is None:
         return None
     known = [
@@ -232,9 +218,8 @@ class _Return:
     value: float
     """Mean R_cum over rows."""
     low: float
-    """Lowest end of the rows' 95% intervals."""
     high: float
-    """Highest end of the rows' 95% intervals."""
+    """Lowest and highest end of the rows' 95% intervals."""
 
     def above(self, reference: "_Return") -> bool:
         """Whether all intervals are above all intervals of `reference`."""
@@ -244,27 +229,25 @@ class _Return:
         return f"{self.policy} ({format_value(self.value)})"
 
 
-def conclude(results: Results) -> list[str]:
+def conclude(environments: Environments, all_estimates: Sequence[Estimates]) -> list[str]:
     """One paragraph per environment, then one per policy with estimates from logs."""
-    conclusions = [_conclude(name, rows) for name, rows in results.environments.items()]
-    return conclusions + [_quote(estimates) for estimates in results.estimates] or [NO_RESULTS]
+    conclusions = [_conclude(name, rows) for name, rows in environments.items()]
+    return conclusions + [_quote(estimates) for estimates in all_estimates] or [NO_RESULTS]
 
 
 def _collect_returns(rows: Sequence[ResultRow]) -> list[_Return]:
     """One summary per policy and checkpoint, in order of first appearance."""
     groups = grouped(rows, lambda row: (row.method, row.checkpoint))
-    policies = [policy for policy, _ in groups]
-    return [
-        _Return(
-            policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}",
-            any(row.training_seed is not None for row in group),
-            len({row.training_seed for row in group}),
-            sum(row.value for row in group) / len(group),
-            min(row.interval[0] for row in group if row.interval),
-            max(row.interval[1] for row in group if row.interval),
-        )
-        for (policy, checkpoint), group in groups.items()
-    ]
+    policies, returns = [policy for policy, _ in groups], []
+    for (policy, checkpoint), group in groups.items():
+        name = policy if policies.count(policy) == 1 else f"{policy}, checkpoint {checkpoint}"
+        seeds = {row.training_seed for row in group}
+        value = sum(row.value for row in group) / len(group)
+        lows = [row.interval[0] for row in group if row.interval]
+        highs = [row.interval[1] for row in group if row.interval]
+        trained = seeds != {None}
+        returns.append(_Return(name, trained, len(seeds), value, min(lows), max(highs)))
+    return returns
 
 
 def _conclude(environment: str, rows: Sequence[ResultRow]) -> str:

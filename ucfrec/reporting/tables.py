@@ -7,7 +7,7 @@ from typing import Any
 
 from ucfrec.errors import one_line
 from ucfrec.results.rows import ResultRow
-from ucfrec.results.statistics import Summary, summary
+from ucfrec.results.statistics import summary
 
 NONE = "–"
 """Cell of a missing value."""
@@ -56,7 +56,8 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[object]]) -> st
 def evaluation_line(row: ResultRow) -> dict[str, Any]:
     """A row with its values by the column names of tables of evaluations."""
     seeds = {"seed": row.evaluation_seed, "train_seed": row.training_seed}
-    return {**row.as_line(), "policy": row.method, **seeds}
+    texts = {name: None if seed is None else str(seed) for name, seed in seeds.items()}
+    return {**row.as_line(), "policy": row.method, **texts}
 
 
 def evaluation_table(rows: Iterable[ResultRow]) -> str:
@@ -67,10 +68,8 @@ def evaluation_table(rows: Iterable[ResultRow]) -> str:
 
 
 def format_rows(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
-    """The `columns` of rows as an aligned text table.
-
-    A value `x` of a row that also has `x_low` and `x_high`, such as R_cum, gets its interval.
-    """
+    """The `columns` of rows as an aligned text table; a value `x` of a row that has `x_low` and
+    `x_high`, such as R_cum, gets its interval."""
     return text_table(columns, [[_format_cell(row, name) for name in columns] for row in rows])
 
 
@@ -85,11 +84,6 @@ def mean_and_sd(values: Iterable[float]) -> str:
     if not sample.count:
         return NONE
     return f"{sample.mean:.4g}" + (f" ± {sample.sd:.2g}" if sample.count > 1 else "")
-
-
-def signed_difference(differences: Summary) -> str:
-    """Mean difference with its sign ± its standard error."""
-    return f"{differences.mean:+.3g} ± {differences.standard_error:.2g}"
 
 
 def format_value(value: Any) -> str:

@@ -202,11 +202,8 @@ def draw_moves(runs: Sequence[tuple[str, int, AugmentationReport]]) -> Chart | N
 
 
 def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Table]] | None:
-    """The decision rule of the samples and one table per session; None if a run has no samples.
-
-    Args:
-        features: one row per item with its `item_id` and features to show; None for none.
-    """
+    """The decision rule of the samples and one table per session, with features of the items by
+    `item_id`; None if a run has no samples."""
     if not (run / SAMPLES).exists() or not (run / ITEMS).exists():
         return None
     samples = read_json(run / SAMPLES)
@@ -220,10 +217,8 @@ def tabulate_samples(run: Path, features: pa.Table | None) -> tuple[str, list[Ta
 
 
 def read_features(path: Path, text_ids: bool = False) -> pa.Table:
-    """Read item features with a column `item_id` from CSV (file name `.csv`) or Parquet.
-
-    Args:
-        text_ids: whether the ids of a CSV are read as they are written, e.g. 007.
+    """Read item features with a column `item_id` from CSV (file name `.csv`), whose ids may stay as
+    they are written, or Parquet.
 
     Raises:
         InputError: the file cannot be read as that or lacks the column.

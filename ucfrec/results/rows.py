@@ -1,7 +1,5 @@
-"""Result rows of all measurements: what was measured, its numbers and their origin.
-
-Rows are lines of JSON in files that several processes may append to; in Python they are a table.
-"""
+"""Result rows of all measurements: what was measured, its numbers and their origin. They are lines
+of JSON in files that several processes may append to, and a table in Python."""
 
 import json
 import math
@@ -9,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
@@ -166,10 +165,7 @@ _ROWS: Final = TypeAdapter(ResultRow)
 
 
 def row_from_json(value: object, where: str) -> ResultRow:
-    """Inverse of `ResultRow.to_json`.
-
-    Args:
-        where: origin of `value` (file and line), for messages.
+    """Inverse of `ResultRow.to_json`; messages name the origin `where` (file and line).
 
     Raises:
         InputError: `value` is not an object, or a field is missing, unknown or of a wrong type.
@@ -243,10 +239,6 @@ def append_rows(
     Atomic: after an interruption either all rows are in the file or none. Other processes that
     append to a file of the folder wait.
 
-    Args:
-        path: file of result rows; made if missing.
-        config: configuration with the rows' `config_hash`; None for rows without one.
-
     Raises:
         InputError: a row has a number that is not finite, or another `config_hash` than `config`.
     """
@@ -285,11 +277,8 @@ def latest(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 @contextmanager
 def benchmarking(path: Path) -> Iterator[None]:
-    """Let no other command measure for the file `path` of result rows.
-
-    Raises:
-        InputError: another command does; the message names it.
-    """
+    """Let no other command measure for the file `path` of result rows; an `InputError` names one
+    that does."""
     with atomic.lock_path(path, "filled", part="benchmark"):
         atomic.remove_leftovers(path.parent)
         yield
@@ -303,11 +292,10 @@ def _append(path: Path, values: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _write(path: Path, head: bytes, values: Sequence[Mapping[str, Any]]) -> None:
+    write = partial(json.dumps, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    text = "".join(f"{write(value)}\n" for value in values)
     with atomic.atomic_file(path) as scratch, scratch.open("wb") as file:
-        file.write(head)
-        for value in values:
-            line = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-            file.write(line.encode() + b"\n")
+        file.write(head + text.encode())
         file.flush()
         os.fsync(file.fileno())
 
@@ -317,10 +305,13 @@ _IDENTITY: Final = (*_ORIGIN, "suite", "table", "command", "commit", "checkpoint
 """Fields that a frame leaves out; a file of the rows has them."""
 
 
+@dataclass(frozen=True, repr=False)
 class ResultTable:
-    """What is shown of result rows, and how they are kept."""
+    """Results of one measurement of several methods."""
 
     rows: Sequence[ResultRow]
+    warnings: Sequence[str]
+    """What makes the numbers less reliable."""
     shown: ClassVar[tuple[str, ...]] = ()
     """Columns of the table, after `method`; empty for those of the rows' own metrics."""
 
@@ -335,7 +326,7 @@ class ResultTable:
 
     def _said(self) -> list[str]:
         """What to know of the rows, shown below them."""
-        return []
+        return [f"warning: {text}" for text in self.warnings]
 
     def to_frame(self) -> "pd.DataFrame":
         """One row per method: its metrics, each with the ends of its 95% interval where it has one
@@ -353,15 +344,11 @@ class ResultTable:
                 if ends := intervals.get(name):
                     line[f"{name}_low"], line[f"{name}_high"] = ends
             lines.append({**line, **row.as_line(), **line})
-        frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY))
+        frame = pd.DataFrame(lines).drop(columns=list(_IDENTITY), errors="ignore")
         return frame.dropna(axis="columns", how="all")
 
     def plot(self, metric: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Draw one metric of every method with its 95% interval.
-
-        Args:
-            metric: name of a metric; None for the one that the rows are about.
-            ax: matplotlib axes to draw on; None for new ones.
+        """Draw a metric of every method, by default that of the rows, with its 95% interval.
 
         Raises:
             InputError: no row has the metric.
@@ -399,25 +386,13 @@ class ResultTable:
         return str(table) + "".join(f"<p>{escape(text)}</p>" for text in self._said())
 
 
-@dataclass(frozen=True, repr=False)
-class Measured(ResultTable):
-    """Results of one measurement of several methods."""
-
-    rows: Sequence[ResultRow]
-    warnings: Sequence[str] = ()
-    """What makes the numbers less reliable."""
-
-    def _said(self) -> list[str]:
-        return [f"warning: {text}" for text in self.warnings]
-
-
-class Evaluation(Measured):
+class Evaluation(ResultTable):
     """Returns in a simulator, one row per policy."""
 
     shown = ("R_cum", "R_cum_low", "R_cum_high", "R_avg_pooled", "length", "coverage", "diversity")
 
 
-class Ranking(Measured):
+class Ranking(ResultTable):
     """How policies and baselines rank what users were shown and liked later."""
 
     shown = (

@@ -56,10 +56,8 @@ def effective_number(weights: Float64Array) -> float:
 
 
 def average_ranks(values: Array) -> Float64Array:
-    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean.
-
-    As `scipy.stats.rankdata`; that module takes a second to import.
-    """
+    """Ranks (N,) of `values` (N,) from 1 in ascending order, equal ones at their mean, as by
+    `scipy.stats.rankdata`, which takes a second to import."""
     _, level, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks: Float64Array = (counts.cumsum() - (counts - 1) / 2)[level]
     return ranks
@@ -68,19 +66,14 @@ def average_ranks(values: Array) -> Float64Array:
 def group_auc(
     scores: Float64Array, liked: BoolArray, owner: Array, n_users: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Per user: AUC times impressions, and impressions (Zhu et al., KDD 2017).
+    """Per user (U,): AUC times impressions, and impressions (Zhu et al., KDD 2017).
 
     Both are 0 for users whose steps are all liked or all not liked. The group AUC is the ratio of
     the sums.
 
     Args:
-        scores: (N,) of the shown items.
-        liked: (N,).
+        scores: (N,) of the shown items, which are `liked` (N,) or not.
         owner: (N,) user of each step, 0 to n_users − 1.
-        n_users: U.
-
-    Returns:
-        Two arrays (U,).
     """
     sizes = np.bincount(owner, minlength=n_users)
     _, level = np.unique(scores, return_inverse=True)
@@ -113,10 +106,8 @@ def bootstrap_interval(values: Float64Array, seed: int) -> tuple[float, float]:
 
 
 def resampled_ratios(above: Float64Array, below: Float64Array, seed: int) -> Float64Array:
-    """Ratios Σ above / Σ below (`_RESAMPLES`, C) of rows (N, C) drawn with replacement.
-
-    Ratios whose denominator is 0 are NaN.
-    """
+    """Ratios Σ above / Σ below (`_RESAMPLES`, C) of rows (N, C) drawn with replacement; NaN for
+    a denominator of 0."""
     generator = np.random.default_rng(seed)
     # Multinomial counts of the rows replace copies of them, which limits memory to O(N).
     share, both = np.full(len(above), 1 / len(above)), np.hstack([above, below])

@@ -50,9 +50,7 @@ class Dimension:
         low, high = self.low, self.high
         if isinstance(low, int) and isinstance(high, int):
             return trial.suggest_int(name, low, high, log=self.log)
-        assert low is not None
-        assert high is not None
-        return trial.suggest_float(name, low, high, log=self.log)
+        return trial.suggest_float(name, low or 0.0, high or 0.0, log=self.log)
 
 
 Space = Mapping[str, Dimension]

@@ -1,6 +1,5 @@
-"""The search: trials of an Optuna study in a folder, in one or several processes, each measured on
-validation rows; the best settings as TOML, and a page of all trials.
-"""
+"""The search: trials of an Optuna study, in one or several processes, measured on validation rows;
+the best settings as TOML, and a page of all trials."""
 
 import json
 import math
@@ -51,11 +50,7 @@ _COMPARED: Final = 4
 
 
 def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int) -> float:
-    """The metric of a finished run, one of `METRICS`; higher is better.
-
-    Args:
-        store: the store that it was trained on.
-        k: items recommended, of "ndcg".
+    """The metric of a finished run on its store, one of `METRICS`; higher is better.
 
     Raises:
         InputError: the run or its validation rows do not have the metric.
@@ -104,14 +99,10 @@ class Plan:
 
 
 def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
-    """Search until the study has so many finished trials; goes on where an earlier call ended.
+    """Search until the study has so many trials, finished or ended early, by parallel `workers`.
 
     The best run lies in `plan.out / "best"`; those of other trials are deleted. `best.toml` has its
     settings, `tuning.md` all trials.
-
-    Args:
-        trials: number of finished trials that the study has at the end, those ended early too.
-        workers: processes that train trials side by side.
 
     Raises:
         InputError: the folder holds another search, the numbers are out of range, the policies have
@@ -172,15 +163,14 @@ def _optuna() -> Any:
 def _require_same(study: "Study", plan: Plan, store: EpisodeStore) -> None:
     """Check that the study is of the same store, settings and metric, or begin it."""
     search = plan.search
-    spaces = {policy: search.space(policy) for policy in search.policies}
+    own: dict[str, Any] = {"fixed": dict(search.fixed), "seed": search.seed}
+    for policy in search.policies:
+        own[policy] = {name: asdict(values) for name, values in search.space(policy).items()}
     identity = {
         "store": store.record.fingerprint,
         "metric": plan.metric,
         "k": plan.k,
-        "search": config_hash(
-            {"fixed": dict(search.fixed), "seed": search.seed}
-            | {name: {n: asdict(d) for n, d in space.items()} for name, space in spaces.items()}
-        ),
+        "search": config_hash(own),
     }
     earlier = study.user_attrs.get("about")
     if earlier is None:
@@ -289,11 +279,8 @@ def _keep_best(study: "Study", plan: Plan) -> None:
 
 
 def importances(study: "Study") -> dict[str, float]:
-    """Share of the metric's variance that each setting explains (fANOVA: Hutter et al., ICML 2014),
-    most important first; empty with fewer than four trials or none that differ.
-
-    Of several policies, only settings that all trials have.
-    """
+    """Share of the metric's variance that each setting of all trials explains (fANOVA: Hutter et
+    al., ICML 2014), most important first; empty with fewer than four trials that differ."""
     import optuna
 
     if len(set(_list_values(study))) < 4:

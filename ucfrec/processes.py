@@ -224,8 +224,7 @@ def progress(
         total: units of the whole job; None if unknown.
         job: name of the job, e.g. "train".
         unit: what is counted, in the plural, e.g. "steps".
-        done: units that were finished before this process resumed the job; they do not count
-            towards the rate.
+        done: units that were finished before this process resumed the job, outside the rate.
         shown: whether this process displays anything.
     """
     from tqdm import tqdm

@@ -90,9 +90,7 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     are checked in `__post_init__`, with `require`. Lists become tuples, as TOML and JSON have lists
     only. Constructing the class with an invalid value raises `SettingError`.
 
-    Args:
-        name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
-            for fields outside any table.
+    `name` is the prefix of its fields in messages: `policy` in `policy.heads`; empty for none.
     """
 
     def decorate(cls: type[Table]) -> type[Table]:
@@ -120,12 +118,9 @@ def require(holds: bool, message: str, *keys: str) -> None:
 
 
 def describe(name: str, table: Any) -> Iterator[Setting]:
-    """Describe every field of `table`, an instance of a class decorated by `settings_table`.
+    """Describe every field of `table`, whose keys begin with `name`.
 
     A field that a subclass redefines without a docstring has the meaning given by its base class.
-
-    Args:
-        name: of the table, the prefix of the keys.
     """
     meanings: dict[str, str] = {}
     for base in filter(is_table, reversed(type(table).__mro__)):

@@ -352,7 +352,8 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
 ) -> None:
     store = EpisodeStore.open(folder / "store")
     users, views = users_of(folder / "run", store), training_views(store)
-    scorer = Scorer(trained.policy, trained.rule, store.item_states, trained.returns, users.reward)
+    returns = trained.record.return_to_go
+    scorer = Scorer(trained.policy, trained.rule, store.item_states, returns, users.reward)
     config = replace(FEW, reward_weights=(0.0, 1.0, 4.0, 8.0), tag_windows=(3, 5))
     given = Problem(scorer, users, {0.9: 2.0, 1.0: 3.0}, *views, config, 0)
     bad = DecisionRule(2.0, reward_weight=1.0, temperature=1.0)

@@ -85,7 +85,7 @@ def test_a_store_is_made_from_remote_logs_in_a_remote_place(
         found = EpisodeStore.open(options.store)
         assert found.record.fingerprint == local.fingerprint
         assert found.record.source.files == tuple(f"{place}/logs/{file.name}" for file in files)
-        assert not list(found._columns._sealed.faults())
+        assert not list(found.record.faults(options.store))
         copy = options.store
     assert not copy.exists()
     # A folder of logs; the store is there already.

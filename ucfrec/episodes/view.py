@@ -92,7 +92,7 @@ class Columns:
             return_to_go: what the returns-to-go count; None for the rest of the session.
         """
         self.return_to_go = return_to_go or ReturnToGo()
-        self.path, self.record, self._sealed = path, record, record.checksums(path)
+        self.path, self.record = path, record
         self._arrays, self._given_states = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
@@ -110,7 +110,7 @@ class Columns:
             InputError: the folder is not a store, is damaged, or was written by a newer ucfrec.
         """
         columns = cls(path, StoreRecord.read(path))
-        columns._sealed.require(small=-1)
+        columns.record.require(path)
         return columns
 
     @classmethod
@@ -192,7 +192,7 @@ class Columns:
         """
         if self._given_states is not None:
             return self._given_states
-        self._sealed.require(ITEM_STATES)
+        self.record.require(self.path, ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
 
     @property
@@ -265,7 +265,7 @@ class Columns:
         shape, parts = tuple(self.record.columns.get(name, ())), []
         for shard in self._shards:
             path = shard / f"{name}.npy"
-            self._sealed.require(f"{shard.name}/{name}.npy")
+            self.record.require(self.path, f"{shard.name}/{name}.npy")
             try:
                 # Mapping compares the header with the size of the file before it takes memory.
                 values: Array = np.load(path, mmap_mode="r")

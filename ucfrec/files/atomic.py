@@ -45,17 +45,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: `path` exists already, or another process is writing it.
     """
-    _require_absent(path)
     with lock_path(path):
-        _require_absent(path)
+        if os.path.lexists(path):
+            raise InputError(f"{path} exists already; remove it or name another output folder")
         with _scratch_moved(path) as scratch:
             scratch.mkdir()
             yield scratch
-
-
-def _require_absent(path: Path) -> None:
-    if os.path.lexists(path):
-        raise InputError(f"{path} exists already; remove it or name another output folder")
 
 
 @contextmanager
@@ -63,9 +58,6 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
 
     Of two processes that write one file, the second waits for the first.
-
-    Raises:
-        InputError: `path` is a folder.
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")

@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -83,7 +83,7 @@ def resolve_config(
 
 def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
     """Settings, in any form that `resolve_config` takes, as `{"table.field": value}`."""
-    return {f"{entry.table}.{entry.key}": entry.value for entry in _from_overrides(overrides)}
+    return {f"{table}.{key}": value for table, key, value, _ in _from_overrides(overrides)}
 
 
 def config_from_dict(values: object) -> Config:
@@ -95,13 +95,8 @@ def config_from_dict(values: object) -> Config:
     return _build(str(name), _from_mapping(tables, "the run's configuration"), seed)
 
 
-class _Setting(NamedTuple):
-    """One setting and its source."""
-
-    table: str
-    key: str
-    value: Any
-    source: str
+_Setting: TypeAlias = tuple[str, str, Any, str]
+"""Table, key, value and source."""
 
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
@@ -147,7 +142,7 @@ def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_S
             parsed = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError):
             parsed = value.strip()
-        yield _Setting(table, key, parsed, source)
+        yield table, key, parsed, source
 
 
 def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
@@ -155,9 +150,9 @@ def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
         table, dot, key = str(name).partition(".")
         _require_table(table, source)
         if dot:
-            yield _Setting(table, key, value, source)
+            yield table, key, value, source
         elif isinstance(value, Mapping):
-            yield from (_Setting(table, str(key), entry, source) for key, entry in value.items())
+            yield from ((table, str(key), entry, source) for key, entry in value.items())
         else:
             raise InputError(
                 f"{source}: {table} is a table of settings; give a value for one of its fields"

@@ -28,7 +28,7 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
-from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
+from ucfrec.files.record import RUN_RECORD, SMALL, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
@@ -337,7 +337,7 @@ class RunRecord(TrainingRecord):
 def read_record(run: Path) -> RunRecord:
     """The record of a run, whose small files are compared with their checksums."""
     record = RunRecord.read(run)
-    record.checksums(run).require()
+    record.require(run, small=SMALL)
     return record
 
 
@@ -403,7 +403,7 @@ def verify_run(run: Path) -> None:
     record = read_record(run)
     if record.policy is None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")
-    for name, fault in record.checksums(run).faults():
+    for name, fault in record.faults(run):
         raise InputError(f"{run / name} {fault}; restore the file, or train again")
     if (run / REFIT / RUN).is_file():
         verify_run(run / REFIT)

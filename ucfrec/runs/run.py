@@ -170,7 +170,6 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
-        callbacks: what is told of the training of the policy.
         initial: a run on an older state of the store, whose weights the training begins with, near
             whose rule a better one is looked for, and whose user model says which effects to fit.
 
@@ -305,7 +304,7 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
     """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    states, returns, config = trained.item_states, trained.returns, run.config.rule
+    states, returns, config = trained.item_states, trained.record.return_to_go, run.config.rule
     problem = Problem(
         Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
         users,

@@ -15,7 +15,6 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model import INITIAL
-from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -110,7 +109,8 @@ def begin(
     at every step, without sessions as long as only those of bots. Of more than a million, evenly
     spaced order statistics are kept, the lowest and highest too.
     """
-    returns_to_go, source = returns_of(store, config), store.record.source
+    source = store.record.source
+    returns_to_go = config.policy.returns(source.session_by)
     package = policy_package(config.policy_name)
     entries: dict[str, Any] = {
         "files": {},
@@ -162,11 +162,6 @@ def begin(
         RunRecord.of(entries, out / RUN).seal(scratch)
 
 
-def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
-    """What the returns-to-go of a run on `store` count."""
-    return config.policy.returns(store.record.source.session_by)
-
-
 def policy_sizes(store: EpisodeStore) -> dict[str, int]:
     """Sizes of states and actions, and of the catalogue (0 for vectors), that policies have."""
     if store.has_items:
@@ -187,7 +182,8 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     returns_to_go = train.column(schema.RETURN_TO_GO)
-    scaled_by = train.returns if returns_of(train, config).per_session else returns_to_go
+    per_session = config.policy.returns(train.record.source.session_by).per_session
+    scaled_by = train.returns if per_session else returns_to_go
     policy.return_scale.fill_(config.policy.return_scale or float(np.abs(scaled_by).max()) or 1.0)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):

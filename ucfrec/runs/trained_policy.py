@@ -14,7 +14,6 @@ from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, damage_explained, warn_user
@@ -94,16 +93,17 @@ class TrainedPolicy:
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
-        however_large = (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}")
-        record.checksums(folder).require(however_large, small=-1)
+        weights, fitted = f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"
+        record.require(folder, ITEM_STATES, weights, fitted)  # however large
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
         states, models, reward_model = folder / ITEM_STATES, folder / REWARD_MODEL, None
-        if (fitted := models / FITTED).exists():
+        if (models / FITTED).exists():
+            tensors, _ = load_tensors(models / FITTED)
             build_model = partial(ItemRewardModel, record.sizes)
-            reward_model = load_module(fitted, build_model, load_tensors(fitted)[0]).eval()
+            reward_model = load_module(models / FITTED, build_model, tensors).eval()
         with damage_explained(folder / RETURNS, REMEDY):
             returns = load_tensors(folder / RETURNS)[0]["returns"]
             is_vector = returns.dim() == 1 and returns.dtype == torch.float32 and len(returns)
@@ -192,11 +192,6 @@ class TrainedPolicy:
         size = self.record.observation_size
         return size and size + len(self.dropped)
 
-    @property
-    def returns(self) -> ReturnToGo:
-        """What the returns-to-go of the training counted."""
-        return self.record.return_to_go
-
     def training_store(self) -> EpisodeStore | None:
         """The store that the run was trained on; see `store_of`."""
         return store_of(self.folder, self.record)
@@ -235,9 +230,15 @@ class TrainedPolicy:
         if self._kept.get("weights") != weights:
             # The one before goes first, for its memory.
             self._kept.clear()
-            states, end = self.item_states, self.session_end
-            scorer = Scorer(self.policy, rule, states, self.returns, self.reward_model, end)
-            self._kept.update(scorer=scorer, weights=weights)
+            self._kept["weights"] = weights
+            self._kept["scorer"] = Scorer(
+                self.policy,
+                rule,
+                self.item_states,
+                self.record.return_to_go,
+                self.reward_model,
+                self.session_end,
+            )
         kept: Scorer = self._kept["scorer"]
         return kept.under(rule)
 

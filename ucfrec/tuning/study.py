@@ -27,7 +27,6 @@ from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import SharedStages, train_run
-from ucfrec.runs.start import returns_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -125,7 +124,8 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     store = EpisodeStore.open(plan.store)
     for policy in plan.search.policies if plan.metric == VALUE else ():
         config = plan.search.config(policy, {})
-        if not (store.has_items and config.rule.choose and returns_of(store, config).per_session):
+        returns = config.policy.returns(store.record.source.session_by)
+        if not (store.has_items and config.rule.choose and returns.per_session):
             raise InputError(
                 f"{store.path}: {policy} has no estimated value there, because its decision rule "
                 f"is not selected in simulated sessions; {_OTHER_METRICS}"

@@ -286,52 +286,36 @@ def test_what_differs_is_made_anew(
     assert_same_tensors(run, alone, *names)
 
 
-def test_an_interrupted_stage_is_not_shared(tmp_path: Path) -> None:
-    shared = SharedStages(tmp_path / "stages")
-
-    def stop() -> None:
-        (tmp_path / "out" / "half").write_text("half")
-        raise KeyboardInterrupt
-
-    (tmp_path / "out").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        shared.provide({"seed": 0}, __name__, tmp_path / "out", ("half", "whole"), stop)
-    made = []
-
-    def make() -> None:
-        made.append(True)
-        (tmp_path / "out" / "whole").write_text("whole")
-
-    for _ in range(2):
-        shared.provide({"seed": 0}, __name__, tmp_path / "out", ("half", "whole"), make)
-    assert made == [True]
-    assert (tmp_path / "out" / "whole").read_text() == "whole"
-
-
-def test_a_file_that_was_being_copied_is_not_taken_for_finished(
+def test_what_was_interrupted_is_not_shared_and_not_taken_for_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shared = SharedStages(tmp_path / "stages")
+    shared, made = SharedStages(tmp_path / "stages"), []
     first, second = tmp_path / "first", tmp_path / "second"
-    for out in (first, second):
-        out.mkdir()
 
-    def make() -> None:
-        (first / "models").mkdir()
+    def make(report: str) -> None:
+        made.append(report)
+        (first / "models").mkdir(parents=True, exist_ok=True)
         (first / "models" / "weights").write_text("weights")
-        (first / "report").write_text("the whole report")
+        if not report:
+            raise KeyboardInterrupt
+        (first / "report").write_text(report)
 
-    shared.provide({"seed": 0}, __name__, first, ("models", "report"), make)
+    def provide(out: Path, report: str) -> None:
+        shared.provide({"seed": 0}, __name__, out, ("models", "report"), lambda: make(report))
 
     def killed(source: Path, to: Path) -> None:
         Path(to).write_text("the wh")
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched:
+    with pytest.raises(KeyboardInterrupt):
+        provide(first, "")
+    for _ in range(2):
+        provide(first, "the whole report")
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr("ucfrec.runs.run.shutil.copyfile", killed)
-        with pytest.raises(KeyboardInterrupt):
-            shared.provide({"seed": 0}, __name__, second, ("report",), make)
+        provide(second, "")
     assert not (second / "report").exists()
-    shared.provide({"seed": 0}, __name__, second, ("models", "report"), make)
+    provide(second, "")
     assert (second / "report").read_text() == "the whole report"
     assert (second / "models" / "weights").read_text() == "weights"
+    assert made == ["", "the whole report"]

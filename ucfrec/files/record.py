@@ -175,10 +175,8 @@ class Record(Entry):
         from concurrent.futures import ThreadPoolExecutor  # only to verify everything
 
         with ThreadPoolExecutor(_THREADS) as threads:
-            faults = zip(
-                self.files, threads.map(partial(self._find_fault, folder), self.files), strict=True
-            )
-            yield from ((name, fault) for name, fault in faults if fault)
+            faults = threads.map(partial(self._find_fault, folder), self.files)
+            yield from (pair for pair in zip(self.files, faults, strict=True) if pair[1])
 
     def strangers(self, folder: Path) -> list[str]:
         """Files of the folder that are not listed, without locks and scratch."""

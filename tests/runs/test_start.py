@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.support.episodes import random_episodes, write_store
 from tests.support.later import later_log, later_mapping
 from tests.support.served import trained_run
 from tests.support.short_validation import ALL_BATCHES, short_validation
@@ -125,17 +126,8 @@ TOGETHER = [
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    rng = np.random.default_rng(0)
-    lengths = rng.integers(1, 6, size=120)
-    n = int(lengths.sum())
-    columns = {
-        "observation": rng.normal(size=(n, 3)),
-        "action": rng.uniform(-1, 1, size=(n, 2)),
-        "reward": rng.normal(size=n),
-    }
     path = tmp_path_factory.mktemp("store") / "store"
-    split = np.repeat([0, 1], [100, 20]).astype(np.uint8)
-    EpisodeStore.write(path, columns, lengths, {"split": split})
+    write_store(path, random_episodes([1, 4, 2, 5, 3] * 30, items=False))
     return path
 
 

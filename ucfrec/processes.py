@@ -12,11 +12,14 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
 
+    from tqdm import tqdm
+
+Progress: TypeAlias = "tqdm[Any]"
 ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 FIRST_LINE = 10.0
 """Seconds before the first line of progress without a terminal; a shorter job prints nothing."""
@@ -200,16 +203,6 @@ def random_state_kept() -> Iterator[None]:
     finally:
         random.setstate(python_state)
         np.random.set_state(numpy_state)  # noqa: NPY002
-
-
-class Progress(Protocol):
-    """The display that `progress` yields, a bar of tqdm."""
-
-    def update(self, n: float = 1) -> object:
-        """Count `n` more units as done."""
-
-    def set_postfix(self, *, refresh: bool | None, **metrics: Any) -> None:
-        """Display `metrics` next to them, e.g. `loss=0.3`."""
 
 
 @contextmanager

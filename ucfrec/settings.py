@@ -70,16 +70,12 @@ class SettingError(InputError):
 
 
 class Setting(NamedTuple):
-    """The description of one field of a table."""
+    """One field of a table: `table.field`, its value, type and range in words, and docstring."""
 
     key: str
-    """`table.field`, as in `--set table.field=value`."""
     value: Any
-    """Current value."""
     allowed: str
-    """Type and range, in words."""
     meaning: str
-    """The docstring of the field, on one line."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(Field, field))

@@ -86,7 +86,7 @@ def _verify(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
     from ucfrec.episodes.record import StoreRecord
     from ucfrec.results.rows import read_rows
-    from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord, read_training
+    from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord
 
     if path.is_file():
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
@@ -95,7 +95,8 @@ def _verify(path: Path) -> int:
     if (path / StoreRecord.FILE).is_file():
         record, unfinished = StoreRecord.read(path), ""
     elif (path / RunRecord.FILE).is_file():
-        record = read_training(path)
+        record = TrainingRecord.read(path)
+        record = RunRecord.read(path) if record.library == "ucfrec" else record
         unfinished = "" if record.policy is not None else ", training has not ended"
     else:
         raise InputError(

@@ -87,7 +87,9 @@ def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, An
 
 
 def config_from_dict(values: object) -> Config:
-    """Rebuild a configuration from its `dataclasses.asdict`; errors as of `resolve_config`."""
+    """Rebuild a configuration from its `asdict`, or itself; errors as of `resolve_config`."""
+    if isinstance(values, Config):
+        return values
     if not isinstance(values, Mapping) or not {"policy_name", "seed"} <= values.keys():
         raise InputError("the run's configuration has no policy_name or no seed")
     tables = {**values}

@@ -65,10 +65,6 @@ def _levels(quantiles: dict[str, float]) -> dict[str, float]:
     return quantiles
 
 
-def _config(value: object) -> Config:
-    return value if isinstance(value, Config) else config_from_dict(value)
-
-
 class TrainingRecord(Record):
     """What every training records, of whatever library."""
 
@@ -137,12 +133,6 @@ class RuleRecord(Entry):
     """Whether the sessions of either half of the users would choose the rule, too."""
     session_end: SessionEndReport | None = None
 
-    @property
-    def simulated(self) -> tuple[float, float] | None:
-        """Return of a session under the rule in the user model, with its standard error; None for
-        a rule that was not simulated."""
-        return None if self.estimate is None else (self.estimate.value, self.estimate.error)
-
 
 class Difference(Entry):
     """What the newest rows say of a new run against the old one, by one measure."""
@@ -199,7 +189,7 @@ class RunRecord(TrainingRecord):
     """The content of `run.json`; entries of stages that have not ended are None."""
 
     library: Literal["ucfrec"] = "ucfrec"
-    config: Annotated[Config, PlainValidator(_config), PlainSerializer(asdict)]
+    config: Annotated[Config, PlainValidator(config_from_dict), PlainSerializer(asdict)]
     store: Text
     """Folder of the store when the run began."""
     policy_package: Text | None = None
@@ -351,12 +341,6 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
     refit = read_record(run / REFIT)
     whole = refit.policy is not None and (refit.rule is None) == (record.rule is None)
     return refit if whole else None
-
-
-def read_training(run: Path) -> TrainingRecord:
-    """The record of a run of whatever library; its other files are not looked at."""
-    record = TrainingRecord.read(run)
-    return RunRecord.read(run) if record.library == "ucfrec" else record
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:

@@ -127,7 +127,11 @@ class TrainedPolicy:
 
     def _require_equal_sizes(self) -> None:
         """Check that the files of the run are of one catalogue and of one size of states."""
-        sizes, states, dropped = self.record.sizes, self.item_states, self.dropped
+        sizes, states, dropped = (
+            self.record.sizes,
+            self.item_states,
+            self.record.dropped_observations,
+        )
         most = self.record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
             raise InputError(
@@ -182,15 +186,10 @@ class TrainedPolicy:
         return IdLookup(self.user_ids)
 
     @property
-    def dropped(self) -> tuple[int, ...]:
-        """Columns of the logged observation that the policy does not see, ascending."""
-        return self.record.dropped_observations
-
-    @property
     def logged_observation_size(self) -> int:
         """Columns that observations must have; 0 if the policy sees none."""
         size = self.record.observation_size
-        return size and size + len(self.dropped)
+        return size and size + len(self.record.dropped_observations)
 
     def training_store(self) -> EpisodeStore | None:
         """The store that the run was trained on; see `store_of`."""
@@ -277,7 +276,7 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
             seed,
-            self.dropped,
+            self.record.dropped_observations,
         )
 
 

@@ -62,12 +62,12 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
     """
     if metric == VALUE:
         rule = trained.record.rule
-        if rule is None or rule.simulated is None:
+        if rule is None or rule.estimate is None:
             raise InputError(
                 "the decision rule of this training is not selected in simulated sessions, so "
                 f"there is no estimated value; {_OTHER_METRICS}"
             )
-        return rule.simulated[0]
+        return rule.estimate.value
     validation = store.split("validation")
     assert trained.item_states is not None
     users = validation.episode_values(schema.USER)

@@ -93,7 +93,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
-    opened = drop_columns(EpisodeStore.open(grown), trained.dropped)
+    opened = drop_columns(EpisodeStore.open(grown), trained.record.dropped_observations)
     full = trained.record.config  # as a training from scratch had it
     if trained.record.update is not None:
         full = config_from_dict(trained.record.update.settings_from_nothing)
@@ -111,7 +111,7 @@ def update_run(
         appended={name: counts[name] for name in _COUNTS}
         | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
-    entries = {"update": update, "dropped_observations": trained.dropped}
+    entries = {"update": update, "dropped_observations": trained.record.dropped_observations}
     record = train_run(opened, out, config, entries, initial=run)
     assert record.update is not None
     if record.update.verdict is None:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 Progress: TypeAlias = "tqdm[Any]"
-ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 FIRST_LINE = 10.0
 """Seconds before the first line of progress without a terminal; a shorter job prints nothing."""
 NEXT_LINE = 30.0
@@ -69,7 +68,8 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 def _handle_signals(handler: Any) -> dict[signal.Signals, Any]:
     """Set the handler of Ctrl-C and TERM; returns those that they had."""
-    return {number: signal.signal(number, handler) for number in ENDING}
+    ending = (signal.SIGINT, signal.SIGTERM)
+    return {number: signal.signal(number, handler) for number in ending}
 
 
 @contextmanager

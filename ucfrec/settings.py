@@ -97,7 +97,8 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
         def check(self: Any, *args: Any, **values: Any) -> None:
             values |= dict(zip(names, args, strict=False))
             try:
-                build(self, *args[len(names) :], **_convert_lists(values))
+                converted = {key: _convert_lists(value) for key, value in values.items()}
+                build(self, *args[len(names) :], **converted)
             except ValidationError as error:
                 raise _setting_error(table, name, error, values) from None
 
@@ -151,8 +152,6 @@ def nearest(name: str, names: Sequence[str]) -> str:
 
 
 def _convert_lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _convert_lists(entry) for key, entry in value.items()}
     return tuple(map(_convert_lists, value)) if isinstance(value, list) else value
 
 

@@ -103,11 +103,10 @@ _Setting: TypeAlias = tuple[str, str, Any, str]
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
-    policy_type, seed = policy_class(policy_name), require_seed("seed", seed)
+    policy_type, sources = policy_class(policy_name), {}
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not policy_type.augmented:
         tables["augment"]["copies"] = 0
-    sources = {}
     for table, key, value, source in (*_from_mapping(policy_type.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
@@ -120,7 +119,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
             CSGConfig(**tables["csg"]),
             AugmentConfig(**tables["augment"]),
             RuleConfig(**tables["rule"]),
-            seed,
+            require_seed("seed", seed),
         )
     except SettingError as error:
         source = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))

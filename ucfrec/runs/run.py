@@ -267,14 +267,14 @@ def _augment(
         return None, run.record.augmentation
     if refit_of is not None:
         return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
-    settings = (config.crm, config.csg, config.augment)
+    crm, csg, augment = config.crm, config.csg, config.augment
     # A policy's own view of the episodes has augmentation of its own.
     has_own_view = run.train is not run.logged
     shared = OWN if has_own_view or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
         augmented, report = augment_episodes(
-            run.train, run.validation, *settings, out, config.seed, device
+            run.train, run.validation, crm, csg, augment, out, config.seed, device
         )
         augmented.save(out / AUGMENTED)
         write_json(out / AUGMENTATION, asdict(report))
@@ -282,7 +282,7 @@ def _augment(
     with distributed.leader_first():
         if not (out / AUGMENTATION).exists():
             inputs = _dependencies(run.train, run.validation, config.seed, device)
-            inputs["settings"] = [asdict(table) for table in settings]
+            inputs["settings"] = [asdict(table) for table in (crm, csg, augment)]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
             shared.provide(inputs, augment_episodes.__module__, out, files, make)
         augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)

@@ -168,8 +168,7 @@ class TrainedPolicy:
 
     @cached_property
     def fingerprint(self) -> str:
-        """12 hexadecimal digits that tell trained runs apart: a hash of the data, the configuration
-        and the checksums of the weights."""
+        """A hash of data, configuration and weights that tells trained runs apart."""
         weights = {name: seal for name, seal in self.record.files.items() if "safetensors" in name}
         of = {"data": self.record.fingerprint, "config": self.record.settings, "weights": weights}
         return config_hash(of)
@@ -310,11 +309,6 @@ class RunOnWorkers:
     folder: Path
     checkpoint: str
     fingerprint: str
-
-    @classmethod
-    def of(cls, trained: TrainedPolicy, checkpoint: str) -> "RunOnWorkers":
-        """The policy that was loaded with this checkpoint."""
-        return cls(trained.folder.absolute(), checkpoint, trained.fingerprint)
 
     @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:

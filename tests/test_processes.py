@@ -292,10 +292,7 @@ def test_a_log_file_gets_plain_lines_with_rate_and_time_left() -> None:
     assert float(line[1]) <= 10  # 1 step of this start in 0.1 s or more, not 6
     assert lines[-1].startswith("train: 100% 10/10 [")
     assert all(re.match(r"train: [\d.]+ steps \[", line) for line in lines_of(0.05, None))
-
-
-def test_a_short_job_prints_nothing_without_a_terminal() -> None:
-    assert lines_of(30, 10) == []
+    assert lines_of(30, 10) == []  # a short job
 
 
 def test_a_terminal_shows_a_bar() -> None:

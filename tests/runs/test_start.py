@@ -107,10 +107,9 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
     start_warm(policy, tmp_path / "run2", tmp_path / "run")
     old = trained.policy.state_dict()
     for name, value in policy.named_parameters():
-        known = len(old[name]) if value.dim() else None
-        assert torch.equal(value[:known] if value.dim() else value, old[name]), name
-        if value.dim() and len(value) > len(old[name]):
-            assert torch.equal(value[known:], fresh[name][known:])
+        new, known = torch.atleast_1d(value), torch.atleast_1d(old[name])
+        assert torch.equal(new[: len(known)], known), name
+        assert torch.equal(new[len(known) :], torch.atleast_1d(fresh[name])[len(known) :])
     assert torch.equal(policy.state_mean, trained.policy.state_mean)
     counts = policy.state_dict()["head.counts"]
     assert len(counts) > ITEMS

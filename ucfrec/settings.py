@@ -230,11 +230,7 @@ def shown(value: object) -> str:
 
 
 def require_whole(name: str, value: object, least: int = 1, most: int | None = None) -> int:
-    """The whole number that `value` is; NumPy's count too.
-
-    Raises:
-        InputError: it is not a whole number, below `least` or above `most`.
-    """
+    """The whole number, NumPy's too, that `value` is, from `least` to `most`, or an `InputError`."""
     try:
         whole = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:

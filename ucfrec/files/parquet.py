@@ -70,12 +70,7 @@ def require_plausible_size(path: Path) -> None:
 
 
 def read_ids(path: Path, column: str) -> Array:
-    """The ids in a column of a Parquet file, (n,) int64 or text.
-
-    Raises:
-        InputError: the file is missing or damaged, or the column is missing, has missing values, or
-            holds neither integers nor text.
-    """
+    """The ids in a column of a Parquet file, (n,) int64 or text."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -92,25 +92,21 @@ class Entry(BaseModel):
 
 
 class Record(Entry):
-    """What a folder is: the content of the JSON file `FILE` in it."""
+    """What a folder is: the content of the JSON file `FILE` in it.
+
+    Messages say with `KIND` what makes such a folder, with `REMEDY` what to do about a damaged one.
+    """
 
     FILE: ClassVar[str]
-    """Name of the file in the folder."""
     KIND: ClassVar[str]
-    """What the folder is, for messages, with what makes one."""
     REMEDY: ClassVar[str]
-    """What to do about a damaged folder."""
 
     files: Annotated[dict[Text, tuple[Count, Text]], AfterValidator(_inside)]
     """Size in bytes and checksum of the other files, by path in the folder."""
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read and check the record of a folder; of the other files, nothing is read.
-
-        Raises:
-            InputError: the folder has no such record, or it is damaged.
-        """
+        """Read and check the record of a folder; of the other files, nothing is read."""
         path = folder / cls.FILE
         if not path.is_file():
             raise InputError(f"{folder} is not {cls.KIND}")

@@ -376,10 +376,7 @@ class WeightAverage:
         self._when: dict[str, Tensor] = {}  # `_log` at the last average of each row of a table
 
     def before_step(self) -> dict[str, Tensor]:
-        """Bring the averages of rows that the next step moves up to date; returns them by table.
-
-        To be called once gradients are known, and before weights move.
-        """
+        """Bring the averages of rows that the gradients will move up to date; returns the rows."""
         moved = {}
         for name, parameter in self._gradients.items():
             gradient = parameter.grad

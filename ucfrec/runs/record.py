@@ -243,11 +243,7 @@ class RunRecord(TrainingRecord):
 
     @property
     def name(self) -> str:
-        """Name of the method.
-
-        Followed by `-augmented` or `-no-augmentation` if the run's use of augmentation is not the
-        method's default.
-        """
+        """Name of the method, with a suffix if its use of augmentation is not the default."""
         name, augmented = self.config.policy_name, self.config.augment.augments
         if augmented == policy_class(name).augmented:
             return name
@@ -269,11 +265,7 @@ class RunRecord(TrainingRecord):
 
     @property
     def finished(self) -> Fit:
-        """The report of the policy's training.
-
-        Raises:
-            InputError: the training has not ended.
-        """
+        """The report of the policy's training, which must have ended."""
         if self.policy is None:
             raise InputError("the training of the run has not ended; train it to its end first")
         return self.policy

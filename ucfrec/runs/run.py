@@ -69,10 +69,7 @@ _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 @dataclass(frozen=True)
 class SharedStages:
-    """Stages that several runs on one log have in common, made once and then copied.
-
-    Each lies in a folder of its own in `folder`; None shares nothing.
-    """
+    """Stages that several runs have in common, each in a folder in `folder`; None for none."""
 
     folder: Path | None
 

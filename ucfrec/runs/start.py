@@ -70,11 +70,10 @@ def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, confi
         return
     record = RunRecord.read(out)
     if not record.is_of(store.record):
+        own, other = record.fingerprint[:12], store.record.fingerprint[:12]
         raise InputError(
-            f"{out} is a run on another store ({record.store}, fingerprint "
-            f"{record.fingerprint[:12]}), not on {store.path} "
-            f"({store.record.fingerprint[:12]}), or on other item states than that has; name "
-            "another run folder"
+            f"{out} is a run on another store ({record.store}, fingerprint {own}), not on "
+            f"{store.path} ({other}), or on other item states than that has; name another folder"
         )
     started = record.config
     if not config.train.cosine and config.train.steps > started.train.steps:
@@ -243,11 +242,8 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
 def warm_settings(config: Config, share: float = SHARE) -> Config:
     """The settings of a warm training, of a `share` of the steps and epochs of one from scratch."""
     steps = max(1, round(share * config.train.steps))
-    train = replace(
-        config.train,
-        steps=steps,
-        warmup_steps=min(config.train.warmup_steps, steps // 10),
-        validate_every=min(config.train.validate_every, steps),
-    )
+    warmup = min(config.train.warmup_steps, steps // 10)
+    every = min(config.train.validate_every, steps)
+    train = replace(config.train, steps=steps, warmup_steps=warmup, validate_every=every)
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

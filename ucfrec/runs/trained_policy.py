@@ -195,11 +195,7 @@ class TrainedPolicy:
         return store_of(self.folder, self.record)
 
     def require_store(self, remedy: str) -> EpisodeStore:
-        """`training_store`.
-
-        Raises:
-            InputError: it is gone, changed or damaged; the message ends with `remedy`.
-        """
+        """`training_store`; an `InputError` that ends with `remedy` if it is gone or changed."""
         store = self.training_store()
         if store is None:
             raise InputError(

@@ -116,13 +116,12 @@ def update_run(
     assert record.update is not None
     if record.update.verdict is None:
         # The drift of the new rows and the verdict.
-        first = opened.n_episodes - record.update.episodes
-        added = opened.select(np.arange(first, opened.n_episodes))
+        added = opened.select(np.arange(opened.n_episodes)[-record.update.episodes :])
         training, seed = store_before.split("train"), config.seed
         changes = measure_drift(trained, training, added, counts, seed)
-        is_newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
-        newest = opened.select(np.flatnonzero(is_newest))
-        earlier = opened.select(np.flatnonzero(~is_newest))
+        split = opened.episode_values(schema.SPLIT)
+        newest = opened.split("test")
+        earlier = opened.select(np.flatnonzero(split != schema.SPLITS.index("test")))
         users = newest.episode_values(schema.USER)
         seen = UserRows.of(newest, users, earlier) if options.filter_seen else None
         new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)

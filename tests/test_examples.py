@@ -139,5 +139,4 @@ def test_a_policy_that_is_updated_earns_more_than_one_that_is_not(tmp_path: Path
         np.mean([getattr(each, name) for each in days[-2:]]) for name in ("reward", "frozen")
     )
     assert reward > 1.15 * frozen
-    covered = [found for each in days for found in each.covered if found is not None]
-    assert np.mean(covered) > 0.7
+    assert np.mean([found for day in days for found in day.covered if found is not None]) > 0.7

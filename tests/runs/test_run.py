@@ -120,10 +120,7 @@ def test_other_actions_alone_on_the_command_line(
 
 @pytest.mark.parametrize("policy_name", ["ucf", "dt4rec", "cdt4rec"])
 def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> None:
-    states, episodes = some_states(), random_episodes([6] * 60)
-    for number, episode in enumerate(episodes):
-        episode.split = int(number % 5 == 0)
-    store = write_store(tmp_path / "store", episodes, states)
+    store = write_store(tmp_path / "store", random_episodes([6] * 90), some_states())
     settings = [
         *("train.steps=4", "train.batch_size=256", "policy.dim=8", "policy.context=4"),
         *("crm.epochs=20", "crm.hidden=16", "augment.actions=2", "augment.epsilon_r=10.0"),
@@ -201,11 +198,9 @@ def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
 
 def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_path: Path) -> None:
     """The fingerprint is of the steps; other features of the same log are other states."""
-    episodes = random_episodes([6] * 60)
-    for number, episode in enumerate(episodes):
-        episode.split = int(number % 5 == 0)
 
     def sealed_store(seed: int) -> EpisodeStore:
+        episodes = random_episodes([6] * 60)
         store = write_store(tmp_path / f"store-{seed}", episodes, some_states(seed=seed))
         store.record.seal(store.path)
         return EpisodeStore.open(store.path)

@@ -11,24 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_layering import imports
+from tests.test_layering import PACKAGES, ROOT, imports
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = {
-    "ucfrec": ROOT / "ucfrec",
-    "ucfrec_datasets": ROOT / "datasets" / "ucfrec_datasets",
-    "ucfrec_simulators": ROOT / "simulators" / "ucfrec_simulators",
-    "ucfrec_control": ROOT / "control" / "ucfrec_control",
-}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-ENTRY_POINTS = [
-    EntryPoint(name, value, group)
-    for group, named in {
-        "console_scripts": PROJECT["scripts"],
-        **PROJECT.get("entry-points", {}),
-    }.items()
-    for name, value in named.items()
-]
+GROUPS = {"console_scripts": PROJECT["scripts"], **PROJECT["entry-points"]}
+ENTRY_POINTS = [EntryPoint(name, at, key) for key in GROUPS for name, at in GROUPS[key].items()]
 
 
 DISTRIBUTIONS = {

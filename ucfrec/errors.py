@@ -31,14 +31,7 @@ def warn_user(message: str) -> None:
 
 @contextmanager
 def damage_explained(path: Path | str, remedy: str) -> Iterator[None]:
-    """Turn errors over the content of a file, which the block uses, into one `InputError`.
-
-    Args:
-        path: of the file, or words for what is used.
-
-    Raises:
-        InputError: an entry is missing or has another type or shape than the block needs.
-    """
+    """Turn errors over the content of the file `path` into one `InputError`."""
     try:
         yield
     except InputError:

@@ -12,12 +12,14 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
 
-ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+    from tqdm import tqdm
+
+Progress: TypeAlias = "tqdm[Any]"
 FIRST_LINE = 10.0
 """Seconds before the first line of progress without a terminal; a shorter job prints nothing."""
 NEXT_LINE = 30.0
@@ -66,7 +68,8 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 def _handle_signals(handler: Any) -> dict[signal.Signals, Any]:
     """Set the handler of Ctrl-C and TERM; returns those that they had."""
-    return {number: signal.signal(number, handler) for number in ENDING}
+    ending = (signal.SIGINT, signal.SIGTERM)
+    return {number: signal.signal(number, handler) for number in ending}
 
 
 @contextmanager
@@ -202,16 +205,6 @@ def random_state_kept() -> Iterator[None]:
         np.random.set_state(numpy_state)  # noqa: NPY002
 
 
-class Progress(Protocol):
-    """The display that `progress` yields, a bar of tqdm."""
-
-    def update(self, n: float = 1) -> object:
-        """Count `n` more units as done."""
-
-    def set_postfix(self, *, refresh: bool | None, **metrics: Any) -> None:
-        """Display `metrics` next to them, e.g. `loss=0.3`."""
-
-
 @contextmanager
 def progress(
     total: float | None, job: str, unit: str, done: float = 0, shown: bool = True
@@ -224,8 +217,7 @@ def progress(
         total: units of the whole job; None if unknown.
         job: name of the job, e.g. "train".
         unit: what is counted, in the plural, e.g. "steps".
-        done: units that were finished before this process resumed the job; they do not count
-            towards the rate.
+        done: units that were finished before this process resumed the job, outside the rate.
         shown: whether this process displays anything.
     """
     from tqdm import tqdm

@@ -14,11 +14,7 @@ _PACKAGES: Final = ("ucfrec", "torch", "numpy", "gymnasium")
 
 
 def versions(packages: Sequence[str] = ()) -> dict[str, str]:
-    """Installed versions of Python and of the packages that results depend on.
-
-    Args:
-        packages: further distributions to include if they are installed, e.g. of a simulator.
-    """
+    """Installed versions of Python, of what results depend on, and of more `packages`."""
     installed = {"python": sys.version.split()[0]}
     for name in (*_PACKAGES, *packages):
         with suppress(PackageNotFoundError):

@@ -70,16 +70,12 @@ class SettingError(InputError):
 
 
 class Setting(NamedTuple):
-    """The description of one field of a table."""
+    """One field of a table: `table.field`, its value, type and range in words, and docstring."""
 
     key: str
-    """`table.field`, as in `--set table.field=value`."""
     value: Any
-    """Current value."""
     allowed: str
-    """Type and range, in words."""
     meaning: str
-    """The docstring of the field, on one line."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(Field, field))
@@ -90,9 +86,7 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
     are checked in `__post_init__`, with `require`. Lists become tuples, as TOML and JSON have lists
     only. Constructing the class with an invalid value raises `SettingError`.
 
-    Args:
-        name: of the table, the prefix of its fields in messages: `policy` in `policy.heads`; empty
-            for fields outside any table.
+    `name` is the prefix of its fields in messages: `policy` in `policy.heads`; empty for none.
     """
 
     def decorate(cls: type[Table]) -> type[Table]:
@@ -103,7 +97,8 @@ def settings_table(name: str) -> Callable[[type[Table]], type[Table]]:
         def check(self: Any, *args: Any, **values: Any) -> None:
             values |= dict(zip(names, args, strict=False))
             try:
-                build(self, *args[len(names) :], **_convert_lists(values))
+                converted = {key: _convert_lists(value) for key, value in values.items()}
+                build(self, *args[len(names) :], **converted)
             except ValidationError as error:
                 raise _setting_error(table, name, error, values) from None
 
@@ -120,12 +115,9 @@ def require(holds: bool, message: str, *keys: str) -> None:
 
 
 def describe(name: str, table: Any) -> Iterator[Setting]:
-    """Describe every field of `table`, an instance of a class decorated by `settings_table`.
+    """Describe every field of `table`, whose keys begin with `name`.
 
     A field that a subclass redefines without a docstring has the meaning given by its base class.
-
-    Args:
-        name: of the table, the prefix of the keys.
     """
     meanings: dict[str, str] = {}
     for base in filter(is_table, reversed(type(table).__mro__)):
@@ -160,8 +152,6 @@ def nearest(name: str, names: Sequence[str]) -> str:
 
 
 def _convert_lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _convert_lists(entry) for key, entry in value.items()}
     return tuple(map(_convert_lists, value)) if isinstance(value, list) else value
 
 
@@ -240,11 +230,7 @@ def shown(value: object) -> str:
 
 
 def require_whole(name: str, value: object, least: int = 1, most: int | None = None) -> int:
-    """The whole number that `value` is; NumPy's count too.
-
-    Raises:
-        InputError: it is not a whole number, below `least` or above `most`.
-    """
+    """The whole number, NumPy's too, that `value` is, at least `least` and at most `most`."""
     try:
         whole = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:

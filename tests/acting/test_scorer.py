@@ -369,7 +369,7 @@ def test_rewards_of_the_session_lower_the_target_of_recommendations(trained: Tra
     log = tagged_log()
     user, items, _ = max(last_sessions(log), key=lambda session: len(session[1]))
     window = trained.policy.config.context
-    assert len(items) > window + trained.returns.horizon
+    assert len(items) > window + trained.record.return_to_go.horizon
     rows = log[log.user_id == user].tail(len(items))
 
     def scores(rewards: float, target: float) -> pd.Series:
@@ -383,7 +383,7 @@ def test_rewards_of_the_session_lower_the_target_of_recommendations(trained: Tra
 
     # Liking is clipped: any reward of 1 or more makes the same states.
     low, high, same = scores(1.0, 4.0), scores(3.0, 4.0), scores(3.0, 6.0)
-    if trained.returns.per_session:
+    if trained.record.return_to_go.per_session:
         np.testing.assert_allclose(low, same, atol=1e-5)
         assert not np.allclose(low, high, atol=1e-6)
     else:

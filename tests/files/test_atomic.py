@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,24 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def forked(work: Callable[[], None]) -> int:
+    """A child process that does the work, and ends with status 0 if that succeeds."""
+    child, status = os.fork(), 1
+    if child == 0:
+        try:
+            work()
+            status = 0
+        finally:
+            os._exit(status)
+    return child
+
+
+def kill(child: int, seconds: float) -> None:
+    time.sleep(seconds)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+
+
 def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("1")
@@ -42,28 +61,6 @@ def test_a_folder_that_exists_is_left_alone(tmp_path: Path) -> None:
         raise AssertionError("the block must not run")
     assert names(tmp_path) == ["out"]
     assert (tmp_path / "out" / "mine").read_text() == "1"
-
-
-def test_what_a_killed_process_left_does_not_mix_in(tmp_path: Path) -> None:
-    """Process numbers come around again."""
-    with atomic_folder(tmp_path / "out") as scratch:
-        left = scratch
-    (tmp_path / "out").rename(left)
-    (left / "stale").write_text("from a run that was killed")
-    with atomic_folder(tmp_path / "out") as scratch:
-        assert scratch == left
-        (scratch / "new").write_text("1")
-    assert names(tmp_path / "out") == ["new"]
-
-
-def test_a_file_is_replaced_when_its_block_ends(tmp_path: Path) -> None:
-    target = tmp_path / "folder" / "a.txt"
-    for text in ("old", "new"):
-        with atomic_file(target) as scratch:
-            scratch.write_text(text)
-            assert not target.exists() or target.read_text() == "old"
-        assert target.read_text() == text
-    assert names(target.parent) == ["a.txt"]
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
@@ -82,22 +79,22 @@ def test_a_block_that_raises_changes_nothing(tmp_path: Path, error: type[BaseExc
         write_json(tmp_path / "a.txt", {"a": object()})
     assert (tmp_path / "a.txt").read_text() == "old"
     assert names(tmp_path) == ["a.txt"]
+    with atomic_file(tmp_path / "a.txt") as scratch:
+        scratch.write_text("new")
+        assert (tmp_path / "a.txt").read_text() == "old"
+    assert (tmp_path / "a.txt").read_text() == "new"
 
 
 def test_a_file_rewritten_by_a_process_that_is_killed_is_always_whole(tmp_path: Path) -> None:
     target = tmp_path / "a.json"
     write_json(target, {"numbers": list(range(2000))})
+
+    def rewrite() -> None:
+        while True:
+            write_json(target, {"numbers": list(range(2000))})
+
     for attempt in range(6):
-        child = os.fork()
-        if child == 0:
-            try:
-                while True:
-                    write_json(target, {"numbers": list(range(2000))})
-            finally:
-                os._exit(1)
-        time.sleep(0.003 + 0.001 * attempt)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        kill(forked(rewrite), 0.003 + 0.001 * attempt)
         assert read_json(target) == {"numbers": list(range(2000))}
 
 
@@ -213,39 +210,28 @@ def test_one_process_may_claim_within_its_claim(tmp_path: Path) -> None:
 def test_writers_of_one_file_wait_for_each_other(tmp_path: Path) -> None:
     path = tmp_path / "count"
     path.write_text("0")
-    children = []
-    for _ in range(3):
-        child = os.fork()
-        if child == 0:
-            try:
-                for _ in range(15):
-                    with claim(path, wait=True):
-                        count = int(path.read_text())
-                        with atomic_file(path) as scratch:
-                            scratch.write_text(str(count + 1))
-                os._exit(0)
-            finally:
-                os._exit(1)
-        children.append(child)
+
+    def count() -> None:
+        for _ in range(15):
+            with claim(path, wait=True):
+                number = int(path.read_text())
+                with atomic_file(path) as scratch:
+                    scratch.write_text(str(number + 1))
+
+    children = [forked(count) for _ in range(3)]
     assert [os.waitpid(child, 0)[1] for child in children] == [0] * 3
     assert path.read_text() == "45"
     assert names(tmp_path) == ["count"]
 
 
 def test_killed_at_any_moment_a_folder_is_whole_and_the_next_writer_tidies(tmp_path: Path) -> None:
+    def write() -> None:
+        with atomic_folder(tmp_path / "out") as scratch:
+            for name in range(200):
+                (scratch / str(name)).write_text("x")
+
     for attempt in range(10):
-        child = os.fork()
-        if child == 0:
-            try:
-                with atomic_folder(tmp_path / "out") as scratch:
-                    for name in range(200):
-                        (scratch / str(name)).write_text("x")
-                os._exit(0)
-            finally:
-                os._exit(1)
-        time.sleep(0.002 * attempt)
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        kill(forked(write), 0.002 * attempt)
         if (tmp_path / "out").exists():
             assert len(names(tmp_path / "out")) == 200
             (tmp_path / "out").rename(tmp_path / f"whole-{attempt}")

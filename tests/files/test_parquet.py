@@ -7,7 +7,6 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,13 +19,6 @@ from ucfrec.files.parquet import read_ids, require_plausible_rows, require_plaus
 from ucfrec.logs.mapping import LogMapping
 from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.reporting.training import read_features
-
-
-def test_ids_come_back(tmp_path: Path) -> None:
-    for ids in ([3, 1, 2], ["b", "a"], []):
-        frame = pd.DataFrame({"item_id": pd.Series(ids, dtype=None if ids else "int64")})
-        frame.to_parquet(tmp_path / "ids.parquet")
-        assert read_ids(tmp_path / "ids.parquet", "item_id").tolist() == ids
 
 
 def test_a_pipe_is_refused_and_not_read(tmp_path: Path) -> None:

@@ -29,8 +29,8 @@ def test_what_was_sealed_comes_back_and_holds(sealed: Path) -> None:
     assert written["numbers"] == [0.5, None]
     assert "note" not in written
     assert (record.version, record.note, {*record.files}) == (1, None, {"a", "b", "inner/c"})
-    assert list(record.checksums(sealed).faults()) == []
-    record.checksums(sealed).require()
+    assert list(record.faults(sealed)) == []
+    record.require(sealed, small=10**9)
 
 
 def test_sealing_again_signs_off_no_damage(sealed: Path) -> None:
@@ -38,7 +38,7 @@ def test_sealing_again_signs_off_no_damage(sealed: Path) -> None:
     (sealed / "b").write_text("B")
     (sealed / "new").write_text("1")
     assert "new" in record.seal(sealed).files
-    assert [name for name, _ in Example.read(sealed).checksums(sealed).faults()] == ["b"]
+    assert [name for name, _ in Example.read(sealed).faults(sealed)] == ["b"]
 
 
 def test_reopening_leaves_only_what_stays(sealed: Path) -> None:
@@ -90,7 +90,7 @@ def test_every_flipped_bit_is_found_or_changes_nothing(sealed: Path, tmp_path: P
         except InputError:
             found += 1
             continue
-        if any(record.checksums(copy).faults()):
+        if any(record.faults(copy)):
             found += 1
             continue
         # The flip was in the layout of the record, or in the name of its entry "checksum".
@@ -105,14 +105,14 @@ def test_each_kind_of_fault_is_named(sealed: Path) -> None:
     (sealed / "b").write_bytes(b"word")
     (sealed / "inner" / "c").write_bytes(bytes(30_001))
     (sealed / "foreign").write_bytes(b"")
-    files = Example.read(sealed).checksums(sealed)
-    assert dict(files.faults()) == {
+    record = Example.read(sealed)
+    assert dict(record.faults(sealed)) == {
         "a": "is not a regular file",
         "b": "is truncated: 4 of 5 bytes",
         "inner/c": "is grown: 30,001 of 30,000 bytes",
     }
-    assert files.strangers() == ["foreign", "record.json"]
+    assert record.strangers(sealed) == ["foreign", "record.json"]
     with pytest.raises(InputError, match="restore the file, or make it again"):
-        files.require(small=-1)
+        record.require(sealed)
     (sealed / "b").unlink()
-    assert dict(files.faults())["b"] == "is missing"
+    assert dict(record.faults(sealed))["b"] == "is missing"

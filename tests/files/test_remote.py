@@ -13,7 +13,7 @@ from ucfrec.commands.cli import main
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.files.remote import Input, Output, _open, local_paths, uri_or_path
-from ucfrec.logs.mapping import read_mapping
+from ucfrec.logs.mapping import LogMapping, read_mapping
 from ucfrec.logs.prepare import prepare
 
 START = 1_700_000_000_000
@@ -79,23 +79,18 @@ def test_a_store_is_made_from_remote_logs_in_a_remote_place(
         put(file, f"{place}/logs/{file.name}")
     assert main(["prepare", f"{place}/logs/*.parquet", "--out", f"{place}/store"]) == 0
     assert f"store: {place}/store" in capsys.readouterr().out
-    prepare(files, read_mapping(_empty(tmp_path)), tmp_path / "store")
+    prepare(files, LogMapping(), tmp_path / "store")
     local = EpisodeStore.open(tmp_path / "store").record
     with local_paths(argparse.Namespace(store=Input(f"{place}/store"))) as options:
         found = EpisodeStore.open(options.store)
         assert found.record.fingerprint == local.fingerprint
         assert found.record.source.files == tuple(f"{place}/logs/{file.name}" for file in files)
-        assert not list(found._columns._sealed.faults())
+        assert not list(found.record.faults(options.store))
         copy = options.store
     assert not copy.exists()
     # A folder of logs; the store is there already.
     assert main(["prepare", f"{place}/logs", "--out", f"{place}/store"]) == 2
     assert f"{place}/store exists already" in capsys.readouterr().err
-
-
-def _empty(folder: Path) -> Path:
-    (folder / "mapping.toml").write_text("")
-    return folder / "mapping.toml"
 
 
 def test_errors_name_the_place_and_write_nothing(
@@ -122,7 +117,7 @@ def test_sizes_are_checked_before_anything_is_copied(
 def test_only_the_command_line_names_places(tmp_path: Path, place: str) -> None:
     put(write_log(tmp_path / "log.parquet"), f"{place}/log.parquet")
     with pytest.raises(InputError, match="does not exist"):
-        prepare([f"{place}/log.parquet"], read_mapping(_empty(tmp_path)), tmp_path / "store")
+        prepare([f"{place}/log.parquet"], LogMapping(), tmp_path / "store")
     mapping = tmp_path / "stranger.toml"
     mapping.write_text(
         f'[[item_features]]\nfiles = ["{place}/log.parquet"]\nkey = "item_id"\n', encoding="utf-8"

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -73,31 +72,13 @@ def assert_same_files(found: Path, expected: Path) -> None:
         assert all(torch.equal(one[key], other[key]) for key in one)
 
 
-@pytest.fixture(scope="module")
-def left_alone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fit]:
-    folder = tmp_path_factory.mktemp("left_alone")
-    return folder, killed_training.train(folder)
-
-
-@pytest.fixture(scope="module")
-def killed_often(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    folder = tmp_path_factory.mktemp("killed")
-    script = subprocess.run(
-        [sys.executable, ROOT / "tests" / "support" / "killed_training.py", "1", folder],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert script.returncode == 0, script.stderr
-    return folder, json.loads(script.stdout)
-
-
 @pytest.mark.slow
-def test_killed_training_ends_as_if_left_alone(
-    left_alone: tuple[Path, Fit], killed_often: tuple[Path, dict[str, Any]]
-) -> None:
-    (calm, calm_fit), (folder, ended) = left_alone, killed_often
+def test_killed_training_ends_as_if_left_alone(tmp_path: Path) -> None:
+    calm, folder = tmp_path / "calm", tmp_path / "killed"
+    calm_fit = killed_training.train(calm)
+    script = ROOT / "tests" / "support" / "killed_training.py"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = json.loads(subprocess.check_output([sys.executable, script, "1", folder], env=env))
     assert ended["killed"] >= 3
     for key in ("steps", "best_step", "best_validation"):
         assert ended[key] == getattr(calm_fit, key)
@@ -238,51 +219,30 @@ def test_a_loss_that_is_not_finite_is_named(tmp_path: Path, bad: float) -> None:
         validated(tmp_path / "validated", [math.nan], FAST)
 
 
-def test_without_a_terminal_a_line_says_how_far_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ucfrec.processes.FIRST_LINE", 0.0)
-    monkeypatch.setattr("ucfrec.processes.NEXT_LINE", 0.0)
-    module = linear()
-    fit(module, draw, squared(module), FAST, tmp_path, seed=1, describe="critic")
-    lines = capsys.readouterr().err.splitlines()
-    assert any(re.match(r"critic:  50% 6/12 \[.* steps/s, loss=", line) for line in lines)
-    longer = replace(FAST, steps=16)
-    fit(module, draw, squared(module), longer, tmp_path, seed=1, describe="critic")
-    assert "critic:  81% 13/16 [" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("draw_takes", "loss_takes"), [(0.75, 0.25), (0.0, 0.5)])
-def test_speed_and_waiting_are_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draw_takes: float, loss_takes: float
-) -> None:
+def test_speed_and_waiting_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module, seconds = linear(), 0.0  # of a clock that no other work on the machine can slow down
     clock = SimpleNamespace(perf_counter=lambda: seconds)
     monkeypatch.setattr("ucfrec.fitting.loop.time", clock)
 
-    def timed_draw(generator: np.random.Generator) -> Tensor:
+    def takes(more: float, result: Any) -> Any:
         nonlocal seconds
-        seconds += draw_takes
-        return draw(generator)
-
-    def timed_loss(batch: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        nonlocal seconds
-        seconds += loss_takes
-        return squared(module)(batch)
-
-    def validate() -> float:
-        nonlocal seconds
-        seconds += 4  # counts as neither
-        return 0.0
+        seconds += more
+        return result
 
     config = LoopConfig(steps=15, batch_size=64, validate_every=5)
-    result = fit(module, timed_draw, timed_loss, config, tmp_path, seed=1, validate=validate)
-    step_takes = draw_takes + loss_takes
-    assert result.seconds == 15 * step_takes + 3 * 4
+    fitted = fit(
+        module,
+        lambda generator: takes(0.75, draw(generator)),
+        lambda batch: takes(0.5, squared(module)(batch)),
+        config,
+        tmp_path,
+        seed=1,
+        validate=lambda: takes(4, 0.0),  # counts as neither
+    )
+    assert fitted.seconds == 15 * 1.25 + 3 * 4
     logged = read_metrics(tmp_path)
-    for step in (5, 10, 15):
-        assert logged["waiting_for_data"][step] == draw_takes / step_takes
-        assert logged["samples_per_second"][step] == 64 / step_takes
+    assert logged["waiting_for_data"] == dict.fromkeys((5, 10, 15), 0.75 / 1.25)
+    assert logged["samples_per_second"] == dict.fromkeys((5, 10, 15), 64 / 1.25)
 
 
 class Model(nn.Module):
@@ -396,7 +356,7 @@ def train(
     return module, seen
 
 
-@pytest.mark.parametrize("warmup", [0, 15])
+@pytest.mark.parametrize("warmup", [0, 15, 40])
 def test_averages_are_those_of_the_formula_for_rows_that_rest_too(
     tmp_path: Path, warmup: int
 ) -> None:
@@ -414,15 +374,10 @@ def test_averages_are_those_of_the_formula_for_rows_that_rest_too(
         ]
     for name, parameter, mean in zip(names, module.parameters(), expected, strict=True):
         torch.testing.assert_close(parameter.detach().double(), mean, rtol=1e-5, atol=1e-6)
-        assert not torch.equal(parameter.detach(), raw[name])
-
-
-def test_a_training_that_ends_with_its_warm_up_is_not_averaged(tmp_path: Path) -> None:
-    averaged, raw = (
-        train(tmp_path / str(decay), replace(AVERAGED, warmup_steps=40, average=decay))[0]
-        for decay in (0.9, 0.0)
-    )
-    assert equal(weights(averaged), weights(raw))
+        assert torch.equal(parameter.detach(), raw[name]) == (warmup == AVERAGED.steps)
+    for file in ("best.safetensors", "last.safetensors"):
+        loaded = load_trained(tmp_path / file)
+        assert all(torch.equal(loaded[key], each) for key, each in module.state_dict().items())
 
 
 def test_an_interrupted_training_ends_with_the_same_bits(tmp_path: Path) -> None:
@@ -468,11 +423,3 @@ def test_averaging_and_reading_averages_do_not_change_the_training_itself(tmp_pa
     assert often.keys() == once.keys() > raw.keys()
     assert all(torch.equal(often[name], once[name]) for name in often)
     assert all(torch.equal(often[name], raw[name]) for name in raw)
-
-
-def test_the_averages_are_what_is_loaded_from_either_file(tmp_path: Path) -> None:
-    module, _ = train(tmp_path, validated=False)
-    for name in ("best.safetensors", "last.safetensors"):
-        loaded = load_trained(tmp_path / name)
-        assert loaded.keys() == module.state_dict().keys()
-        assert all(torch.equal(loaded[key], each) for key, each in module.state_dict().items())

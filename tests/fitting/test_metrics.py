@@ -67,9 +67,7 @@ def test_a_torn_last_line_is_left_out_and_never_joined_to_the_next(tmp_path: Pat
     ],
 )
 def test_other_lines_are_named_in_one_line(tmp_path: Path, line: str, says: str) -> None:
-    (tmp_path / METRICS).write_text(
-        '{"step": 1, "loss": 2}\n' + line + '\n{"step": 2, "loss": 1}\n'
-    )
+    (tmp_path / METRICS).write_text(f'{{"step": 1, "loss": 2}}\n{line}\n{{"step": 2}}\n')
     with pytest.raises(InputError, match=says) as caught:
         read_metrics(tmp_path)
     assert f"{tmp_path / METRICS}, line 2," in str(caught.value)
@@ -81,11 +79,8 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=5,
 )
-LINES = st.binary(max_size=30) | JSON.map(lambda value: json.dumps(value).encode()) | (
-    st.dictionaries(st.sampled_from(["step", "loss", "kl"]), JSON).map(
-        lambda row: json.dumps(row).encode()
-    )
-)  # fmt: skip
+ROWS = st.dictionaries(st.sampled_from(["step", "loss", "kl"]), JSON)
+LINES = st.binary(max_size=30) | (JSON | ROWS).map(lambda value: json.dumps(value).encode())
 
 
 @given(st.lists(LINES, max_size=4))

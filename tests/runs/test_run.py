@@ -120,10 +120,7 @@ def test_other_actions_alone_on_the_command_line(
 
 @pytest.mark.parametrize("policy_name", ["ucf", "dt4rec", "cdt4rec"])
 def test_other_items_with_every_addition(tmp_path: Path, policy_name: str) -> None:
-    states, episodes = some_states(), random_episodes([6] * 60)
-    for number, episode in enumerate(episodes):
-        episode.split = int(number % 5 == 0)
-    store = write_store(tmp_path / "store", episodes, states)
+    store = write_store(tmp_path / "store", random_episodes([6] * 90), some_states())
     settings = [
         *("train.steps=4", "train.batch_size=256", "policy.dim=8", "policy.context=4"),
         *("crm.epochs=20", "crm.hidden=16", "augment.actions=2", "augment.epsilon_r=10.0"),
@@ -201,11 +198,9 @@ def test_a_checkpoint_that_cannot_be_written_is_one_clear_error(
 
 def test_a_run_goes_on_with_the_same_item_states_and_not_with_fewer_steps(tmp_path: Path) -> None:
     """The fingerprint is of the steps; other features of the same log are other states."""
-    episodes = random_episodes([6] * 60)
-    for number, episode in enumerate(episodes):
-        episode.split = int(number % 5 == 0)
 
     def sealed_store(seed: int) -> EpisodeStore:
+        episodes = random_episodes([6] * 60)
         store = write_store(tmp_path / f"store-{seed}", episodes, some_states(seed=seed))
         store.record.seal(store.path)
         return EpisodeStore.open(store.path)
@@ -286,52 +281,37 @@ def test_what_differs_is_made_anew(
     assert_same_tensors(run, alone, *names)
 
 
-def test_an_interrupted_stage_is_not_shared(tmp_path: Path) -> None:
-    shared = SharedStages(tmp_path / "stages")
-
-    def stop() -> None:
-        (tmp_path / "out" / "half").write_text("half")
-        raise KeyboardInterrupt
-
-    (tmp_path / "out").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        shared.provide({"seed": 0}, __name__, tmp_path / "out", ("half", "whole"), stop)
-    made = []
-
-    def make() -> None:
-        made.append(True)
-        (tmp_path / "out" / "whole").write_text("whole")
-
-    for _ in range(2):
-        shared.provide({"seed": 0}, __name__, tmp_path / "out", ("half", "whole"), make)
-    assert made == [True]
-    assert (tmp_path / "out" / "whole").read_text() == "whole"
-
-
-def test_a_file_that_was_being_copied_is_not_taken_for_finished(
+def test_what_was_interrupted_is_not_shared_and_not_taken_for_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shared = SharedStages(tmp_path / "stages")
+    shared, made = SharedStages(tmp_path / "stages"), []
     first, second = tmp_path / "first", tmp_path / "second"
-    for out in (first, second):
-        out.mkdir()
 
-    def make() -> None:
-        (first / "models").mkdir()
+    def make(report: str) -> None:
+        made.append(report)
+        (first / "models").mkdir(parents=True, exist_ok=True)
         (first / "models" / "weights").write_text("weights")
-        (first / "report").write_text("the whole report")
+        if not report:
+            raise KeyboardInterrupt
+        (first / "report").write_text(report)
 
-    shared.provide({"seed": 0}, __name__, first, ("models", "report"), make)
+    def provide(out: Path, report: str) -> None:
+        shared.provide({"seed": 0}, __name__, out, ("models", "report"), lambda: make(report))
 
     def killed(source: Path, to: Path) -> None:
         Path(to).write_text("the wh")
         raise KeyboardInterrupt
 
+    with pytest.raises(KeyboardInterrupt):
+        provide(first, "")
+    for _ in range(2):
+        provide(first, "the whole report")
     with monkeypatch.context() as patched:
         patched.setattr("ucfrec.runs.run.shutil.copyfile", killed)
         with pytest.raises(KeyboardInterrupt):
-            shared.provide({"seed": 0}, __name__, second, ("report",), make)
+            provide(second, "")
     assert not (second / "report").exists()
-    shared.provide({"seed": 0}, __name__, second, ("models", "report"), make)
+    provide(second, "")
     assert (second / "report").read_text() == "the whole report"
     assert (second / "models" / "weights").read_text() == "weights"
+    assert made == ["", "the whole report"]

@@ -86,7 +86,7 @@ def test_a_run_goes_on_as_it_was_started_and_is_refitted_so(tmp_path: Path) -> N
             train_screened(store, tmp_path / "run", config, other)
     whole = refit(store, tmp_path / "run", tmp_path / "whole")
     assert whole.sizes == record.sizes
-    assert TrainedPolicy.load(tmp_path / "whole").dropped == FLAGGED
+    assert TrainedPolicy.load(tmp_path / "whole").record.dropped_observations == FLAGGED
 
 
 def test_runs_that_share_stages_are_screened_once(

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.support.episodes import random_episodes, write_store
 from tests.support.later import later_log, later_mapping
 from tests.support.served import trained_run
 from tests.support.short_validation import ALL_BATCHES, short_validation
@@ -106,10 +107,9 @@ def test_what_the_old_run_knows_is_kept(tmp_path: Path) -> None:
     start_warm(policy, tmp_path / "run2", tmp_path / "run")
     old = trained.policy.state_dict()
     for name, value in policy.named_parameters():
-        known = len(old[name]) if value.dim() else None
-        assert torch.equal(value[:known] if value.dim() else value, old[name]), name
-        if value.dim() and len(value) > len(old[name]):
-            assert torch.equal(value[known:], fresh[name][known:])
+        new, known = torch.atleast_1d(value), torch.atleast_1d(old[name])
+        assert torch.equal(new[: len(known)], known), name
+        assert torch.equal(new[len(known) :], torch.atleast_1d(fresh[name])[len(known) :])
     assert torch.equal(policy.state_mean, trained.policy.state_mean)
     counts = policy.state_dict()["head.counts"]
     assert len(counts) > ITEMS
@@ -125,17 +125,8 @@ TOGETHER = [
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    rng = np.random.default_rng(0)
-    lengths = rng.integers(1, 6, size=120)
-    n = int(lengths.sum())
-    columns = {
-        "observation": rng.normal(size=(n, 3)),
-        "action": rng.uniform(-1, 1, size=(n, 2)),
-        "reward": rng.normal(size=n),
-    }
     path = tmp_path_factory.mktemp("store") / "store"
-    split = np.repeat([0, 1], [100, 20]).astype(np.uint8)
-    EpisodeStore.write(path, columns, lengths, {"split": split})
+    write_store(path, random_episodes([1, 4, 2, 5, 3] * 30, items=False))
     return path
 
 

@@ -398,12 +398,13 @@ def read_store(path: Path) -> list[Any]:
     from ucfrec import schema
     from ucfrec.episodes.store import EpisodeStore
     from ucfrec.files.parquet import read_ids
+    from ucfrec.files.record import SMALL
 
     store = EpisodeStore.open(path)
     columns = [store.step_values(name, *store.all_steps()) for name in store.record.columns]
     episodes = [store.episode_values(name) for name in schema.EPISODE_DTYPES]
     states = store.item_states
-    store.record.checksums(path).require()
+    store.record.require(path, small=SMALL)
     ids = [read_ids(path / f"{name}.parquet", f"{name[:-1]}_id") for name in ("users", "items")]
     used = ("n_steps", "n_episodes", "reward", "fingerprint", "source", "splits")
     meta = {name: getattr(store.record, name) for name in used}

@@ -43,9 +43,8 @@ def test_the_update_is_recorded_with_its_drift_and_verdict(folder: Path) -> None
     log = later_log(propensity=True)
     assert update.drift["unknown_items"] == pytest.approx((log.item_id >= ITEMS).mean())
     assert update.drift["observed"] == pytest.approx(log.reward[log.item_id < ITEMS].mean())
-    assert {each.measure for each in update.verdict.differences} == {
-        "ndcg_liked", "reward per step"
-    }  # fmt: skip
+    measures = {each.measure for each in update.verdict.differences}
+    assert measures == {"ndcg_liked", "reward per step"}
     assert update.verdict.steps == 60
     assert record.finished.steps < old.record.finished.steps
     assert record.rule is not None

@@ -19,7 +19,6 @@ from ucfrec.logs.append import append_logs
 from ucfrec.runs.record import UpdateVerdict
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.updating.verdict import (
-    _doubt,
     compare_runs,
     describe,
     popularity_index,
@@ -135,14 +134,6 @@ def test_a_difference_among_few_users_is_doubted(trained: TrainedPolicy) -> None
     found = verdict(good, bad, few)
     assert (found.result, found.users) == ("no significant difference", 9)
     assert all("fewer than 10, have such rows" in each.doubt for each in found.differences)
-
-
-def test_the_cause_of_missing_weight_fits_the_filter() -> None:
-    weights, user = np.full((100, 2), 0.5), np.arange(100)
-    assert "update with --filter-seen" in _doubt(weights, user, filter_seen=False)
-    filtered = _doubt(weights, user, filter_seen=True)
-    assert "update with" not in filtered
-    assert "items that requests excluded by candidates" in filtered
 
 
 def test_the_index_is_that_of_the_formula() -> None:

@@ -86,7 +86,7 @@ def _verify(path: Path) -> int:
     """Print what `path` is and its faults; returns their number."""
     from ucfrec.episodes.record import StoreRecord
     from ucfrec.results.rows import read_rows
-    from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord, read_training
+    from ucfrec.runs.record import REFIT, RunRecord, TrainingRecord
 
     if path.is_file():
         print(one_line(f"{path}: {len(read_rows(path))} result rows, all readable"))
@@ -95,25 +95,25 @@ def _verify(path: Path) -> int:
     if (path / StoreRecord.FILE).is_file():
         record, unfinished = StoreRecord.read(path), ""
     elif (path / RunRecord.FILE).is_file():
-        record = read_training(path)
+        record = TrainingRecord.read(path)
+        record = RunRecord.read(path) if record.library == "ucfrec" else record
         unfinished = "" if record.policy is not None else ", training has not ended"
     else:
         raise InputError(
             f"{path} is neither an episode store (meta.json) nor a run (run.json); check the path"
         )
-    sealed = record.checksums(path)
-    faults = list(sealed.faults())
+    faults = list(record.faults(path))
     for name, fault in faults:
         print(one_line(f"{path / name} {fault}"))
-    for name in sealed.strangers():
+    for name in record.strangers(path):
         if name != record.FILE:
             print(one_line(f"{path / name} is not listed in {record.FILE}: it was added later"))
     refit = path / REFIT
     more = _verify(refit) if (refit / RunRecord.FILE).is_file() else 0
-    size = sum(size for size, _ in sealed.files.values()) / 1e6
+    size = sum(size for size, _ in record.files.values()) / 1e6
     print(
         one_line(
-            f"{path}: {len(sealed.files) - len(faults)} of {len(sealed.files)} files have the "
+            f"{path}: {len(record.files) - len(faults)} of {len(record.files)} files have the "
             f"content that was written ({size:,.1f} MB{unfinished})"
         )
     )

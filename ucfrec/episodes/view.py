@@ -83,8 +83,8 @@ class Columns:
     ) -> None:
         """Arrays are columns in memory, by name; they and `item_states` are used instead of the
         folder's files, of which none may be missing or have another size than when written."""
-        self.path, self.record, self._sealed = path, record, record.checksums(path)
-        self._sealed.require(small=-1)
+        self.path, self.record = path, record
+        record.require(path)
         self._arrays, self._given_states = dict(arrays or {}), item_states
         self._shards = [path / f"shard-{i:05d}" for i in range(record.n_shards)]
         self._steps: dict[str, StepColumn] = {}
@@ -126,7 +126,7 @@ class Columns:
         """See `EpisodeView.item_states`."""
         if self._given_states is not None:
             return self._given_states
-        self._sealed.require(ITEM_STATES)
+        self.record.require(self.path, ITEM_STATES)
         return ItemStates.load(self.path / ITEM_STATES)
 
     @property
@@ -186,7 +186,7 @@ class Columns:
         shape, parts = tuple(self.record.columns.get(name, ())), []
         for shard in self._shards:
             path = shard / f"{name}.npy"
-            self._sealed.require(f"{shard.name}/{name}.npy")
+            self.record.require(self.path, f"{shard.name}/{name}.npy")
             try:
                 # Mapping compares the header with the size of the file before it takes memory.
                 values: Array = np.load(path, mmap_mode="r")

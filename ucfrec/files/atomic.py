@@ -29,7 +29,6 @@ _CHECKSUM: Final = "checksum"
 """Entry of a JSON object with the checksum of its other entries."""
 _PATIENCE: Final = 0.5
 """Seconds before a claim is given up: another process may just be removing a dead one."""
-_FOREVER: Final = -1.0
 _COMMAND_LENGTH: Final = 160
 _LARGEST_JSON: Final = 2**30
 _LARGEST_TOML: Final = 2**24
@@ -45,17 +44,12 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: `path` exists already, or another process is writing it.
     """
-    _require_absent(path)
     with lock_path(path):
-        _require_absent(path)
+        if os.path.lexists(path):
+            raise InputError(f"{path} exists already; remove it or name another output folder")
         with _scratch_moved(path) as scratch:
             scratch.mkdir()
             yield scratch
-
-
-def _require_absent(path: Path) -> None:
-    if os.path.lexists(path):
-        raise InputError(f"{path} exists already; remove it or name another output folder")
 
 
 @contextmanager
@@ -63,9 +57,6 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a scratch path next to `path` that replaces `path` when the block succeeds.
 
     Of two processes that write one file, the second waits for the first.
-
-    Raises:
-        InputError: `path` is a folder.
     """
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file is needed; name a file")
@@ -126,7 +117,7 @@ def claim(path: Path, wait: bool = False) -> Iterator[bool]:
         return
     new_folders = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = _acquire(_lock_of(path), _FOREVER if wait else _PATIENCE)
+    lock = _acquire(_lock_of(path), -1.0 if wait else _PATIENCE)
     if lock is None:
         yield False
         return
@@ -262,11 +253,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def require_file(path: Path, remedy: str) -> None:
-    """Check that a file is there, and no pipe or device, reading which might never end.
-
-    Raises:
-        InputError: it is not; the message ends with `remedy`.
-    """
+    """Check that a file is there, and no pipe or device, reading which might never end."""
     if not path.is_file():
         what = "is not a regular file" if path.exists() else "does not exist"
         raise InputError(f"{path} {what}; {remedy}")

@@ -3,6 +3,7 @@
 import gzip
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -58,12 +59,9 @@ def require_plausible_size(path: Path) -> None:
     most, unfolded = max(_LARGE, _RATIO * size), 0
     if _DEFLATE * size <= most:
         return
-    try:
-        with gzip.open(path) as file:
-            while unfolded <= most and (block := file.read(_BLOCK)):
-                unfolded += len(block)
-    except (EOFError, gzip.BadGzipFile, zlib.error):
-        return
+    with suppress(EOFError, gzip.BadGzipFile, zlib.error), gzip.open(path) as file:
+        while unfolded <= most and (block := file.read(_BLOCK)):
+            unfolded += len(block)
     if unfolded > most:
         raise InputError(
             f"{path} unfolds to more than {most:,} bytes from {size:,}, so nearly all of its rows "
@@ -72,12 +70,7 @@ def require_plausible_size(path: Path) -> None:
 
 
 def read_ids(path: Path, column: str) -> Array:
-    """The ids in a column of a Parquet file, (n,) int64 or text.
-
-    Raises:
-        InputError: the file is missing or damaged, or the column is missing, has missing values, or
-            holds neither integers nor text.
-    """
+    """The ids in a column of a Parquet file, (n,) int64 or text."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

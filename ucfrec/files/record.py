@@ -10,7 +10,7 @@ of it. They find accidents, not forgers: who can change a file can change its ch
 import math
 import os
 from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self
 
@@ -57,51 +57,6 @@ def file_checksum(path: Path) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True)
-class Sealed:
-    """The files of a folder and what its record says about them."""
-
-    folder: Path
-    remedy: str
-    files: Mapping[str, tuple[int, str]]
-
-    def require(self, names: Container[str] = (), small: int = SMALL) -> None:
-        """Check the sizes of all files, and the content of `names` and of those of `small` bytes.
-
-        Raises:
-            InputError: the first file that is missing or has another content.
-        """
-        for name, (size, _) in self.files.items():
-            if fault := self._find_fault(name, size <= small or name in names):
-                where = self.folder / name
-                raise InputError(f"{where} {fault}; restore the file, or {self.remedy}")
-
-    def faults(self) -> Iterator[tuple[str, str]]:
-        """Read every file; yields (path in the folder, what is wrong with it)."""
-        from concurrent.futures import ThreadPoolExecutor  # only to verify everything
-
-        with ThreadPoolExecutor(_THREADS) as threads:
-            faults = zip(self.files, threads.map(self._find_fault, self.files), strict=True)
-            yield from ((name, fault) for name, fault in faults if fault)
-
-    def strangers(self) -> list[str]:
-        """Files of the folder that are not listed, without locks and scratch."""
-        return sorted(set(_names(self.folder)) - self.files.keys())
-
-    def _find_fault(self, name: str, content: bool = True) -> str:
-        path, (stated, checksum) = self.folder / name, self.files[name]
-        try:
-            if not path.is_file():
-                return "is not a regular file" if path.exists() else "is missing"
-            if (size := path.stat().st_size) != stated:
-                kind = "truncated" if size < stated else "grown"
-                return f"is {kind}: {size:,} of {stated:,} bytes"
-            same = not content or file_checksum(path) == checksum
-            return "" if same else "has another content than was written"
-        except OSError as error:
-            return f"cannot be read ({explain_os_error(error)})"
-
-
 def _names(folder: Path) -> Iterator[str]:
     for where, folders, files in os.walk(folder):
         # A folder with a record of its own has checksums of its own.
@@ -137,25 +92,21 @@ class Entry(BaseModel):
 
 
 class Record(Entry):
-    """What a folder is: the content of the JSON file `FILE` in it."""
+    """What a folder is: the content of the JSON file `FILE` in it.
+
+    Messages say with `KIND` what makes such a folder, with `REMEDY` what to do about a damaged one.
+    """
 
     FILE: ClassVar[str]
-    """Name of the file in the folder."""
     KIND: ClassVar[str]
-    """What the folder is, for messages, with what makes one."""
     REMEDY: ClassVar[str]
-    """What to do about a damaged folder."""
 
     files: Annotated[dict[Text, tuple[Count, Text]], AfterValidator(_inside)]
     """Size in bytes and checksum of the other files, by path in the folder."""
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read and check the record of a folder; of the other files, nothing is read.
-
-        Raises:
-            InputError: the folder has no such record, or it is damaged.
-        """
+        """Read and check the record of a folder; of the other files, nothing is read."""
         path = folder / cls.FILE
         if not path.is_file():
             raise InputError(f"{folder} is not {cls.KIND}")
@@ -202,9 +153,43 @@ class Record(Entry):
         write_json(folder / self.FILE, self.model_dump(), seal=True)
         return self
 
-    def checksums(self, folder: Path) -> Sealed:
-        """Of the other files of the folder of this record."""
-        return Sealed(folder, self.REMEDY, self.files)
+    def require(self, folder: Path, *names: str, small: int = -1) -> None:
+        """Check size and content of `names` that are listed; without any, sizes, and small files.
+
+        Raises:
+            InputError: the first file that is missing or has another content.
+        """
+        for name in names or self.files:
+            if name not in self.files:
+                continue
+            if fault := self._find_fault(folder, name, bool(names) or self.files[name][0] <= small):
+                where = folder / name
+                raise InputError(f"{where} {fault}; restore the file, or {self.REMEDY}")
+
+    def faults(self, folder: Path) -> Iterator[tuple[str, str]]:
+        """Read every file; yields (path in the folder, what is wrong with it)."""
+        from concurrent.futures import ThreadPoolExecutor  # only to verify everything
+
+        with ThreadPoolExecutor(_THREADS) as threads:
+            faults = threads.map(partial(self._find_fault, folder), self.files)
+            yield from (pair for pair in zip(self.files, faults, strict=True) if pair[1])
+
+    def strangers(self, folder: Path) -> list[str]:
+        """Files of the folder that are not listed, without locks and scratch."""
+        return sorted(set(_names(folder)) - self.files.keys())
+
+    def _find_fault(self, folder: Path, name: str, content: bool = True) -> str:
+        path, (stated, checksum) = folder / name, self.files[name]
+        try:
+            if not path.is_file():
+                return "is not a regular file" if path.exists() else "is missing"
+            if (size := path.stat().st_size) != stated:
+                kind = "truncated" if size < stated else "grown"
+                return f"is {kind}: {size:,} of {stated:,} bytes"
+            same = not content or file_checksum(path) == checksum
+            return "" if same else "has another content than was written"
+        except OSError as error:
+            return f"cannot be read ({explain_os_error(error)})"
 
 
 def _first_fault(error: ValidationError, path: Path, remedy: str) -> InputError:

@@ -122,11 +122,9 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
 
     `count` is the number of rows of this process that its loss is a mean of.
     """
-    of_some = [parameter for parameter in parameters if parameter.grad is not None]
-    tables = [parameter for parameter in of_some if parameter.grad.is_sparse]  # type: ignore[union-attr]
-    dense = [p.grad for p in of_some if p.grad is not None and not p.grad.is_sparse]
-    device = of_some[0].device
-    total = torch.tensor(float(count), device=device)
+    gradients = [(each, each.grad) for each in parameters if each.grad is not None]
+    dense = [grad for _, grad in gradients if not grad.is_sparse]
+    total = torch.tensor(float(count), device=gradients[0][1].device)
     # One message takes less time than one for every gradient.
     message = torch.cat([total.view(1), *((grad * total).flatten() for grad in dense)])
     distributed.all_reduce(message)
@@ -134,9 +132,9 @@ def average_gradients(parameters: Iterable[nn.Parameter], count: float) -> None:
     parts = torch.split(message[1:], [grad.numel() for grad in dense])
     for grad, part in zip(dense, parts, strict=True):
         grad.copy_(part.view_as(grad) / whole)
-    for table in tables:
-        assert table.grad is not None
-        table.grad = _joint_rows(table.grad.coalesce(), total / whole)
+    for table, grad in gradients:
+        if grad.is_sparse:
+            table.grad = _joint_rows(grad.coalesce(), total / whole)
 
 
 def _joint_rows(gradient: Tensor, weight: Tensor) -> Tensor:

@@ -205,7 +205,6 @@ class _Training:
             self._resume()
 
     def _resume(self) -> None:
-        """Read what `save` wrote."""
         tensors, counters = load_tensors(self._last)
         state: dict[int, dict[str, Tensor]] = {}
         means = {name: tensors.pop(name) for name in [*tensors] if name.startswith(_AVERAGE)}
@@ -377,10 +376,7 @@ class WeightAverage:
         self._when: dict[str, Tensor] = {}  # `_log` at the last average of each row of a table
 
     def before_step(self) -> dict[str, Tensor]:
-        """Bring the averages of rows that the next step moves up to date; returns them by table.
-
-        To be called once gradients are known, and before weights move.
-        """
+        """Bring the averages of rows that the gradients will move up to date; returns the rows."""
         moved = {}
         for name, parameter in self._gradients.items():
             gradient = parameter.grad
@@ -439,10 +435,7 @@ class WeightAverage:
 def _averages(
     tensors: Mapping[str, Tensor], weights: Mapping[str, Tensor], counters: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """Averages by the names of their weights, every row of a table brought up to date.
-
-    `tensors` and `counters` are of `WeightAverage.state`; others are ignored.
-    """
+    """Averages of `WeightAverage.state` by names of weights, every row brought up to date."""
     means = {}
     for name, table in weights.items():
         mean, when = (tensors.get(f"{_AVERAGE}{name}{end}") for end in ("", _WHEN))
@@ -455,5 +448,5 @@ def _averages(
 
 def _rested(means: Tensor, weights: Tensor, log_shares: Tensor) -> Tensor:
     """Averages of rows (M, …) that rested for steps with Σ log d = `log_shares` (M,)."""
-    share = log_shares.exp().to(means.dtype).view(-1, *[1] * (means.dim() - 1))
+    share = log_shares.exp().to(means.dtype)[(..., *[None] * (means.dim() - 1))]
     return torch.where(share < 1, torch.lerp(weights, means, share), means)

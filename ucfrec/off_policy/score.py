@@ -186,9 +186,9 @@ def _select_observations(store: EpisodeStore, trained: TrainedPolicy) -> Episode
             f"the policy was trained with observations of {trained.logged_observation_size} "
             f"numbers; those of the logs have {store.observation_size}"
         )
-    if not store.observation_size or not trained.dropped:
+    if not store.observation_size or not trained.record.dropped_observations:
         return store
-    return store.without_observation_dimensions(trained.dropped)
+    return store.without_observation_dimensions(trained.record.dropped_observations)
 
 
 def score_steps(

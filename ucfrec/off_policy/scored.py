@@ -252,7 +252,8 @@ def score_with_spark(
     assert options.reward is not None
     log = UserLog(files, columns, options.reward, options.session_by, trained.folder / ITEMS)
     with atomic_folder(out) as folder:
-        run, rule = RunOnWorkers.of(trained, checkpoint), rule or trained.rule
+        run = RunOnWorkers(trained.folder.absolute(), checkpoint, trained.fingerprint)
+        rule = rule or trained.rule
         score_part = partial(_score_part, run, folder.absolute(), memory_limit, rule, filter_seen)
         sessions = map_users(log, folder.parent, master, score_part)
         number_sessions(folder, sessions)

@@ -412,6 +412,7 @@ def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
     """What a program needs to know to use the graph."""
     rule, record, b = graph.scorer.rule, trained.record, "batch"
     length, context = graph.scorer.length, graph.scorer.policy.config.context
+    dropped = record.dropped_observations
     inputs: dict[str, tuple[str, list[str | int]]] = {
         "items": ("int64", [b, length]),
         "rewards": ("float32", [b, length]),
@@ -447,7 +448,7 @@ def _describe_graph(graph: RuleGraph, trained: TrainedPolicy) -> dict[str, Any]:
         "reward": record.reward,
         "session_by": record.session_by,
         "session_gap_ms": record.session_gap_ms,
-        **({"dropped_observations": [*trained.dropped]} if trained.dropped else {}),
+        **({"dropped_observations": [*dropped]} if dropped else {}),
         "fingerprint": record.fingerprint,
         "item_ids": trained.items.ids.tolist(),
         "user_ids": trained.user_ids.tolist(),

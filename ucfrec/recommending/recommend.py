@@ -265,7 +265,7 @@ def sessions_of(trained: TrainedPolicy, histories: Histories, length: int) -> Se
                 f"the policy was trained with observations of {expected} numbers; those of the "
                 f"histories have {size}"
             )
-        seen = torch.from_numpy(np.delete(logged, trained.dropped, axis=1))
+        seen = torch.from_numpy(np.delete(logged, trained.record.dropped_observations, axis=1))
         observations = seen.unsqueeze(1).expand(-1, trained.policy.config.context, -1)
     users = trained.users.numbers(histories.users)
     rows, rewards = histories.item_ids, histories.rewards

@@ -73,7 +73,7 @@ def recommend_with_spark(
             seed=seed,
         )
         exposed = None if exposures is None else parts[1]
-        run = RunOnWorkers.of(trained, checkpoint)
+        run = RunOnWorkers(trained.folder.absolute(), checkpoint, trained.fingerprint)
         part = _RecommendPart(run, parts[0], exposed, memory_limit, rule.hash, recommended)
         return sum(map_users(log, parts[0].parent, master, part))
 

@@ -4,7 +4,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -83,11 +83,13 @@ def resolve_config(
 
 def settings_given(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
     """Settings, in any form that `resolve_config` takes, as `{"table.field": value}`."""
-    return {f"{entry.table}.{entry.key}": entry.value for entry in _from_overrides(overrides)}
+    return {f"{table}.{key}": value for table, key, value, _ in _from_overrides(overrides)}
 
 
 def config_from_dict(values: object) -> Config:
-    """Rebuild a configuration from its `dataclasses.asdict`; errors as of `resolve_config`."""
+    """Rebuild a configuration from its `asdict`, or itself; errors as of `resolve_config`."""
+    if isinstance(values, Config):
+        return values
     if not isinstance(values, Mapping) or not {"policy_name", "seed"} <= values.keys():
         raise InputError("the run's configuration has no policy_name or no seed")
     tables = {**values}
@@ -95,22 +97,16 @@ def config_from_dict(values: object) -> Config:
     return _build(str(name), _from_mapping(tables, "the run's configuration"), seed)
 
 
-class _Setting(NamedTuple):
-    """One setting and its source."""
-
-    table: str
-    key: str
-    value: Any
-    source: str
+_Setting: TypeAlias = tuple[str, str, Any, str]
+"""Table, key, value and source."""
 
 
 def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
     """Build each table once, from all its settings, so that values are checked together."""
-    policy_type, seed = policy_class(policy_name), require_seed("seed", seed)
+    policy_type, sources = policy_class(policy_name), {}
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if not policy_type.augmented:
         tables["augment"]["copies"] = 0
-    sources = {}
     for table, key, value, source in (*_from_mapping(policy_type.presets, policy_name), *settings):
         tables[table][key] = value.item() if isinstance(value, np.generic) else value
         sources[f"{table}.{key}"] = source
@@ -123,7 +119,7 @@ def _build(policy_name: str, settings: Iterable[_Setting], seed: int) -> Config:
             CSGConfig(**tables["csg"]),
             AugmentConfig(**tables["augment"]),
             RuleConfig(**tables["rule"]),
-            seed,
+            require_seed("seed", seed),
         )
     except SettingError as error:
         source = ", ".join(dict.fromkeys(sources[key] for key in error.keys if key in sources))
@@ -147,7 +143,7 @@ def _from_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> Iterator[_S
             parsed = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError):
             parsed = value.strip()
-        yield _Setting(table, key, parsed, source)
+        yield table, key, parsed, source
 
 
 def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
@@ -155,9 +151,9 @@ def _from_mapping(values: Mapping[str, Any], source: str) -> Iterator[_Setting]:
         table, dot, key = str(name).partition(".")
         _require_table(table, source)
         if dot:
-            yield _Setting(table, key, value, source)
+            yield table, key, value, source
         elif isinstance(value, Mapping):
-            yield from (_Setting(table, str(key), entry, source) for key, entry in value.items())
+            yield from ((table, str(key), entry, source) for key, entry in value.items())
         else:
             raise InputError(
                 f"{source}: {table} is a table of settings; give a value for one of its fields"

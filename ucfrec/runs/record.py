@@ -28,7 +28,7 @@ from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError, damage_explained
 from ucfrec.files.atomic import read_json
-from ucfrec.files.record import RUN_RECORD, Count, Entry, Number, Record, Text
+from ucfrec.files.record import RUN_RECORD, SMALL, Count, Entry, Number, Record, Text
 from ucfrec.fitting.loop import Fit
 from ucfrec.policies.registry import BUILT_IN, policy_class, policy_names
 from ucfrec.runs.config import Config, config_from_dict
@@ -63,10 +63,6 @@ def _levels(quantiles: dict[str, float]) -> dict[str, float]:
     if not quantiles or not all(0 <= float(level) <= 1 for level in quantiles):
         raise ValueError("there are none, or one is not of a share")
     return quantiles
-
-
-def _config(value: object) -> Config:
-    return value if isinstance(value, Config) else config_from_dict(value)
 
 
 class TrainingRecord(Record):
@@ -137,12 +133,6 @@ class RuleRecord(Entry):
     """Whether the sessions of either half of the users would choose the rule, too."""
     session_end: SessionEndReport | None = None
 
-    @property
-    def simulated(self) -> tuple[float, float] | None:
-        """Return of a session under the rule in the user model, with its standard error; None for
-        a rule that was not simulated."""
-        return None if self.estimate is None else (self.estimate.value, self.estimate.error)
-
 
 class Difference(Entry):
     """What the newest rows say of a new run against the old one, by one measure."""
@@ -199,7 +189,7 @@ class RunRecord(TrainingRecord):
     """The content of `run.json`; entries of stages that have not ended are None."""
 
     library: Literal["ucfrec"] = "ucfrec"
-    config: Annotated[Config, PlainValidator(_config), PlainSerializer(asdict)]
+    config: Annotated[Config, PlainValidator(config_from_dict), PlainSerializer(asdict)]
     store: Text
     """Folder of the store when the run began."""
     policy_package: Text | None = None
@@ -253,11 +243,7 @@ class RunRecord(TrainingRecord):
 
     @property
     def name(self) -> str:
-        """Name of the method.
-
-        Followed by `-augmented` or `-no-augmentation` if the run's use of augmentation is not the
-        method's default.
-        """
+        """Name of the method, with a suffix if its use of augmentation is not the default."""
         name, augmented = self.config.policy_name, self.config.augment.augments
         if augmented == policy_class(name).augmented:
             return name
@@ -279,11 +265,7 @@ class RunRecord(TrainingRecord):
 
     @property
     def finished(self) -> Fit:
-        """The report of the policy's training.
-
-        Raises:
-            InputError: the training has not ended.
-        """
+        """The report of the policy's training, which must have ended."""
         if self.policy is None:
             raise InputError("the training of the run has not ended; train it to its end first")
         return self.policy
@@ -337,7 +319,7 @@ class RunRecord(TrainingRecord):
 def read_record(run: Path) -> RunRecord:
     """The record of a run, whose small files are compared with their checksums."""
     record = RunRecord.read(run)
-    record.checksums(run).require()
+    record.require(run, small=SMALL)
     return record
 
 
@@ -351,12 +333,6 @@ def refit_of_run(run: Path, record: RunRecord) -> RunRecord | None:
     refit = read_record(run / REFIT)
     whole = refit.policy is not None and (refit.rule is None) == (record.rule is None)
     return refit if whole else None
-
-
-def read_training(run: Path) -> TrainingRecord:
-    """The record of a run of whatever library; its other files are not looked at."""
-    record = TrainingRecord.read(run)
-    return RunRecord.read(run) if record.library == "ucfrec" else record
 
 
 def read_candidates(run: Path) -> tuple[Candidate, ...]:
@@ -403,7 +379,7 @@ def verify_run(run: Path) -> None:
     record = read_record(run)
     if record.policy is None:
         raise InputError(f"{run} cannot be verified: its training has not ended; train it again")
-    for name, fault in record.checksums(run).faults():
+    for name, fault in record.faults(run):
         raise InputError(f"{run / name} {fault}; restore the file, or train again")
     if (run / REFIT / RUN).is_file():
         verify_run(run / REFIT)

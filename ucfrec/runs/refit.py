@@ -44,12 +44,12 @@ def refit(store: EpisodeStore, first: Path, out: Path) -> RunRecord:
         raise InputError(f"{first} is not finished; train it to its end first")
     entries: dict[str, Any] = {
         "refit_of": _identity(trained),
-        "dropped_observations": trained.dropped,
+        "dropped_observations": trained.record.dropped_observations,
         "augmentation": trained.record.augmentation,
     }
     if out == first / REFIT:
         entries |= place_of(store.path, first)
-    store = drop_columns(store, trained.dropped)
+    store = drop_columns(store, trained.record.dropped_observations)
     config = trained.record.config
     steps = max(1, round(SHARE * trained.record.finished.best_step))
     warmup = min(config.train.warmup_steps, steps // 10)
@@ -73,9 +73,6 @@ def refit_within(store: EpisodeStore, run: Path) -> RunRecord:
     """`refit` a run into its own folder, which then acts by the new weights; made once.
 
     A refit of other weights than those of the run is made again.
-
-    Raises:
-        InputError: the run is not finished.
     """
     out = run / REFIT
     if (out / RUN).exists():

@@ -69,10 +69,7 @@ _SESSIONS, _HISTORY, _ITEMS = 3, 5, 5
 
 @dataclass(frozen=True)
 class SharedStages:
-    """Stages that several runs on one log have in common, made once and then copied.
-
-    Each lies in a folder of its own in `folder`; None shares nothing.
-    """
+    """Stages that several runs have in common, each in a folder in `folder`; None for none."""
 
     folder: Path | None
 
@@ -170,7 +167,6 @@ def train_run(
         shared: reward models and augmentation that runs on the same store have in common where
             their settings of these stages and their seeds agree; by default a run makes its own.
             The time of a stage is in the record of the run that made it.
-        callbacks: what is told of the training of the policy.
         initial: a run on an older state of the store, whose weights the training begins with, near
             whose rule a better one is looked for, and whose user model says which effects to fit.
 
@@ -268,14 +264,14 @@ def _augment(
         return None, run.record.augmentation
     if refit_of is not None:
         return AugmentedEpisodes.load(refit_of / AUGMENTED, run.train), run.record.augmentation
-    settings = (config.crm, config.csg, config.augment)
+    crm, csg, augment = config.crm, config.csg, config.augment
     # A policy's own view of the episodes has augmentation of its own.
     has_own_view = run.train is not run.logged
     shared = OWN if has_own_view or not run.record.return_to_go.per_session else run.shared
 
     def make() -> None:
         augmented, report = augment_episodes(
-            run.train, run.validation, *settings, out, config.seed, device
+            run.train, run.validation, crm, csg, augment, out, config.seed, device
         )
         augmented.save(out / AUGMENTED)
         write_json(out / AUGMENTATION, asdict(report))
@@ -283,7 +279,7 @@ def _augment(
     with distributed.leader_first():
         if not (out / AUGMENTATION).exists():
             inputs = _dependencies(run.train, run.validation, config.seed, device)
-            inputs["settings"] = [asdict(table) for table in settings]
+            inputs["settings"] = [asdict(table) for table in (crm, csg, augment)]
             files = (*MODELS, AUGMENTED, AUGMENTATION)
             shared.provide(inputs, augment_episodes.__module__, out, files, make)
         augmented = AugmentedEpisodes.load(out / AUGMENTED, run.train)
@@ -305,7 +301,7 @@ def _fit_user_model(run: _Inputs, initial: Path | None) -> UserModel:
 def _choose_rule(run: _Inputs, users: UserModel, initial: Path | None) -> RuleRecord:
     """Choose the decision rule: in simulated sessions, or where the log has none, by ranking."""
     trained = TrainedPolicy.load(run.out, in_training=True)
-    states, returns, config = trained.item_states, trained.returns, run.config.rule
+    states, returns, config = trained.item_states, trained.record.return_to_go, run.config.rule
     problem = Problem(
         Scorer(run.policy, trained.rule, states, returns, users.reward, users.session_end),
         users,

@@ -55,7 +55,7 @@ def train_screened(
         InputError: as `train_run` and `screen`; the run was started with another `how`; or no
             column of observed states would be left.
     """
-    if how is not None and how not in SCREENINGS:
+    if how not in (None, *SCREENINGS):
         raise InputError(f"screen is {how!r}; use one of {', '.join(SCREENINGS)}")
     screening = None
     if (out / RUN).exists():

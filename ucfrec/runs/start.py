@@ -15,7 +15,6 @@ from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.counterfactual.augmentation import CRM, require_rewards_vary
 from ucfrec.counterfactual.reward_model import INITIAL
-from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError
@@ -71,11 +70,10 @@ def require_startable(store: EpisodeStore, train: EpisodeStore, out: Path, confi
         return
     record = RunRecord.read(out)
     if not record.is_of(store.record):
+        own, other = record.fingerprint[:12], store.record.fingerprint[:12]
         raise InputError(
-            f"{out} is a run on another store ({record.store}, fingerprint "
-            f"{record.fingerprint[:12]}), not on {store.path} "
-            f"({store.record.fingerprint[:12]}), or on other item states than that has; name "
-            "another run folder"
+            f"{out} is a run on another store ({record.store}, fingerprint {own}), not on "
+            f"{store.path} ({other}), or on other item states than that has; name another folder"
         )
     started = record.config
     if not config.train.cosine and config.train.steps > started.train.steps:
@@ -110,7 +108,8 @@ def begin(
     at every step, without sessions as long as only those of bots. Of more than a million, evenly
     spaced order statistics are kept, the lowest and highest too.
     """
-    returns_to_go, source = returns_of(store, config), store.record.source
+    source = store.record.source
+    returns_to_go = config.policy.returns(source.session_by)
     package = policy_package(config.policy_name)
     entries: dict[str, Any] = {
         "files": {},
@@ -162,11 +161,6 @@ def begin(
         RunRecord.of(entries, out / RUN).seal(scratch)
 
 
-def returns_of(store: EpisodeStore, config: Config) -> ReturnToGo:
-    """What the returns-to-go of a run on `store` count."""
-    return config.policy.returns(store.record.source.session_by)
-
-
 def policy_sizes(store: EpisodeStore) -> dict[str, int]:
     """Sizes of states and actions, and of the catalogue (0 for vectors), that policies have."""
     if store.has_items:
@@ -187,7 +181,8 @@ def new_policy(train: EpisodeStore, config: Config) -> SequencePolicy:
     policy.state_mean.copy_(mean)
     policy.state_std.copy_(torch.where(std > 1e-6, std, 1.0))
     returns_to_go = train.column(schema.RETURN_TO_GO)
-    scaled_by = train.returns if returns_of(train, config).per_session else returns_to_go
+    per_session = config.policy.returns(train.record.source.session_by).per_session
+    scaled_by = train.returns if per_session else returns_to_go
     policy.return_scale.fill_(config.policy.return_scale or float(np.abs(scaled_by).max()) or 1.0)
     policy.lowest_return_to_go.fill_(float(returns_to_go.min()))
     if isinstance(policy.head, ItemHead):
@@ -247,11 +242,8 @@ def rule_to_start_from(initial: Path, new: TrainedPolicy) -> DecisionRule:
 def warm_settings(config: Config, share: float = SHARE) -> Config:
     """The settings of a warm training, of a `share` of the steps and epochs of one from scratch."""
     steps = max(1, round(share * config.train.steps))
-    train = replace(
-        config.train,
-        steps=steps,
-        warmup_steps=min(config.train.warmup_steps, steps // 10),
-        validate_every=min(config.train.validate_every, steps),
-    )
+    warmup = min(config.train.warmup_steps, steps // 10)
+    every = min(config.train.validate_every, steps)
+    train = replace(config.train, steps=steps, warmup_steps=warmup, validate_every=every)
     epochs = max(1, round(share * (config.crm.epochs or _CRM_EPOCHS)))
     return replace(config, train=train, crm=replace(config.crm, epochs=epochs))

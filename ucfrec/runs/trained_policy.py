@@ -14,7 +14,6 @@ from ucfrec.acting.policy_actor import PolicyActor
 from ucfrec.acting.scorer import Scorer
 from ucfrec.arrays import Array, Float32Array, IntArray
 from ucfrec.episodes.item_table import IdLookup
-from ucfrec.episodes.returns import ReturnToGo
 from ucfrec.episodes.states import ItemStates, TrainingCounts
 from ucfrec.episodes.store import ITEM_STATES, EpisodeStore
 from ucfrec.errors import InputError, damage_explained, warn_user
@@ -94,16 +93,17 @@ class TrainedPolicy:
             )
         _note_other_version(run, record)
         config, path = record.config, folder / "policy" / f"{checkpoint}.safetensors"
-        however_large = (ITEM_STATES, f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}")
-        record.checksums(folder).require(however_large, small=-1)
+        weights, fitted = f"policy/{path.name}", f"{REWARD_MODEL}/{FITTED}"
+        record.require(folder, ITEM_STATES, weights, fitted)  # however large
         build = partial(policy_class(config.policy_name), config.policy, record.sizes)
         with random_state_kept():
             policy = load_module(path, build, load_trained(path))
         policy.eval()
         states, models, reward_model = folder / ITEM_STATES, folder / REWARD_MODEL, None
-        if (fitted := models / FITTED).exists():
+        if (models / FITTED).exists():
+            tensors, _ = load_tensors(models / FITTED)
             build_model = partial(ItemRewardModel, record.sizes)
-            reward_model = load_module(fitted, build_model, load_tensors(fitted)[0]).eval()
+            reward_model = load_module(models / FITTED, build_model, tensors).eval()
         with damage_explained(folder / RETURNS, REMEDY):
             returns = load_tensors(folder / RETURNS)[0]["returns"]
             is_vector = returns.dim() == 1 and returns.dtype == torch.float32 and len(returns)
@@ -127,7 +127,11 @@ class TrainedPolicy:
 
     def _require_equal_sizes(self) -> None:
         """Check that the files of the run are of one catalogue and of one size of states."""
-        sizes, states, dropped = self.record.sizes, self.item_states, self.dropped
+        sizes, states, dropped = (
+            self.record.sizes,
+            self.item_states,
+            self.record.dropped_observations,
+        )
         most = self.record.observation_size + len(dropped)
         if list(dropped) != sorted({*dropped}) or (dropped and dropped[-1] >= most):
             raise InputError(
@@ -164,8 +168,7 @@ class TrainedPolicy:
 
     @cached_property
     def fingerprint(self) -> str:
-        """12 hexadecimal digits that tell trained runs apart: a hash of the data, the configuration
-        and the checksums of the weights."""
+        """A hash of data, configuration and weights that tells trained runs apart."""
         weights = {name: seal for name, seal in self.record.files.items() if "safetensors" in name}
         of = {"data": self.record.fingerprint, "config": self.record.settings, "weights": weights}
         return config_hash(of)
@@ -182,31 +185,17 @@ class TrainedPolicy:
         return IdLookup(self.user_ids)
 
     @property
-    def dropped(self) -> tuple[int, ...]:
-        """Columns of the logged observation that the policy does not see, ascending."""
-        return self.record.dropped_observations
-
-    @property
     def logged_observation_size(self) -> int:
         """Columns that observations must have; 0 if the policy sees none."""
         size = self.record.observation_size
-        return size and size + len(self.dropped)
-
-    @property
-    def returns(self) -> ReturnToGo:
-        """What the returns-to-go of the training counted."""
-        return self.record.return_to_go
+        return size and size + len(self.record.dropped_observations)
 
     def training_store(self) -> EpisodeStore | None:
         """The store that the run was trained on; see `store_of`."""
         return store_of(self.folder, self.record)
 
     def require_store(self, remedy: str) -> EpisodeStore:
-        """`training_store`.
-
-        Raises:
-            InputError: it is gone, changed or damaged; the message ends with `remedy`.
-        """
+        """`training_store`; an `InputError` that ends with `remedy` if it is gone or changed."""
         store = self.training_store()
         if store is None:
             raise InputError(
@@ -235,9 +224,15 @@ class TrainedPolicy:
         if self._kept.get("weights") != weights:
             # The one before goes first, for its memory.
             self._kept.clear()
-            states, end = self.item_states, self.session_end
-            scorer = Scorer(self.policy, rule, states, self.returns, self.reward_model, end)
-            self._kept.update(scorer=scorer, weights=weights)
+            self._kept["weights"] = weights
+            self._kept["scorer"] = Scorer(
+                self.policy,
+                rule,
+                self.item_states,
+                self.record.return_to_go,
+                self.reward_model,
+                self.session_end,
+            )
         kept: Scorer = self._kept["scorer"]
         return kept.under(rule)
 
@@ -276,7 +271,7 @@ class TrainedPolicy:
             self.item_ids if item_numbers is None else item_numbers,
             self.user_ids,
             seed,
-            self.dropped,
+            self.record.dropped_observations,
         )
 
 
@@ -310,11 +305,6 @@ class RunOnWorkers:
     folder: Path
     checkpoint: str
     fingerprint: str
-
-    @classmethod
-    def of(cls, trained: TrainedPolicy, checkpoint: str) -> "RunOnWorkers":
-        """The policy that was loaded with this checkpoint."""
-        return cls(trained.folder.absolute(), checkpoint, trained.fingerprint)
 
     @lru_cache(maxsize=1)  # noqa: B019
     def load(self) -> TrainedPolicy:

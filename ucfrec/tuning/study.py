@@ -26,7 +26,6 @@ from ucfrec.provenance import config_hash
 from ucfrec.reporting.tables import markdown_table
 from ucfrec.runs.config import Config
 from ucfrec.runs.run import SharedStages, train_run
-from ucfrec.runs.start import returns_of
 from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec.tuning.space import POLICY, Search
 
@@ -57,12 +56,12 @@ def measure_run(trained: TrainedPolicy, store: EpisodeStore, metric: str, k: int
     """
     if metric == VALUE:
         rule = trained.record.rule
-        if rule is None or rule.simulated is None:
+        if rule is None or rule.estimate is None:
             raise InputError(
                 "the decision rule of this training is not selected in simulated sessions, so "
                 f"there is no estimated value; {_OTHER_METRICS}"
             )
-        return rule.simulated[0]
+        return rule.estimate.value
     validation = store.split("validation")
     users = validation.episode_values(schema.USER)
     period = Period.of(validation, users)
@@ -114,7 +113,8 @@ def tune(plan: Plan, trials: int, workers: int = 1) -> "Study":
     store = EpisodeStore.open(plan.store)
     for policy in plan.search.policies if plan.metric == VALUE else ():
         config = plan.search.config(policy, {})
-        if not (store.has_items and config.rule.choose and returns_of(store, config).per_session):
+        returns = config.policy.returns(store.record.source.session_by)
+        if not (store.has_items and config.rule.choose and returns.per_session):
             raise InputError(
                 f"{store.path}: {policy} has no estimated value there, because its decision rule "
                 f"is not selected in simulated sessions; {_OTHER_METRICS}"

@@ -93,7 +93,7 @@ def update_run(
     grown = store or out.with_name(out.name + STORE_SUFFIX)
     with lock_path(grown, "updated"):
         counts = append_logs(store_before.path, paths, grown, mapping, options.append)
-    opened = drop_columns(EpisodeStore.open(grown), trained.dropped)
+    opened = drop_columns(EpisodeStore.open(grown), trained.record.dropped_observations)
     full = trained.record.config  # as a training from scratch had it
     if trained.record.update is not None:
         full = config_from_dict(trained.record.update.settings_from_nothing)
@@ -111,18 +111,17 @@ def update_run(
         appended={name: counts[name] for name in _COUNTS}
         | {"not_newer": counts["dropped"]["clock_out_of_range"]},
     )
-    entries = {"update": update, "dropped_observations": trained.dropped}
+    entries = {"update": update, "dropped_observations": trained.record.dropped_observations}
     record = train_run(opened, out, config, entries, initial=run)
     assert record.update is not None
     if record.update.verdict is None:
         # The drift of the new rows and the verdict.
-        first = opened.n_episodes - record.update.episodes
-        added = opened.select(np.arange(first, opened.n_episodes))
+        added = opened.select(np.arange(opened.n_episodes)[-record.update.episodes :])
         training, seed = store_before.split("train"), config.seed
         changes = measure_drift(trained, training, added, counts, seed)
-        is_newest = opened.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
-        newest = opened.select(np.flatnonzero(is_newest))
-        earlier = opened.select(np.flatnonzero(~is_newest))
+        split = opened.episode_values(schema.SPLIT)
+        newest = opened.split("test")
+        earlier = opened.select(np.flatnonzero(split != schema.SPLITS.index("test")))
         users = newest.episode_values(schema.USER)
         seen = UserRows.of(newest, users, earlier) if options.filter_seen else None
         new, acting = TrainedPolicy.load(out, split=True), TrainedPolicy.load(trained.folder)

@@ -99,12 +99,8 @@ def describe(verdict: UpdateVerdict) -> str:
 def _judge_items(
     trained: TrainedPolicy, view: EpisodeStore, seen: UserRows | None
 ) -> tuple[Float64Array, Float64Array]:
-    """What a run makes of N logged items, in one pass over a view whose unknown items are −1.
-
-    Returns:
-        (N,) probability under the run's rule, and (N,) 1 / log2(1 + rank), 0 of items that are not
-        among the first ten; both 0 of items that it does not know.
-    """
+    """Of N logged items, (N,) probability under a run's rule, and (N,) 1 / log2(1 + rank) among the
+    first ten; 0 of others, and of items that it does not know, which are −1."""
     probabilities, gains = [], []
     for batch in score_steps(trained, view, None, seen):
         column, unknown = batch.items.clamp(min=0).unsqueeze(1), batch.items < 0
@@ -173,28 +169,20 @@ def stability_index(old: Array, new: Array) -> float:
 
 
 def popularity_index(old: Array, new: Array) -> float:
-    """`stability_index` of items in groups of about equal old popularity.
-
-    Args:
-        old: (n_items,) training steps that showed each item.
-        new: (n_items,) of the new rows.
-    """
+    """`stability_index` of steps that showed each item (n_items,), in groups of about equal old
+    popularity."""
     order = np.argsort(-old, kind="stable")
     more_popular = np.cumsum(old[order]) - old[order]
     group = np.minimum(_GROUPS * more_popular // max(old.sum(), 1), _GROUPS - 1).astype(np.int64)
-    return stability_index(
-        np.bincount(group, old[order], _GROUPS), np.bincount(group, new[order], _GROUPS)
-    )
+    counts = [np.bincount(group, items[order], _GROUPS) for items in (old, new)]
+    return stability_index(counts[0], counts[1])
 
 
 def reward_index(old: Float64Array, new: Float64Array) -> float:
     """`stability_index` of rewards in groups between deciles of the old ones."""
     edges = np.unique(np.quantile(old, np.linspace(0, 1, _GROUPS + 1)[1:-1], method="lower"))
-    old_counts, new_counts = (
-        np.bincount(np.searchsorted(edges, rewards, side="left"), minlength=len(edges) + 1)
-        for rewards in (old, new)
-    )
-    return stability_index(old_counts, new_counts)
+    counts = [np.bincount(np.searchsorted(edges, x), None, len(edges) + 1) for x in (old, new)]
+    return stability_index(counts[0], counts[1])
 
 
 def measure_drift(

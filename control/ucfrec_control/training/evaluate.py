@@ -253,7 +253,7 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
     Returns:
         `loss` with the logged states, and `loss_at_zero` with every distractor fixed to 0.
     """
-    dropped = trained.dropped
+    dropped = trained.record.dropped_observations
     _, validation = training_views(drop_columns(store, dropped))
     generator = np.random.default_rng(0)
     sources = trained.record.data.others.get("distractors", [])

@@ -70,8 +70,8 @@ def _training_metrics(record: RunRecord) -> dict[str, Any]:
         "train_wall_time_s": record.wall_time_s,
         "validation_loss": record.finished.best_validation,
     }
-    if record.rule is not None and (value := record.rule.simulated) is not None:
-        metrics |= {"estimated_value": value[0], "estimated_value_error": value[1]}
+    if record.rule is not None and (of := record.rule.estimate) is not None:
+        metrics |= {"estimated_value": of.value, "estimated_value_error": of.error}
     if (augmentation := record.augmentation) is None:
         return metrics
     return metrics | {

@@ -238,7 +238,7 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     assert screening is not None
     flagged = tuple(screening.flagged)
     assert {tuple(row.details["screening"]) for row in rows["ucf-dropped"]} == {flagged}
-    assert TrainedPolicy.load(run).dropped == flagged
+    assert TrainedPolicy.load(run).record.dropped_observations == flagged
 
 
 def test_tables_of_rows_at_hand_are_shown_without_measuring(

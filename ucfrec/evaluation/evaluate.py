@@ -176,10 +176,11 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
     later = np.repeat(starts + lengths, lengths) - places - 1
     first = np.repeat(places, later)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    one, other = items[first], items[second]
-    shared = (incidence[one] & incidence[other]).sum(axis=1)
-    either = (incidence[one] | incidence[other]).sum(axis=1)
-    distances = np.where(one == other, 0.0, 1.0 - shared / np.maximum(either, 1))
+    earlier_item, later_item = items[first], items[second]
+    shared = (incidence[earlier_item] & incidence[later_item]).sum(axis=1)
+    either = (incidence[earlier_item] | incidence[later_item]).sum(axis=1)
+    distances = 1.0 - shared / np.maximum(either, 1)
+    distances[earlier_item == later_item] = 0.0
     owner = np.searchsorted(starts, first, side="right") - 1
     total = np.bincount(owner, weights=distances, minlength=len(starts))
     pairs = lengths * (lengths - 1) / 2

@@ -239,34 +239,33 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
     shown = ranked.top == period.items[:, None]
     hit = shown.any(axis=1)
     gain = (shown / np.log2(2 + np.arange(shown.shape[1]))).sum(axis=1)
-
     every = np.ones(len(owner))
     liked = period.liked.astype(np.float64)
     counted = np.bincount(period.items, minlength=period.n_items)
     rates = np.bincount(period.items, liked, period.n_items)
     with np.errstate(invalid="ignore"):
         rates = np.append(rates / counted, np.nan)[ranked.top]  # −1: no item
-    known = (~np.isnan(rates)).sum(1)
+    n_known = (~np.isnan(rates)).sum(1)
     # Of each item that a user liked: whether it is recommended at the user's first step.
-    wanted = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
+    liked_pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
     first = np.unique(owner, return_index=True)[1]
-    found = (ranked.top[first[wanted[0]]] == wanted[1][:, None]).any(axis=1)
-    n_liked = np.bincount(wanted[0], minlength=len(users))
-    recalled = np.bincount(wanted[0], found, len(users)) / np.maximum(n_liked, 1)
+    in_top = (ranked.top[first[liked_pairs[0]]] == liked_pairs[1][:, None]).any(axis=1)
+    n_liked = np.bincount(liked_pairs[0], minlength=len(users))
+    recalled = np.bincount(liked_pairs[0], in_top, len(users)) / np.maximum(n_liked, 1)
     by_step = {
         "hit_rate_shown": (hit, every),
         "ndcg_shown": (gain, every),
         "hit_rate_liked": (hit * liked, liked),
         "ndcg_liked": (gain * liked, liked),
-        "item_rate": (np.nansum(rates, axis=1), known),
-        "known": (known, (ranked.top >= 0).sum(1)),
+        "item_rate": (np.nansum(rates, axis=1), n_known),
+        "known": (n_known, (ranked.top >= 0).sum(1)),
     }
     sums = {
         "recall_liked": (recalled, (n_liked > 0).astype(np.float64)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
     }
     for name, values in by_step.items():
-        above, below = (np.bincount(owner, each, len(users)).astype(np.float64) for each in values)
+        above, below = (np.bincount(owner, column).astype(np.float64) for column in values)
         sums[name] = above, below
     return {name: sums[name] for name in MEASURES}
 

@@ -235,7 +235,7 @@ def tune(
 ) -> float:
     """The parameter of least estimated mean squared error, of weights, r − q and v (S,)."""
     shrunk = {parameter: shrink(weights, parameter) for parameter in parameters}
-    return min(shrunk, key=lambda each: mean_squared_error(weights, shrunk[each], left, value))
+    return min(shrunk, key=lambda most: mean_squared_error(weights, shrunk[most], left, value))
 
 
 def mean_squared_error(

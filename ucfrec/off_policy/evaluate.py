@@ -286,10 +286,10 @@ def make_report(
     judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
     del judged["estimator"], judged["reasons"]
 
-    found = {"R_cum": estimates, "R_step": {} if per_step is None else per_step.estimates}
+    by_metric = {"R_cum": estimates, "R_step": {} if per_step is None else per_step.estimates}
 
     def make_row(metric: str, name: str) -> ResultRow:
-        result = found[metric][name]
+        result = by_metric[metric][name]
         table, units = _TABLES[metric]
         row = ResultRow(
             suite=SUITE,
@@ -331,7 +331,7 @@ def make_report(
         user=None if weighable is None else weighable.user,
         terms=terms,
         per_step=per_step,
-        step_rows=[make_row("R_step", name) for name in found["R_step"]],
+        step_rows=[make_row("R_step", name) for name in by_metric["R_step"]],
     )
 
 

@@ -201,12 +201,12 @@ def score_steps(
             query = scorer.query(sessions, windows)
             excluded = None
             if seen is not None:
-                rows, before = seen.seen(numbers)
-                pairs = np.unique((rows * n_items + before)[before < n_items])
-                rows, before = np.divmod(pairs, n_items)
+                rows, seen_items = seen.seen(numbers)
+                pairs = np.unique((rows * n_items + seen_items)[seen_items < n_items])
+                rows, seen_items = np.divmod(pairs, n_items)
                 # A step that would have no item left excludes none.
                 left = np.bincount(rows, minlength=len(numbers))[rows] < n_items
-                excluded = torch.from_numpy(rows[left]), torch.from_numpy(before[left])
+                excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
             scores = scorer.scores_of(query, excluded, shown)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
@@ -301,10 +301,10 @@ def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
-        known = np.ones(logged.n_episodes, dtype=bool)
+        in_training = np.ones(logged.n_episodes, dtype=bool)
         if record.refit_of is None:
-            known = logged.episode_values(schema.SPLIT) != schema.SPLITS.index("test")
-        return float(known[logged.all_steps()[0]].mean())
+            in_training = logged.episode_values(schema.SPLIT) != schema.SPLITS.index("test")
+        return float(in_training[logged.all_steps()[0]].mean())
     return share_of_rows_seen(trained, np.concatenate(list(_hash_store(logged))))
 
 

@@ -78,7 +78,7 @@ class Selection:
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
         columns: dict[str, Any] = {"selection": self.headline}
-        standing = next((one for one in self.standings if one.name == name), None)
+        standing = next((place for place in self.standings if place.name == name), None)
         if standing is not None:
             columns |= {"band_low": standing.low, "band_high": standing.high}
             columns |= {"probability_best": standing.probability_best, "rank": standing.rank}

@@ -58,6 +58,11 @@ def test_named_entries_are_observed_in_their_order() -> None:
     np.testing.assert_array_equal(observations[:, 2:], np.eye(LENGTH + 1)[[0, 0, 0]])
     swapped, _ = environment("Discrete", 3, ("step", "secret")).reset(seed=0)
     np.testing.assert_array_equal(swapped, np.roll(observations, LENGTH + 1, axis=1))
+    # Neighbouring seeds share no session.
+    env = environment("Discrete", 50, ("secret",))
+    secrets = [env.reset(seed=seed)[0][:, 0] for seed in (0, 1, 0)]
+    np.testing.assert_array_equal(secrets[0], secrets[2])
+    assert not set(secrets[0]) & set(secrets[1])
 
 
 def test_without_names_a_dict_is_not_observed_and_a_category_is_one_hot() -> None:
@@ -82,13 +87,6 @@ def test_sessions_end_in_the_step_that_ends_them() -> None:
         np.testing.assert_array_equal(step.observations.argmax(1), LENGTH - 1)
     rewards = np.concatenate([step.rewards for step in steps])
     assert played.returns.sum() == rewards.sum()
-
-
-def test_neighbouring_seeds_share_no_session() -> None:
-    env = environment("Discrete", 50, ("secret",))
-    secrets = [env.reset(seed=seed)[0][:, 0] for seed in (0, 1, 0)]
-    np.testing.assert_array_equal(secrets[0], secrets[2])
-    assert not set(secrets[0]) & set(secrets[1])
 
 
 def test_users_are_passed_on_and_must_be_numbers() -> None:
@@ -137,6 +135,10 @@ def test_a_missing_module_and_options_of_other_environments_are_refused() -> Non
         GymnasiumEnvironment("not_there:X-v0", 1)
     with pytest.raises(InputError, match="are for gymnasium:ID; leave them out for synthetic-cat"):
         Environment("synthetic-catalog", observe=("step",)).simulator()
+    name = f"gymnasium:{MODULE}:ucfrec-test/Box-v0"
+    vectors = Environment(name, observe=("secret",), item_features="vectors").simulator()
+    with pytest.raises(InputError, match="takes vectors, not items"):
+        vectors.make(1, None)
 
 
 def test_from_the_environment_to_an_evaluation_on_the_command_line(
@@ -182,12 +184,9 @@ def test_a_environment_that_shows_nothing_is_logged_without_observations(
     assert not (logs / "items.parquet").exists()
 
 
-ID = "tests.support.gymnasium_environments:ucfrec-test/Discrete-v0"
-
-
 @pytest.fixture
 def env() -> gymnasium.Env[Any, Any]:
-    return gymnasium.make(ID)
+    return gymnasium.make(f"{MODULE}:ucfrec-test/Discrete-v0")
 
 
 def test_features_are_read_from_attributes_arrays_and_tables(
@@ -229,10 +228,3 @@ def test_unusable_features_are_refused(env: gymnasium.Env[Any, Any], tmp_path: P
     refused(path, "has 4 rows; give each item_id from 0 to 3 once")
     pq.write_table(pa.table({"item": [0, 1, 2, 3]}), path)
     refused(path, "has no whole numbers as item_id")
-
-
-def test_environments_of_vectors_have_no_items() -> None:
-    name = ID.replace("Discrete", "Box")
-    environment = Environment(f"gymnasium:{name}", observe=("secret",), item_features="vectors")
-    with pytest.raises(InputError, match="takes vectors, not items"):
-        environment.simulator().make(1, None)

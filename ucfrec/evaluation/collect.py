@@ -46,15 +46,7 @@ def collect(
     the simulator's feedback, the observation unless it is empty, and the propensity if it is known;
     sessions simulated in parallel are interleaved), `items.parquet` if the environment describes
     its items, and `collect.json`, the record of the run. Sessions start 60 s apart and their steps
-    1 s apart. Memory is bounded, because rows are written one row group at a time.
-
-    Args:
-        env: made by `simulator`; environment i is seeded with `seed` + i.
-        sessions: at least 1.
-        env_name, behavior: names in the record.
-
-    Returns:
-        Returns and lengths of the sessions, ordered by session id.
+    1 s apart. `env` is made by `simulator`, and its environment i seeded with `seed` + i.
 
     Raises:
         InputError: `sessions` is below 1, or `out` exists.
@@ -97,12 +89,11 @@ class _SessionLog:
 
     def record(self, step: Step) -> None:
         """Add one step of all live sessions."""
+        number, ends = self._played[step.rows], step.terminated | step.truncated
         self._steps.append(step)
-        self._numbers.append(self._played[step.rows])
-        self._played[step.rows] = np.where(
-            step.terminated | step.truncated, 0, self._played[step.rows] + 1
-        )
-        self._rows += len(step.rows)
+        self._numbers.append(number)
+        self._played[step.rows] = np.where(ends, 0, number + 1)
+        self._rows += len(number)
         if self._rows >= ROWS_PER_GROUP:
             self._flush()
 
@@ -131,11 +122,12 @@ class _SessionLog:
             USER_ID: pa.array(np.concatenate(users).astype(np.int64)),
             SESSION_ID: pa.array(session.astype(np.int64)),
             TIMESTAMP: pa.array(start + np.concatenate(self._numbers) * STEP_MS),
-            (ACTION if self._items is None else ITEM_ID): (
-                _lists(actions) if self._items is None else pa.array(self._items[actions])
-            ),
-            self._feedback: pa.array(np.concatenate([step.rewards for step in steps])),
         }
+        if self._items is None:
+            columns[ACTION] = _lists(actions)
+        else:
+            columns[ITEM_ID] = pa.array(self._items[actions])
+        columns[self._feedback] = pa.array(np.concatenate([step.rewards for step in steps]))
         observations = np.concatenate([step.observations for step in steps])
         if observations.shape[1]:
             columns[OBSERVATION] = _lists(observations)
@@ -155,10 +147,7 @@ def collect_store(
     environment: Environment, folder: Path, sessions: int, seed: int, behavior: str | None = None
 ) -> Path:
     """Collect logs in `folder/logs` and prepare `folder/store`; existing folders are reused.
-
-    Args:
-        seed: of the environments and of the behavior policy.
-        behavior: one of the simulator's built-in policies; None for its `logging_behavior`.
+    `behavior` is a built-in policy of the simulator; None for its `logging_behavior`.
     """
     logs, store = folder / "logs", folder / "store"
     simulator = environment.simulator()

@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.rollout import Actor, Episodes, rollout
+from ucfrec.acting.rollout import Actor, Episodes, Step, rollout
 from ucfrec.arrays import BoolArray, IntArray
 from ucfrec.episodes.item_table import IdLookup
 from ucfrec.episodes.states import TrainingCounts
@@ -61,16 +61,9 @@ def evaluate_policy(
     seed: int,
     rule: DecisionRule | None = None,
 ) -> ResultRow:
-    """Result row of a trained policy.
-
-    Args:
-        name: name of the policy in the row.
-        seed: environment i is seeded with `seed` + i; also of the draws of the rule.
-        rule: the decision rule; None for the run's own.
-
-    Raises:
-        InputError: the policy's actions or observations do not fit this environment.
-    """
+    """Result row of a trained policy, under that name; InputError if its actions or observations do
+    not fit this environment. `seed` is of the draws, and environment i is seeded with `seed` + i;
+    without a rule, the run's own decides."""
     env = environment.simulator().started(min(episodes, SIDE_BY_SIDE), environment.folder)
     numbers, rule = _item_numbers(environment, env, trained), rule or trained.rule
     actor = trained.actor(env.num_envs, rule, numbers, seed)
@@ -100,14 +93,12 @@ def _row(
 ) -> ResultRow:
     start = time.perf_counter()
     recommended: list[tuple[IntArray, IntArray]] = []
-    played = rollout(
-        env,
-        actor,
-        episodes,
-        seed,
-        lambda step: recommended.append((step.episodes, step.actions)),
-        f"{columns['method']} in {environment.name}",
-    )
+
+    def note(step: Step) -> None:
+        recommended.append((step.episodes, step.actions))
+
+    describe = f"{columns['method']} in {environment.name}"
+    played = rollout(env, actor, episodes, seed, note, describe)
     seconds = time.perf_counter() - start
     variety: Mapping[str, float | None] = {}
     if isinstance(env.single_action_space, spaces.Discrete):
@@ -159,13 +150,9 @@ def _item_numbers(environment: Environment, env: Any, trained: TrainedPolicy) ->
 
 
 def session_metrics(played: Episodes) -> dict[str, float]:
-    """Metrics of simulated episodes; rewards and returns in reward units.
-
-    Returns:
-        `R_cum`: mean episode return (called R_tra in some papers). `R_avg_pooled`: sum of all
-        rewards divided by the number of all steps (called R_each in some papers). `R_avg_episode`:
-        mean over episodes of the episode's mean reward per step. `length`: mean number of steps of
-        an episode.
+    """Metrics of simulated episodes, in reward units: `R_cum`, the mean return (R_tra in some
+    papers), `R_avg_pooled`, all rewards by all steps (R_each in some), `R_avg_episode`, the mean of
+    episodes' mean rewards per step, and `length`, the mean number of steps.
     """
     returns, lengths = played.returns, played.lengths
     return {
@@ -182,16 +169,18 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
 
     `episodes` (M,) are sorted indices, `items` (M,) the items of these steps; M is at least 1.
     """
-    _, starts, lengths = np.unique(episodes, return_index=True, return_counts=True)
+    starts = np.unique(episodes, return_index=True)[1]
+    lengths = np.diff(starts, append=len(episodes))
     # Pairs of all episodes are enumerated at once: each step with all later ones of its episode.
-    last = np.repeat(starts + lengths, lengths)
-    later = last - np.arange(len(items)) - 1
-    first = np.repeat(np.arange(len(items)), later)
+    places = np.arange(len(items))
+    later = np.repeat(starts + lengths, lengths) - places - 1
+    first = np.repeat(places, later)
     second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    one, other = items[first], items[second]
-    shared = (incidence[one] & incidence[other]).sum(axis=1)
-    either = (incidence[one] | incidence[other]).sum(axis=1)
-    distances = np.where(one == other, 0.0, 1.0 - shared / np.maximum(either, 1))
+    earlier_item, later_item = items[first], items[second]
+    shared = (incidence[earlier_item] & incidence[later_item]).sum(axis=1)
+    either = (incidence[earlier_item] | incidence[later_item]).sum(axis=1)
+    distances = 1.0 - shared / np.maximum(either, 1)
+    distances[earlier_item == later_item] = 0.0
     owner = np.searchsorted(starts, first, side="right") - 1
     total = np.bincount(owner, weights=distances, minlength=len(starts))
     pairs = lengths * (lengths - 1) / 2
@@ -199,15 +188,9 @@ def diversity(episodes: IntArray, items: IntArray, incidence: BoolArray) -> floa
 
 
 def dominant_tags(incidence: BoolArray, positives: IntArray) -> BoolArray:
-    """Dominant tags (n_tags,): the most frequent ones that together cover at most 80%.
-
-    The most frequent one is always dominant, if it counts at all.
-
-    Args:
-        incidence: (n_items, n_tags).
-        positives: (n_items,) numbers of positive interactions in the training log; each counts
-            once for every tag of its item.
-    """
+    """Dominant tags (n_tags,) of items with tags (n_items, n_tags) and positive interactions in the
+    training log (n_items,): the most frequent ones that together cover at most 80%, and the most
+    frequent one, if it counts at all."""
     counts = positives @ incidence.astype(np.int64)
     order = np.argsort(-counts, kind="stable")
     dominant = np.empty(len(counts), dtype=np.bool_)
@@ -225,11 +208,8 @@ def variety_columns(
     """The `COLUMNS`; a metric whose inputs are missing is None.
 
     Diversity (tag Jaccard) and dominance need a catalogue with tags; novelty and dominance need
-    `counts` and `numbers`, which built-in policies do not have.
-
-    Args:
-        numbers: (items of the log,) the environment's index of each item, −1 for items that it
-            lacks.
+    `counts` and `numbers`, which built-in policies do not have: the environment's index of each
+    item of the log, −1 for none.
     """
     sessions = np.hstack(recommended)
     episodes, items = sessions[:, np.argsort(sessions[0], kind="stable")]

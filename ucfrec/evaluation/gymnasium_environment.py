@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from operator import attrgetter
+from operator import add, attrgetter
 from pathlib import Path
 from typing import Any, Final, SupportsFloat
 
@@ -39,21 +39,15 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
     Observations are vectors (O,): of a dict observation the entries `observe`, one after the other;
     any other observation as a whole, numbers as they are and categories one-hot. O is 0 where items
-    are recommended and nothing is chosen from a dict, or the observation has no fixed size; states
-    then come from the items shown.
+    are recommended and nothing is chosen from a dict, or the observation has no fixed size.
 
     Of `info`, the environment passes on `user_id`, a whole number. One that `reset` gives is that
     of the whole session, but for steps that give another. `reset(seed=s)` seeds copy i with a
     number drawn from (s, i), so that two seeds share no sessions.
 
-    Args:
-        env_id: identifier as `gymnasium.make` takes it; `module:ID` imports `module` first.
-        observe: names of the entries of a dict observation that are observed.
-
     Raises:
-        InputError: the environment cannot be made, its actions are neither items nor vectors, or
-            its observation does not have the entries `observe`. Later, if only some sessions give
-            a `user_id` when they are reset.
+        InputError: it cannot be made or played, or lacks the entries `observe`; or later, if it
+            gives only some sessions a `user_id`.
     """
 
     def __init__(self, env_id: str, num_envs: int, observe: Sequence[str] = ()) -> None:
@@ -80,8 +74,7 @@ class GymnasiumEnvironment(SyncVectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Take one item or vector as action in each session, (N,) or (N, A); see
-        `VectorEnv.step`."""
+        """Take one item or vector as action in each session, (N,) or (N, A)."""
         played = super().step(actions)
         self._require_all_users(played[-1])
         return played
@@ -97,8 +90,7 @@ class GymnasiumEnvironment(SyncVectorEnv):
 
 
 class GymnasiumCatalog(GymnasiumEnvironment):
-    """A `GymnasiumEnvironment` of items that have features, which `items` reads; InputError also
-    where the actions are vectors."""
+    """A `GymnasiumEnvironment` of items, not vectors, whose features `items` reads."""
 
     def __init__(
         self, env_id: str, num_envs: int, items: Items, observe: Sequence[str] = ()
@@ -162,8 +154,7 @@ def _actions(
 ) -> tuple[spaces.Discrete | spaces.Box, Callable[[Any], Any]]:
     """The environment's action space, and what turns its actions into the environment's."""
     if isinstance(space, spaces.Discrete):
-        start = space.start
-        return spaces.Discrete(space.n), lambda item: start + item
+        return spaces.Discrete(space.n), partial(add, space.start)
     if isinstance(space, spaces.MultiDiscrete) and space.shape == (1,):
         first = space.start
         return spaces.Discrete(space.nvec[0]), lambda item: (first + item).astype(space.dtype)
@@ -209,14 +200,10 @@ def item_table(source: str, env: gymnasium.Env[Any, Any], n_items: int) -> pa.Ta
     """The features of an environment's items: one row per action, with the column `item_id`.
 
     `source` names a file (`.npy`, `.parquet`) or else an attribute of the environment, with dots
-    for attributes of attributes. Row i of an array belongs to action i: numbers (n_items,) or
-    (n_items, D) become the column `features`, booleans (n_items, D) the column `tags`, the list of
-    the columns that are true. A Parquet file has a column `item_id` with the numbers of the
-    actions, and its other columns are kept.
-
-    Raises:
-        InputError: the file or attribute is missing, is of another kind or shape, or has numbers
-            that are not finite.
+    for attributes of attributes. Row i of an array belongs to action i: finite numbers (n_items,)
+    or (n_items, D) become the column `features`, booleans (n_items, D) the column `tags`, the list
+    of the columns that are true. A Parquet file has a column `item_id` with the numbers of the
+    actions, and its other columns are kept. InputError for anything else.
     """
     if source.endswith((".parquet", ".npy")):
         require_file(Path(source), "name another file")

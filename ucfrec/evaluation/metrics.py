@@ -2,9 +2,9 @@
 
 `recommended` has one row per item and user: `user_id`, `item_id` and `rank` (from 1), as
 `Recommender.recommend` returns it. `relevant` has the pairs `user_id`, `item_id` of what users
-liked later; a pair counts once. The definitions are those of RecTools where it has the metric, so
-that numbers can be compared. Means are over the users of `relevant` (a user without recommendations
-counts 0), or over those of `recommended` where nothing relevant is asked for.
+liked later; a pair counts once. The definitions are those of RecTools where it has the metric.
+Means are over the users of `relevant` (a user without recommendations counts 0), or over those of
+`recommended` where nothing relevant is asked for.
 """
 
 from collections.abc import Collection, Sequence
@@ -30,8 +30,7 @@ def hit_rate(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int = 10) -> 
 
     Raises:
         InputError: a column is missing, there are no rows, ids are numbers in one frame and text
-            in the other, ranks of a user are not distinct whole numbers from 1, or `k` is not one;
-            as all of these.
+            in the other, or ranks of a user are not distinct whole numbers from 1; as all of these.
     """
     return float(_hits(recommended, relevant, k).groupby(USER_ID)[_RANK].any().mean())
 
@@ -82,14 +81,8 @@ def ndcg(
 
 def gauc(scored: pd.DataFrame) -> float:
     """Probability that a liked item scores higher than another one shown to the same user, mean
-    over users weighted by rows; users with liked items only, or with none, do not count.
-
-    Args:
-        scored: `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
-
-    Raises:
-        InputError: a column is missing, there are no rows, a score is missing, or `liked` is
-            something else.
+    over users weighted by rows; users with liked items only, or with none, do not count. `scored`
+    has `user_id`, `score` (higher is better) and `liked` (true or false) of each row shown.
     """
     _require(scored, "scored", [USER_ID, "score", "liked"])
     if other := (~scored["liked"].isin([0, 1])).sum():
@@ -114,10 +107,8 @@ def coverage(recommended: pd.DataFrame, catalogue: Collection[Any], k: int = 10)
 
 def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> float:
     """Mean inverse user frequency of the `k` best, in bits: −log2 of the share of the history's
-    users who have the item, mean over a user's items and then over users.
-
-    Args:
-        history: pairs `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
+    users who have the item, mean over a user's items and then over users. `history` has the pairs
+    `user_id`, `item_id` of the past; an item that it lacks counts as one user's.
     """
     top = _top(recommended, k)
     _require(history, "history", _PAIR)
@@ -130,13 +121,8 @@ def novelty(recommended: pd.DataFrame, history: pd.DataFrame, k: int = 10) -> fl
 
 def diversity(recommended: pd.DataFrame, features: pd.DataFrame, k: int = 10) -> float:
     """Number of features in which two of a user's `k` best items differ (Hamming distance), mean
-    over pairs and then over users; a user with one item counts 0.
-
-    Args:
-        features: one row per item, `item_id` as the index.
-
-    Raises:
-        InputError: an item has no features or two rows of them, or a feature is a list.
+    over pairs and then over users; a user with one item counts 0. `features` have one row per item,
+    `item_id` as the index; InputError if an item has none or two, or a feature is a list.
     """
     top = _top(recommended, k)
     if not features.shape[1]:
@@ -174,22 +160,13 @@ def serendipity(
     items and 0 of others, mean over a user's `k` best and then over users.
 
     p_user = (n + 1 − rank) / n of n items in the catalogue, and p_any the same by the rank of the
-    item's popularity in the history; 0 for items that it lacks.
-
-    Args:
-        history: pairs `user_id`, `item_id` of the past, rows counted.
-        catalogue: all items; each counts once.
-
-    Raises:
-        InputError: the catalogue is empty or lacks a recommended item.
+    item's popularity in the rows of the history; 0 for items that it lacks. InputError if the
+    catalogue lacks a recommended item.
     """
     top = _top(recommended, k)
     n = _count_items(catalogue, top)
-    _require(relevant, "relevant", _PAIR)
-    _require(history, "history", [ITEM_ID])
-    _require_comparable(top[ITEM_ID], history[ITEM_ID], "history")
-    for name in _PAIR:
-        _require_comparable(top[name], relevant[name], "relevant")
+    _require(relevant, "relevant", _PAIR, top)
+    _require(history, "history", [ITEM_ID], top)
     popularity = history[ITEM_ID].value_counts().rank(method="dense", ascending=False)
     by_all = ((n + 1 - top[ITEM_ID].map(popularity)) / n).fillna(0.0)
     earlier = ((n + 1 - top[_RANK]) / n - by_all).clip(lower=0.0)
@@ -215,10 +192,8 @@ def _top(recommended: pd.DataFrame, k: int) -> pd.DataFrame:
 
 def _hits(recommended: pd.DataFrame, relevant: pd.DataFrame, k: int) -> pd.DataFrame:
     """One row per relevant pair, with its `rank` if it is among the `k` best, else NaN."""
-    _require(relevant, "relevant", _PAIR)
     top = _top(recommended, k)[[*_PAIR, _RANK]].drop_duplicates(_PAIR)
-    for name in _PAIR:
-        _require_comparable(recommended[name], relevant[name], "relevant")
+    _require(relevant, "relevant", _PAIR, recommended)
     return relevant[_PAIR].drop_duplicates().merge(top, on=_PAIR, how="left")
 
 
@@ -239,9 +214,7 @@ def _count_items(catalogue: Collection[Any], top: pd.DataFrame) -> int:
 
 def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> None:
     """Check that ids of `recommended` and of another frame are of one kind: 7 is not "7"."""
-    kinds = [
-        _KINDS.get(infer_dtype(np.asarray(column), skipna=True), "") for column in (ids, others)
-    ]
+    kinds = [_KINDS.get(infer_dtype(np.asarray(column)), "") for column in (ids, others)]
     if {*kinds} == {"numbers", "text"}:
         raise InputError(
             f"{ids.name} holds {kinds[0]} in recommended, but {kinds[1]} in {of_others}; convert "
@@ -249,9 +222,15 @@ def _require_comparable(ids: pd.Series, others: pd.Series, of_others: str) -> No
         )
 
 
-def _require(frame: pd.DataFrame, name: str, columns: Sequence[str]) -> None:
+def _require(
+    frame: pd.DataFrame, name: str, columns: Sequence[str], beside: pd.DataFrame | None = None
+) -> None:
+    """Check that a frame has rows and columns, of the kinds of those of `recommended`, if given."""
     absent = [column for column in columns if column not in frame]
     if absent:
         raise InputError(f"{name} has no column {', '.join(absent)}; rename the one that it is in")
     if frame.empty:
         raise InputError(f"{name} has no rows")
+    if beside is not None:
+        for column in columns:
+            _require_comparable(beside[column], frame[column], name)

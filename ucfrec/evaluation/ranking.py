@@ -20,7 +20,6 @@ from ucfrec import schema
 from ucfrec.arrays import Array, BoolArray, Float64Array, IntArray
 from ucfrec.episodes.states import LIKED, ItemStates, least_liked, liked_rewards
 from ucfrec.episodes.store import EpisodeStore, UserRows
-from ucfrec.episodes.windows import Windows
 from ucfrec.errors import InputError
 from ucfrec.logs.engine import bind, engine, explain_errors
 from ucfrec.logs.expressions import Expression
@@ -46,11 +45,7 @@ class LikedExpression:
     """A step is liked if a SQL expression over its `reward` is true; missing values are not."""
 
     def __init__(self, expression: Expression, reward: str = schema.REWARD) -> None:
-        """
-        Args:
-            expression: a truth value over the column `reward`.
-            reward: the run's; where it is a column's name, that name means the reward, too.
-        """
+        """`expression` is over the column `reward`, which the run's own name of it means, too."""
         self._expression = expression
         self._names = {schema.REWARD.casefold(): schema.REWARD}
         if reward.isidentifier():
@@ -136,11 +131,6 @@ class Steps:
     left_out: tuple[Tensor, Tensor] | None = None
     """Rows (M,) and items (M,) that may not be recommended; None to rank all items."""
 
-    def windows(self, length: int) -> Windows:
-        """Windows of `length` steps that end with each evaluated step, whose own action and reward,
-        in the last column, rankers must not read."""
-        return self.store.windows(self.episodes, self.steps, length)
-
 
 class Ranker(Protocol):
     """Scores all items of the catalogue at every step."""
@@ -158,20 +148,15 @@ class Ranked:
     """One ranker's results at N evaluated steps."""
 
     scores: Float64Array
-    """(N,) score of the shown item at its user's first evaluated step: what was known before any of
-    the user's evaluated steps. Scores at the steps themselves would depend on the very rewards that
-    they are compared by."""
+    """(N,) score of the shown item at its user's first evaluated step: scores at the steps
+    themselves would depend on the very rewards that they are compared by."""
     top: IntArray
     """(N, k) recommended items, best first; −1 where too few are left."""
 
 
 @torch.no_grad()
 def rank_steps(ranker: Ranker, later: Later, k: int) -> Ranked:
-    """Rank every step of a later log.
-
-    Args:
-        k: number of recommended items per step, at most n_items.
-    """
+    """Rank every step of a later log: `k` items, at most n_items."""
     store, n_items = later.store, len(later.store.item_states.embeddings)
     at_once = max(1, min(_STEPS_AT_ONCE, _SCORES_AT_ONCE // n_items))
     parts = []
@@ -199,7 +184,7 @@ def _first_scores(ranker: Ranker, later: Later, at_once: int) -> Float64Array:
         at = first[begin : begin + at_once]
         scores = ranker.scores(later.steps(at, filter_seen=False))
         rows = order[bounds[begin] : bounds[begin + len(at)]]
-        of_user = owner[rows] - begin if len(scores) > 1 else np.zeros(len(rows), dtype=np.int64)
+        of_user = (owner[rows] - begin) % len(scores)
         result[rows] = scores.double().numpy()[of_user, items[rows]]
     return result
 
@@ -254,32 +239,35 @@ def measure(period: Period, ranked: Ranked) -> dict[str, tuple[Float64Array, Flo
     shown = ranked.top == period.items[:, None]
     hit = shown.any(axis=1)
     gain = (shown / np.log2(2 + np.arange(shown.shape[1]))).sum(axis=1)
-
-    def sum_by_user(values: Array) -> Float64Array:
-        return np.bincount(owner, values, minlength=len(users)).astype(np.float64)
-
-    every, liked = np.ones(len(owner)), period.liked.astype(np.float64)
+    every = np.ones(len(owner))
+    liked = period.liked.astype(np.float64)
     counted = np.bincount(period.items, minlength=period.n_items)
     rates = np.bincount(period.items, liked, period.n_items)
     with np.errstate(invalid="ignore"):
         rates = np.append(rates / counted, np.nan)[ranked.top]  # −1: no item
-    known = sum_by_user((~np.isnan(rates)).sum(1))
+    n_known = (~np.isnan(rates)).sum(1)
     # Of each item that a user liked: whether it is recommended at the user's first step.
-    wanted = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
+    liked_pairs = np.unique(np.stack([owner, period.items])[:, period.liked], axis=1)
     first = np.unique(owner, return_index=True)[1]
-    found = (ranked.top[first[wanted[0]]] == wanted[1][:, None]).any(axis=1)
-    n_liked = np.bincount(wanted[0], minlength=len(users))
-    recalled = np.bincount(wanted[0], found, len(users)) / np.maximum(n_liked, 1)
-    return {
-        "hit_rate_shown": (sum_by_user(hit), sum_by_user(every)),
-        "ndcg_shown": (sum_by_user(gain), sum_by_user(every)),
-        "hit_rate_liked": (sum_by_user(hit * liked), sum_by_user(liked)),
-        "ndcg_liked": (sum_by_user(gain * liked), sum_by_user(liked)),
+    in_top = (ranked.top[first[liked_pairs[0]]] == liked_pairs[1][:, None]).any(axis=1)
+    n_liked = np.bincount(liked_pairs[0], minlength=len(users))
+    recalled = np.bincount(liked_pairs[0], in_top, len(users)) / np.maximum(n_liked, 1)
+    by_step = {
+        "hit_rate_shown": (hit, every),
+        "ndcg_shown": (gain, every),
+        "hit_rate_liked": (hit * liked, liked),
+        "ndcg_liked": (gain * liked, liked),
+        "item_rate": (np.nansum(rates, axis=1), n_known),
+        "known": (n_known, (ranked.top >= 0).sum(1)),
+    }
+    sums = {
         "recall_liked": (recalled, (n_liked > 0).astype(np.float64)),
         "gauc": group_auc(ranked.scores, period.liked, owner, len(users)),
-        "item_rate": (sum_by_user(np.nansum(rates, axis=1)), known),
-        "known": (known, sum_by_user((ranked.top >= 0).sum(1))),
     }
+    for name, values in by_step.items():
+        above, below = (np.bincount(owner, column).astype(np.float64) for column in values)
+        sums[name] = above, below
+    return {name: sums[name] for name in MEASURES}
 
 
 @dataclass(frozen=True)
@@ -331,7 +319,7 @@ def _find_ends(resampled: Float64Array) -> Float64Array:
     """Ends (2, rankers, measures) of the 95% intervals; NaN if all resampled ratios are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanquantile(resampled, [0.025, 0.975], axis=0))
+        return np.nanquantile(resampled, [0.025, 0.975], axis=0)
 
 
 def name_rankers(rankers: Sequence[Ranker]) -> dict[str, Ranker]:

@@ -15,13 +15,12 @@ from torch import Tensor
 
 from ucfrec import schema
 from ucfrec.acting.decision import DecisionRule
-from ucfrec.acting.scorer import Scorer, logged_scores, sessions_before
+from ucfrec.acting.scorer import logged_scores, sessions_before
 from ucfrec.arrays import Array
 from ucfrec.episodes.states import TrainingCounts, liked_rewards
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.evaluation.ranking import (
-    MEASURES,
     Compared,
     Later,
     LikedExpression,
@@ -82,16 +81,6 @@ class NamedRanker:
     scores: Callable[[Steps], Tensor]
 
 
-def reward_ranker(scorer: Scorer) -> NamedRanker:
-    """Ranks items by the run's reward model alone."""
-
-    def scores(steps: Steps) -> Tensor:
-        sessions = sessions_before(scorer, steps.store, steps.episodes, steps.steps)
-        return scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
-
-    return NamedRanker("reward model", scores)
-
-
 def same_for_all(name: str, items: Tensor) -> NamedRanker:
     """Ranks items by fixed scores (n_items,), the same for all users."""
     return NamedRanker(name, lambda _: items.unsqueeze(0))
@@ -111,14 +100,6 @@ def neighbour_ranker(train: EpisodeStore, popularity: Tensor) -> NamedRanker:
     return NamedRanker("item-knn", scores)
 
 
-def boosted_ranker(train: EpisodeStore, seed: int) -> NamedRanker:
-    """Ranks items by gradient-boosted clicks; see `BoostedPolicy`."""
-    policy = BoostedPolicy(BoostedConfig(context=_KNN_HISTORY + 1, dim=1), policy_sizes(train))
-    policy.start_from(train)
-    policy.make_solver(train, None, Path(), seed)()
-    return NamedRanker("boosted clicks", lambda steps: policy.act(steps.windows(_KNN_HISTORY + 1)))
-
-
 def factor_ranker(
     name: _Factors, train: EpisodeStore, popularity: Tensor, seed: int, liked_of: LikedOf
 ) -> NamedRanker:
@@ -128,7 +109,8 @@ def factor_ranker(
     from implicit.bpr import BayesianPersonalizedRanking
     from threadpoolctl import threadpool_limits
 
-    users = train.episode_values(schema.USER).astype(np.int64)[train.all_steps()[0]]
+    owners = train.episode_values(schema.USER).astype(np.int64)
+    users = owners[train.all_steps()[0]]
     items = train.column(schema.ITEM)
     liked = liked_of(train, train.column(schema.REWARD)).astype(np.float32)
     shape = (int(users.max()) + 1, len(popularity))
@@ -152,35 +134,20 @@ def factor_ranker(
     return NamedRanker(name, scores)
 
 
-def recent_rankers(
-    train: EpisodeStore, store: EpisodeStore, liked_of: LikedOf = liked_rewards
-) -> list[Ranker]:
-    """Clicks and click rate with half-lives, which the validation split of the store chooses."""
-    first, validation = store.split("train"), store.split("validation")
-    if not validation.n_episodes:
-        return []
-    rankers: list[Ranker] = []
-    for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
-        hours = kind.best_half_life(first, validation, liked_of)
-        scores = kind.scores_of(TrainingCounts.of(train, liked_of, hours))
-        rankers.append(same_for_all(f"recent {name}", scores.double()))
-    return rankers
-
-
 def baselines(
-    counts: TrainingCounts, train: EpisodeStore | None, seed: int, liked_of: LikedOf = liked_rewards
+    counts: TrainingCounts,
+    train: EpisodeStore | None,
+    seed: int,
+    liked_of: LikedOf = liked_rewards,
+    store: EpisodeStore | None = None,
 ) -> list[Ranker]:
     """Baseline rankers: random, most shown, most clicked, item click rate, item-kNN, boosted
-    clicks, ALS and BPR.
-
-    ALS and BPR are included if the package `implicit` is installed (extra `rank`).
+    clicks, ALS and BPR if the package `implicit` is installed (extra `rank`), and clicks and click
+    rate with half-lives, which the validation split of `store` chooses.
 
     Args:
-        train: the training episodes; None if their store is unavailable, which excludes all that
-            learn from single rows.
-        seed: of the random scores, boosted clicks, ALS and BPR.
-        liked_of: says which training steps were liked, for ALS and BPR; `counts` has its own, and
-            boosted clicks those of the run.
+        train: the training episodes; None if unavailable, which excludes what learns from rows.
+        liked_of: which training steps were liked; `counts` has its own, boosted clicks the run's.
     """
     shown, liked = counts.shown.double(), counts.liked.double()
     drawn = torch.Generator().manual_seed(seed)
@@ -194,12 +161,27 @@ def baselines(
     ]
     if train is not None:
         rankers.append(neighbour_ranker(train, shown.float()))
-        rankers.append(boosted_ranker(train, seed))
+        config = BoostedConfig(context=_KNN_HISTORY + 1, dim=1)
+        boosted = BoostedPolicy(config, policy_sizes(train))
+        boosted.start_from(train)
+        boosted.make_solver(train, None, Path(), seed)()
+
+        def scores(steps: Steps) -> Tensor:
+            windows = steps.store.windows(steps.episodes, steps.steps, _KNN_HISTORY + 1)
+            return boosted.act(windows)
+
+        rankers.append(NamedRanker("boosted clicks", scores))
         if find_spec("implicit") is not None:
             rankers += [
                 factor_ranker(name, train, shown.float(), seed, liked_of)
                 for name in get_args(_Factors)
             ]
+    if train is not None and store is not None and store.split("validation").n_episodes:
+        first, validation = store.split("train"), store.split("validation")
+        for name, kind in (("clicks", RecentClicksPolicy), ("click rate", RecentRatePolicy)):
+            hours = kind.best_half_life(first, validation, liked_of)
+            recent = kind.scores_of(TrainingCounts.of(train, liked_of, hours))
+            rankers.append(same_for_all(f"recent {name}", recent.double()))
     return rankers
 
 
@@ -225,23 +207,19 @@ def ranking_rows(
     seed: int,
     liked: LikedExpression | None = None,
 ) -> list[ResultRow]:
-    """One row for every policy and baseline.
-
-    The details have, by measure of `ucfrec.evaluation.ranking.MEASURES`, `intervals` and
-    `differences`: the value less the first policy's, with its interval. Rows of policies have
-    their `decision_rule`, and its hash as `rule`.
+    """One row for every policy and baseline, with the `MEASURES`, their `intervals` and
+    `differences`: the value less the first policy's, with its interval.
 
     Args:
         policies: at least one; the first is the reference of the differences.
         trained: any of their runs, for the counts of the training rows and the reward model.
-        train: the store of those rows; None excludes item-kNN and ALS.
-        users: (E,) identifier of the user of each of its episodes.
-        k: items that are recommended at a step.
-        seed: of the resampled users and of `random`.
-        liked: which steps were liked; None for the run's own definition. Without `train`, "most
-            clicked" and "item click rate" keep the run's own.
+        train: the store of those rows; None excludes what learns from them.
+        users: (E,) identifier of the user of each episode of `later`.
+        liked: which steps were liked; None for the run's own definition, which "most clicked" and
+            "item click rate" keep without `train`.
     """
-    counts, fitted_on, liked_of = trained.counts, train, liked or liked_rewards
+    counts, fitted_on = trained.counts, train
+    liked_of = liked or liked_rewards
     assert counts is not None
     assert trained.item_states is not None
     if train is not None and trained.record.refit_of is None:
@@ -250,10 +228,14 @@ def ranking_rows(
         counts = TrainingCounts.of(fitted_on, liked)
     unnamed: list[Ranker] = [*policies]
     if trained.reward_model is not None:
-        unnamed.append(reward_ranker(trained.scorer()))
-    unnamed += baselines(counts, fitted_on, seed, liked_of)
-    if train is not None and fitted_on is not None:
-        unnamed += recent_rankers(fitted_on, train, liked_of)
+        scorer = trained.scorer()
+
+        def scores(steps: Steps) -> Tensor:
+            sessions = sessions_before(scorer, steps.store, steps.episodes, steps.steps)
+            return scorer.rewards(replace(sessions, users=torch.from_numpy(steps.users)))
+
+        unnamed.append(NamedRanker("reward model", scores))
+    unnamed += baselines(counts, fitted_on, seed, liked_of, train)
     rankers = name_rankers(unnamed)
     k = min(k, len(counts.shown))
     period = Period.of(later.store, np.asarray(users), liked_of)
@@ -301,9 +283,9 @@ def _row(compared: Compared, policy: PolicyRanker | None, shared: Mapping[str, A
         )
     metric = METRIC if math.isfinite(compared.values[METRIC]) else _OTHERWISE
     low, high = compared.intervals[metric]
-    interval = (low, high) if math.isfinite(low) and math.isfinite(high) else None
+    interval = (low, high) if math.isfinite(low + high) else None
     measured = {
-        **{name: compared.values[name] for name in MEASURES},
+        **compared.values,
         "coverage": compared.coverage,
         "intervals": compared.intervals,
         "differences": compared.differences,

@@ -46,11 +46,7 @@ class Simulator:
         return "mixture" if "mixture" in self.behaviors else "random"
 
     def started(self, sessions: int, folder: Path | None) -> "VectorEnv[Any, Any, Any]":
-        """What `make` makes of a number of parallel sessions.
-
-        Raises:
-            InputError: it is no vector environment.
-        """
+        """What `make` makes of parallel sessions; InputError if it is no vector environment."""
         from gymnasium.vector import VectorEnv
 
         env = self.make(sessions, folder)
@@ -105,12 +101,8 @@ class Environment:
         return self.name + observe + features
 
     def simulator(self) -> Simulator:
-        """Load the simulator plugin, or make the one of a Gymnasium environment.
-
-        Raises:
-            InputError: no simulator of this name is installed, or it takes no `observe` and
-                `item_features`.
-        """
+        """Load the simulator plugin, or make the one of a Gymnasium environment; InputError if it
+        is not installed, or takes no `observe` and `item_features`."""
         if self.name.startswith(GYMNASIUM):
             from ucfrec.acting.rollout import Uniform
             from ucfrec.evaluation import gymnasium_environment as wrapped

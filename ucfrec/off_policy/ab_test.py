@@ -51,7 +51,7 @@ class Comparison:
     """Its standard error, over users."""
     low: float | None
     """Ends of the 95% interval, for a test that ends when it was planned to; None, as the others,
-    where an arm has fewer than `FEWEST_USERS` users or no user differs from another of the arm."""
+    where an arm has fewer than `FEWEST_USERS` users or all are equal."""
     high: float | None
     always_low: float | None
     """Ends of the 95% interval that may be looked at as often as one likes, and acted upon."""
@@ -64,12 +64,12 @@ class Comparison:
                 self.arms, self.values, self.users, self.rows, strict=True
             )
         ]
-        for count, text in (
-            (self.without_user, f"rows have no {schema.USER_ID}; they are left out"),
-            (self.without_arm, f"rows have no {schema.ARM}; they are left out"),
-            (self.in_several, "users were in more than one arm; their rows are left out"),
-        ):
-            lines += [f"{count:,} {text}"] * (count > 0)
+        left_out = {
+            f"rows have no {schema.USER_ID}; they are left out": self.without_user,
+            f"rows have no {schema.ARM}; they are left out": self.without_arm,
+            "users were in more than one arm; their rows are left out": self.in_several,
+        }
+        lines += [f"{count:,} {text}" for text, count in left_out.items() if count]
         low, high, always_low, always_high = (
             "unknown" if end is None else f"{end:+.4g}"
             for end in (self.low, self.high, self.always_low, self.always_high)
@@ -101,9 +101,8 @@ def always_valid(difference: float, variance: float, expected: float) -> tuple[f
 
     The mixture sequential probability ratio test for normal estimates, inverted (Johari, Koomen,
     Pekelis & Walsh, Always valid inference, Operations Research 2022): the difference is mixed over
-    N(0, expected²), fixed beforehand; near the differences that matter, the interval is shortest.
-    With an estimated variance, above 0, it holds asymptotically (Waudby-Smith, Arbour, Sinha,
-    Kennedy & Ramdas, Annals of Statistics 2024).
+    N(0, expected²), fixed beforehand. With an estimated variance, above 0, it holds asymptotically
+    (Waudby-Smith, Arbour, Sinha, Kennedy & Ramdas, Annals of Statistics 2024).
     """
     mixed = variance + expected**2
     inside = math.log(mixed / variance) - 2 * math.log(1 - LEVEL)
@@ -118,14 +117,10 @@ def compare_arms(
     expected: float | None = None,
     memory_limit: str = "2GB",
 ) -> Comparison:
-    """Compare two arms in logs of `ucfrec join`. Users are drawn into arms, so they are clusters.
-    Rows without a value are left out, with an `InputNote`.
-
-    Args:
-        arms: names of the first arm and the other; None for the two that there are, the one with
-            more users first.
-        expected: difference that the always-valid interval is tuned for, fixed beforehand; None for
-            5% of the first arm's value.
+    """Compare two arms, or the two that there are, most users first, in logs of `ucfrec join`.
+    Users are drawn into arms, so they are clusters. Rows without a value are left out, with an
+    `InputNote`. `expected` is the difference that the always-valid interval is tuned for, fixed
+    beforehand; None for 5% of the first arm's value.
 
     Raises:
         InputError: a column is missing or no number, a value is infinite, or there are not two arms
@@ -149,35 +144,31 @@ def compare_arms(
         sums[arm] = np.stack([values, shown.astype(np.float64)])[:, shown > 0]
         without_value[arm] = int((rows - shown).sum())
     users = {arm: values.shape[1] for arm, values in sums.items()}
-    names = arms or tuple(sorted(users, key=lambda arm: -users[arm])[:2])
+    names = arms or sorted(users, key=lambda arm: -users[arm])
     if len(names) != 2 or min(users.get(arm, 0) for arm in names) < 2:
         present = ", ".join(f"{arm!r} ({count:,} users)" for arm, count in sorted(users.items()))
         raise InputError(
             f"{name}: two arms with two users each who have a value of {column} are needed, the "
             f"logs have {present or 'none'}; write exposures with serve --split, or name two with "
-            "--arms"
+            "--arms A,B"
         )
-    if arms is None and len(users) > 2:
-        raise InputError(f"the logs have {len(users)} arms; name two of them with --arms A,B")
     first, second = names
     if without_value[first] or without_value[second]:
-        warnings.warn(
+        text = (
             f"{name}: {column} has no value in {without_value[first]:,} rows of {first} and "
-            f"{without_value[second]:,} of {second}, which are left out; write 0 where that is "
-            "meant",
-            InputNote,
-            stacklevel=2,
+            f"{without_value[second]:,} of {second}, which are left out; write 0 where it is meant"
         )
+        warnings.warn(text, InputNote, stacklevel=2)
     (value_a, error_a), (value_b, error_b) = (
         cluster_mean(total / count, None, count) for total, count in (sums[first], sums[second])
     )
     difference, variance = value_b - value_a, error_b**2 + error_a**2
     error = math.sqrt(variance)
-    ends: tuple[float | None, ...] = (None,) * 4
+    low = high = always_low = always_high = None
     if min(error_a, error_b) > 0 and min(users[first], users[second]) >= FEWEST_USERS:
         mixture = expected or EXPECTED * abs(value_a) or error
-        always = always_valid(difference, variance, mixture)
-        ends = difference - _NORMAL * error, difference + _NORMAL * error, *always
+        low, high = difference - _NORMAL * error, difference + _NORMAL * error
+        always_low, always_high = always_valid(difference, variance, mixture)
     return Comparison(
         column=column,
         arms=(first, second),
@@ -190,10 +181,10 @@ def compare_arms(
         in_several=int((has_user & (groups["arms"] > 1) & groups["last"]).sum()),
         difference=difference,
         error=error,
-        low=ends[0],
-        high=ends[1],
-        always_low=ends[2],
-        always_high=ends[3],
+        low=low,
+        high=high,
+        always_low=always_low,
+        always_high=always_high,
     )
 
 

@@ -1,8 +1,7 @@
 """The return per session of a policy, from logs of another: arrays in, estimates out.
 
-Every estimate is a mean discounted return of a session, in the unit of the reward. Notation as in
-`ucfrec.off_policy.logged_steps`: G_i the logged return, w_it the weight of step t, w_i that of the
-whole session, E_n the mean over sessions.
+Notation as in `ucfrec.off_policy.logged_steps`: G_i the logged return, w_it the weight of step t,
+w_i that of the whole session, E_n the mean over sessions.
 
 | name | equation | source |
 |---|---|---|
@@ -30,11 +29,8 @@ E_n[v + ŵ (r − q)], with q = v = 0 for the IPS kinds, and ŵ(w; λ) for the w
 | DRos | λ w / (w² + λ) | Su, Dimakopoulou, Krishnamurthy & Dudík, ICML 2020 |
 
 The IPS kinds shrink the weight of the whole session; the DR kinds are for sessions of one step.
-λ has the least estimated mean squared error of the candidates (Su et al. 2020, section 5): the
-sample variance over n plus the square of the estimated bias E_n[(w − ŵ)(r − q)]. Their bound on
-that bias does not depend on λ and, with logs of 500 sessions and lognormal weights, never shrinks
-anything; the plain estimate of it lowers the error there by a tenth to a third. Where any weight is
-shrunk there is no interval: resampling with λ as given knows nothing of the bias.
+λ has the least estimated mean squared error (Su et al. 2020, section 5): the sample variance over n
+plus the square of the estimated bias E_n[(w − ŵ)(r − q)], which no interval would know.
 
 In the means over sessions at step t, a session that has ended counts with the weight of its last
 step, as if it went on without reward (Thomas & Brunskill 2016).
@@ -44,18 +40,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.logged_steps import LoggedSteps, independent_terms
+from ucfrec.arrays import Float64Array, IntArray
+from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
 SUITE: Final = "off-policy"
 """Suite of the result rows."""
 LOGGED: Final = "logged"
+_LEAST_RATIO: Final = 1e-12
+"""Mean ratio of a position below which nothing is divided by it."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +62,8 @@ class Estimate:
 
     value: float
     low: float | None
-    """Ends of the 95% interval, studentised and clustered by user (`cluster_intervals`). None for
-    DM and FQE, whose error is the model's; for MIPS and where weights are shrunk, whose bias no
-    resampling shows; and where too few sessions have a reward under the weights."""
+    """Ends of the 95% interval (`cluster_intervals`). None for DM, FQE, MIPS and where weights are
+    shrunk, whose error no resampling shows; and where too few sessions have weight and reward."""
     high: float | None
     error: float | None
     """Standard error, over users."""
@@ -94,8 +91,7 @@ class Terms:
     """(S,) what each session counts."""
     parameter: float | None = None
     biased: bool = False
-    """Whether there is an error in it that no resampling shows: a model's, or that of shrunk or
-    marginalised weights."""
+    """Whether it has an error that no resampling shows: of a model, or of changed weights."""
 
     @property
     def influences(self) -> Float64Array:
@@ -105,15 +101,11 @@ class Terms:
 
 
 def estimate(steps: LoggedSteps, seed: int) -> dict[str, Estimate]:
-    """Mean return per session as logged, and under the evaluated policy.
+    """Mean return per session as logged, and under the evaluated policy; `seed` draws resamples.
 
     DM, FQE and the doubly robust need `steps.model`; MIPS the probabilities of clusters; all that
     weigh leave out sessions with a step of unknown propensity, which is right where propensities
-    are lost at random, and are omitted where no session has any weight. SWITCH-DR, DRos and
-    sub-Gaussian DR are defined for sessions of one step.
-
-    Args:
-        seed: draws the bootstrap's resamples.
+    are lost at random, and are omitted where no session has any weight.
     """
     ones = np.ones(len(steps.first))
     terms = {LOGGED: Terms(steps.returns, ones, ones)}
@@ -135,22 +127,23 @@ def summarise(terms: Mapping[str, Terms], user: IntArray | None, seed: int) -> d
     estimates = {}
     intervals = cluster_intervals(above, below, user, seed)
     for (name, term), interval in zip(terms.items(), intervals, strict=True):
-        interval, weights = None if term.biased else interval, term.weights
+        low, high, error, _ = NO_INTERVAL if term.biased or interval is None else interval
+        value, weights = float(term.above.sum() / term.below.sum()), term.weights
+        largest = float(weights.max() / weights.sum()) if weights.any() else 1.0
         estimates[name] = Estimate(
-            value=float(term.above.sum() / term.below.sum()),
-            low=None if interval is None else interval.low,
-            high=None if interval is None else interval.high,
-            error=None if interval is None else interval.error,
+            value=value,
+            low=low,
+            high=high,
+            error=error,
             effective_sessions=effective_number(weights),
-            largest_weight=float(weights.max() / weights.sum()) if weights.any() else 1.0,
+            largest_weight=largest,
             parameter=term.parameter,
         )
     return estimates
 
 
 def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
-    """The terms of every estimate that weighs sessions, of steps with all propensities; none where
-    no session has any weight."""
+    """The terms of every estimate that weighs, of steps with all propensities and any weight."""
     weights, last = steps.weights, steps.session_weights
     if not last.any():
         return {}
@@ -172,8 +165,7 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
         by_step = normalise_by_step(steps, left, steps.model.v, StepSums.of(steps, left))
         terms["SNDR"] = Terms(by_step, ones, last)
     if steps.pages:
-        for name, (above, counts) in independent_terms(steps).items():
-            terms[name] = Terms(above, ones, counts)
+        terms |= _page_terms(steps)
     if (clustered := steps.cluster_weights) is not None:
         above = steps.per_session(steps.discounts * clustered * steps.reward)
         terms["MIPS"] = Terms(above, ones, clustered[steps.last], biased=True)
@@ -189,16 +181,34 @@ def session_terms(steps: LoggedSteps) -> dict[str, Terms]:
     return terms
 
 
+def _page_terms(steps: LoggedSteps) -> dict[str, Terms]:
+    """Those of the independent model, in which a page counts its mean ratio."""
+    ratios, ones = steps.target / steps.propensity, np.ones(len(steps.first))
+    rewards = steps.discounts * ratios * steps.reward
+    counts = steps.per_session(ratios) / steps.lengths
+    terms = {"IIPS": Terms(steps.per_session(rewards), ones, counts)}
+    # Means over pages, by position, of ρ, of ρ r γ^t over it, and of there being such a position.
+    below = np.bincount(steps.step, ratios) / len(ones)
+    if (below > _LEAST_RATIO).all():
+        mean = np.bincount(steps.step, rewards) / len(ones) / below
+        positions = np.bincount(steps.step) / len(ones)
+        # The estimate Σ_t positions_t mean_t, plus each page's influence on it.
+        beyond = (steps.discounts * steps.reward - mean[steps.step]) * ratios
+        influence = (positions / below)[steps.step] * beyond + mean[steps.step]
+        terms["SNIIPS"] = Terms(steps.per_session(influence), ones, counts)
+    return terms
+
+
 def shrink_optimistically(weights: Float64Array, strength: float) -> Float64Array:
     """λ w / (w² + λ): w where λ is infinite, 0 where it is 0."""
     if math.isinf(strength):
         return weights
-    return np.asarray(strength * weights / np.maximum(weights**2 + strength, 1e-300))
+    return strength * weights / np.maximum(weights**2 + strength, 1e-300)
 
 
 def shrink_to_sub_gaussian(weights: Float64Array, strength: float) -> Float64Array:
     """w / (1 − λ + λ w): w where λ is 0, 1 where it is 1."""
-    return np.asarray(weights / np.maximum(1 - strength + strength * weights, 1e-300))
+    return weights / np.maximum(1 - strength + strength * weights, 1e-300)
 
 
 Shrink = Callable[[Float64Array, float], Float64Array]
@@ -223,13 +233,9 @@ def tune(
     left: Float64Array,
     value: Float64Array,
 ) -> float:
-    """The parameter of least estimated mean squared error, the first of equals (Su et al. 2020), of
-    unshrunk weights, r − q and v (S,)."""
-    errors = [
-        mean_squared_error(weights, shrink(weights, parameter), left, value)
-        for parameter in parameters
-    ]
-    return parameters[int(np.argmin(errors))]
+    """The parameter of least estimated mean squared error, of weights, r − q and v (S,)."""
+    shrunk = {parameter: shrink(weights, parameter) for parameter in parameters}
+    return min(shrunk, key=lambda most: mean_squared_error(weights, shrunk[most], left, value))
 
 
 def mean_squared_error(
@@ -269,15 +275,14 @@ class StepSums:
 def normalise_by_step(
     steps: LoggedSteps, left: Float64Array, v: Float64Array | None, sums: StepSums
 ) -> Float64Array:
-    """(S,) estimate plus influence of each session; their mean is the estimate.
+    """(S,) estimate plus influence (the derivative by a session's share) of each session.
 
     The estimate is Σ_t γ^t [Σ_i w_it left_it / W_t + Σ_i w_i,t−1 v_it / W_t−1] with W_t = Σ_i w_it
-    over all sessions. Its influence (the derivative by a session's share) stands for it in the
-    bootstrap, which then needs one number per session rather than one per step.
+    over all sessions. In the bootstrap its influences stand for it: one number a session.
 
     Args:
         left: (N,) reward, or what a model leaves of it, whose values `v` (N,) then are.
-        sums: of all sessions; where there are more than those of `steps`, without modelled values.
+        sums: of all sessions, which may be more than those of `steps` where `v` is None.
     """
     weights, step, sessions, totals = steps.weights, steps.step, sums.sessions, sums.totals
     by_step = steps.discount ** np.arange(len(totals))
@@ -297,13 +302,12 @@ def normalise_by_step(
     tail = np.append(np.cumsum(slopes[::-1])[::-1], 0.0)
     taken = steps.per_session(weights * slopes[step])
     taken += steps.session_weights * tail[steps.lengths]
-    return np.asarray(value + sessions * (steps.per_session(mine) - taken - start))
+    return value + sessions * (steps.per_session(mine) - taken - start)
 
 
 RESAMPLES = 2000
 MOST_CLUSTERS = 10_000
-"""Of more, random groups are drawn, all of about one size: the error stays, and time and memory do
-not grow with the logs."""
+"""Of more, random groups are drawn: the error stays, and time and memory are bounded."""
 FEWEST_USERS = 10
 """Users below which their spread says too little for a conclusion."""
 _COUNTS_AT_ONCE = 2**22
@@ -311,8 +315,7 @@ _USABLE = 0.9
 """Share of resamples that must have a spread of their own."""
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """What resampling says of a number."""
 
     low: float
@@ -323,11 +326,11 @@ class Interval:
     """Share of resamples in which the number is above 0."""
 
 
+NO_INTERVAL: Final = (None, None, None, None)
+
+
 def cluster_intervals(
-    above: Float64Array,
-    below: Float64Array,
-    cluster: IntArray | None,
-    seed: int,
+    above: Float64Array, below: Float64Array, cluster: IntArray | None, seed: int
 ) -> list[Interval | None]:
     """Studentised 95% bootstrap intervals of the ratios Σ above / Σ below.
 
@@ -341,20 +344,19 @@ def cluster_intervals(
         cluster: (S,) of each session, any integers; None where each session is its own.
 
     Returns:
-        One per column; None where nothing spreads: one cluster, all clusters equal, or so few that
-        differ that more than a tenth of the resamples have no spread.
+        One per column; None where more than a tenth of the resamples have no spread.
     """
     resamples = resample(above, below, cluster, seed)
     intervals: list[Interval | None] = []
     for k, (value, error) in enumerate(zip(resamples.value, resamples.error, strict=True)):
-        rows = resamples.usable[:, k]
-        if not resamples.spreads[k] or rows.mean() < _USABLE:
+        rows = np.isfinite(resamples.studentised[:, k])
+        if rows.mean() < _USABLE:
             intervals.append(None)
             continue
-        shift, errors = resamples.shift[rows, k], resamples.errors[rows, k]
-        low_t, high_t = np.quantile(shift / errors, [0.025, 0.975])
+        low_t, high_t = np.quantile(resamples.studentised[rows, k], [0.025, 0.975])
+        above_zero = float((value + resamples.shift[rows, k] > 0).mean())
         low, high = float(value - high_t * error), float(value - low_t * error)
-        intervals.append(Interval(low, high, float(error), float((value + shift > 0).mean())))
+        intervals.append(Interval(low, high, float(error), above_zero))
     return intervals
 
 
@@ -368,12 +370,9 @@ class Resamples:
     """(K,) standard errors over clusters."""
     shift: Float64Array
     """(B, K) of each resample: its ratio less `value`."""
-    errors: Float64Array
-    """(B, K) its own standard error."""
-    spreads: BoolArray
-    """(K,) whether clusters differ at all."""
-    usable: BoolArray
-    """(B, K) whether the resample has a spread of its own."""
+    studentised: Float64Array
+    """(B, K) `shift` in standard errors of the resample; NaN where it has no spread, as in all
+    where clusters do not differ."""
 
 
 def resample(
@@ -411,9 +410,11 @@ def resample(
             spreads.append(correction * np.sqrt(spread) / b * unit)
         shifts.append(shift * unit)
     shift, errors, error_in_units = np.concatenate(shifts), np.concatenate(spreads), error * unit
-    usable = np.isfinite(shift) & (errors > 1e-9 * error_in_units)
     differ = (error > 1e-12) & (clusters > 1)
-    return Resamples(value, error_in_units, shift, errors, differ, usable)
+    usable = differ & np.isfinite(shift) & (errors > 1e-9 * error_in_units)
+    studentised = np.full(shift.shape, np.nan)
+    studentised[usable] = shift[usable] / errors[usable]
+    return Resamples(value, error_in_units, shift, studentised)
 
 
 def cluster_mean(
@@ -438,10 +439,7 @@ def _number_clusters(cluster: IntArray | None, sessions: int) -> tuple[IntArray,
 
 @lru_cache(maxsize=1)
 def _draw_counts(clusters: int, seed: int) -> npt.NDArray[np.uint16]:
-    """(B, C) how often each resample has each cluster, at most 40 MB.
-
-    Kept for the next call: an estimate, its verdict and a selection draw the same clusters.
-    """
+    """(B, C) how often each resample has each cluster, at most 40 MB; kept for the next call."""
     generator = np.random.default_rng(seed)
     counts = np.empty((RESAMPLES, clusters), dtype=np.uint16)
     at_once = max(1, min(RESAMPLES, _COUNTS_AT_ONCE // clusters))

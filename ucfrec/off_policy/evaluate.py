@@ -55,27 +55,22 @@ class EstimateOptions:
     discount: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Discount factor γ of the estimated returns."""
     pages: bool = False
-    """Estimate the return of a page: sessions of one step, of one user within 10 ms, are the
-    positions of a page (`ucfrec.off_policy.logged_steps`)."""
+    """Estimate the return of a page: its positions are sessions of one step, within 10 ms."""
     users_known: bool = True
-    """Whether the logs' users are persons, whose sessions are resampled together; if not, each
-    session is taken to be of another user."""
+    """Whether users are persons; if not, each session is taken to be of another user."""
     reward_range: tuple[float, float] | None = None
-    """Least and greatest reward of a step, for the bounds of the value of unsupported choices;
-    unset, those observed."""
+    """Least and greatest reward of a step, for bounds of the value; unset, those observed."""
     wanted_lift: Annotated[float, Field(gt=0)] | None = None
-    """Return per session that a launch should gain over the logged policy; unset, 5% of the mean
-    logged return."""
+    """Return per session that a launch should gain; unset, 5% of the mean logged return."""
     item_groups: Annotated[int, Field(ge=0)] = 0
     """Clusters of items for MIPS; 0 chooses by the size of the catalogue, 1 omits MIPS."""
     estimate_propensities: bool = False
     """Estimate the propensities that the logs lack, cross-fitted and calibrated."""
     filter_seen: bool = False
-    """Exclude items that the user was shown before a step, in earlier rows too, as `recommend` and
-    `serve` do by default; then their logs have to be evaluated so."""
+    """Exclude items that the user was shown before a step, as `recommend` and `serve` do by
+    default; then their logs have to be evaluated so."""
 
     def __post_init__(self) -> None:
-        """Check that the range is in order."""
         low, high = self.reward_range or (0.0, 0.0)
         require(low <= high, f"the reward range is {low} to {high}; name the least one first")
 
@@ -85,11 +80,9 @@ DEFAULTS = EstimateOptions()
 
 @dataclass(frozen=True)
 class StepValue:
-    """What N' logged steps with a propensity say of the evaluated policy, per step.
-
-    The contextual bandit of Dudík, Langford & Li (ICML 2011) on those steps, picked at random: the
-    mean reward of a step, had the evaluated policy chosen its item after a history as the logging
-    policy makes them. It says nothing of the return of sessions that the policy itself would make.
+    """What N' logged steps with a propensity say of the evaluated policy: the mean reward of a step
+    (Dudík, Langford & Li, ICML 2011), had it chosen the item after a history as the logging policy
+    makes them. It says nothing of the return of sessions that the policy itself would make.
     """
 
     estimates: dict[str, Estimate]
@@ -123,7 +116,8 @@ def step_value(steps: LoggedSteps, seed: int) -> StepValue | None:
     reward, weight = steps.reward[weighable], (steps.target / steps.propensity)[weighable]
     if not weight.any():
         return None
-    ones, user = np.ones(len(reward)), steps.users[steps.session[weighable]]
+    user = steps.users[steps.session[weighable]]
+    ones = np.ones(len(reward))
     left = reward - steps.model.logged_reward[weighable]
     doubly_robust = steps.model.reward[weighable] + weight * left
     terms = {
@@ -177,15 +171,11 @@ class Evidence:
 
     steps: LoggedSteps
     rows: int
-    """Number of rows of the logs."""
     columns: dict[str, Any]
     """Further columns of the result rows."""
     segment: IntArray | None = None
-    """(S,) as `diagnose` takes it."""
     declared: str = ""
-    """What the estimates rest on beside the logs."""
     fingerprint: str | None = None
-    """Of the logs."""
     models: ModelReport | None = None
     per_step: StepValue | None = None
     forbidden: list[str] = field(default_factory=list)
@@ -202,17 +192,8 @@ def evaluate_off_policy(
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> OffPolicyReport:
-    """Estimate the mean return of a session under a policy, from logs alone.
-
-    Models of future reward are fitted on these logs; each user's sessions are predicted by models
-    fitted on other users.
-
-    Args:
-        trained: its run's folder is named in the rows.
-        logged: logs read with `keep_unknown`. The policy would never show an item that it does not
-            know, so such a step has weight 0.
-        rule: the decision rule to evaluate; None for the run's own.
-        seed: seed of the folds and of the bootstrap.
+    """Estimate the mean return of a session under a policy, and a rule or its run's own, from logs
+    alone, read with `keep_unknown`: a step of an unknown item has weight 0.
 
     Raises:
         InputError: propensities are not probabilities, there is only one user, or a page would have
@@ -238,7 +219,8 @@ def evaluate_off_policy(
             f"items to choose from, the run knows {items:,}: propensities are too small"
         )
     if options.pages:
-        steps = as_pages(steps, *_find_pages(logged))
+        page, position = _find_pages(logged)
+        steps = as_pages(steps, page, position)
     else:
         # The quarter of the logs, 1 to 4 by time, in which each session begins.
         times = store.column(schema.TIMESTAMP)[steps.first]
@@ -263,6 +245,10 @@ def evaluate_off_policy(
     return make_report(trained, rule, evidence, seed, options)
 
 
+_TABLES = {"R_cum": ("estimates", "sessions"), "R_step": ("per step", "steps")}
+"""Table of each metric's rows, and what is counted there."""
+
+
 def make_report(
     trained: TrainedPolicy,
     rule: DecisionRule,
@@ -270,17 +256,21 @@ def make_report(
     seed: int,
     options: EstimateOptions,
 ) -> OffPolicyReport:
-    """Estimate from logged steps, judge the estimates, and make their result rows.
-
-    `R_cum` is the mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean
-    reward of a step; a row may have no interval.
+    """Estimate from logged steps, judge the estimates, and make their result rows: `R_cum` is the
+    mean return, as in `ucfrec.evaluation.evaluate`, and `R_step` the mean reward of a step.
     """
     steps, per_step = evidence.steps, evidence.per_step
     estimates = estimate(steps, seed)
     diagnosis = diagnose(steps, options.reward_range, evidence.segment)
-    forbidden, declared, filter_seen = evidence.forbidden, evidence.declared, options.filter_seen
-    lift = options.wanted_lift
-    verdict = conclude(steps, seed, diagnosis, lift, forbidden, declared, filter_seen)
+    verdict = conclude(
+        steps,
+        seed,
+        diagnosis,
+        wanted_lift=options.wanted_lift,
+        forbidden=evidence.forbidden,
+        declared=evidence.declared,
+        filter_seen=options.filter_seen,
+    )
     warnings = [*verdict.reasons, *list_cautions(diagnosis, estimates), *evidence.remarks]
     record, choice = trained.record, "softmax" if rule.draws else "greedy"
     conditions: dict[str, Scalar] = {
@@ -288,7 +278,7 @@ def make_report(
         "discount": options.discount,
         "pages": options.pages,
         "anonymous": not options.users_known,
-        "filter_seen": filter_seen,
+        "filter_seen": options.filter_seen,
         "sessions": len(steps.first),
         "steps": evidence.rows,
     }
@@ -296,7 +286,11 @@ def make_report(
     judged |= {"warnings": warnings, "verdict": str(verdict), "verdict_of": verdict.estimator}
     del judged["estimator"], judged["reasons"]
 
-    def make_row(name: str, result: Estimate, metric: str, units: str, table: str) -> ResultRow:
+    by_metric = {"R_cum": estimates, "R_step": {} if per_step is None else per_step.estimates}
+
+    def make_row(metric: str, name: str) -> ResultRow:
+        result = by_metric[metric][name]
+        table, units = _TABLES[metric]
         row = ResultRow(
             suite=SUITE,
             table=table,
@@ -329,10 +323,7 @@ def make_report(
     if weighable is not None and verdict.estimator is not None:
         terms = session_terms(weighable)[verdict.estimator].influences
     return OffPolicyReport(
-        rows=[
-            make_row(name, result, "R_cum", "sessions", "estimates")
-            for name, result in estimates.items()
-        ],
+        rows=[make_row("R_cum", name) for name in estimates],
         warnings=warnings,
         verdict=verdict,
         models=evidence.models,
@@ -340,10 +331,7 @@ def make_report(
         user=None if weighable is None else weighable.user,
         terms=terms,
         per_step=per_step,
-        step_rows=[
-            make_row(name, result, "R_step", "steps", "per step")
-            for name, result in ({} if per_step is None else per_step.estimates).items()
-        ],
+        step_rows=[make_row("R_step", name) for name in by_metric["R_step"]],
     )
 
 
@@ -395,14 +383,9 @@ def collect_steps(
     seed: int,
     options: EstimateOptions = DEFAULTS,
 ) -> tuple[LoggedSteps, ModelReport, str]:
-    """Collect the logged steps, in order, the policy's probabilities and models of its return.
-
-    In memory are some ten numbers a step; what the models see of it, and the probabilities of item
-    groups, lie on disk.
-
-    Returns:
-        The steps, how good the models are, and which propensities are estimated; "" if none is.
-    """
+    """The logged steps, in order, with the policy's probabilities and models of its return; how
+    good the models are; and which propensities are estimated, "" if none is. What the models see,
+    and the probabilities of groups, lie on disk."""
     store = logged.store
     propensity = np.full(store.n_steps, np.nan)
     if schema.PROPENSITY in store.record.columns:

@@ -3,10 +3,8 @@
 Notation of the whole package: session i of S, step t (from 0) of its T_i steps; ρ_it =
 target / propensity of the logged action; w_it = Π_{k ≤ t} ρ_ik, with w_i,−1 = 1; γ the discount.
 
-The steps of a page are its positions, chosen at once. The return of a page under another policy
-depends on how its positions influence each other, and the weights follow from what is assumed
-(McInerney, Brost, Chandar, Mehrotra & Carterette, *Counterfactual Evaluation of Slate
-Recommendations with Sequential Reward Interactions*, KDD 2020):
+The steps of a page are its positions, chosen at once. Its weights follow from how its positions are
+assumed to influence each other (McInerney, Brost, Chandar, Mehrotra & Carterette, KDD 2020):
 
 | model of the reward at a position | depends on the items at | weight | estimates |
 |---|---|---|---|
@@ -30,8 +28,6 @@ _LARGEST: Final = 1e100
 """Weights stop here: beyond, an estimate means nothing, and their squares stay finite."""
 _ROUNDING: Final = 1e-6
 """By how much a probability may be above 1; it counts as 1."""
-_LEAST_RATIO: Final = 1e-12
-"""Mean ratio of a position below which nothing is divided by it."""
 PAGE_MS: Final = 10
 """Most milliseconds between rows of one page: Open Bandit writes its positions one by one."""
 _TARGETS = ("target", "cluster_target")
@@ -73,11 +69,8 @@ class LoggedSteps:
     """N logged steps of S sessions, a session's steps together and in order.
 
     Lists and pandas Series are taken as well, by place and not by index; numbers are kept as
-    float64, and users that are not integers are numbered.
-
-    Raises:
-        InputError: lengths differ, sessions are not numbered in order, a number is missing or not
-            finite, a user is missing, a probability or the discount is out of its range.
+    float64, and users that are not integers are numbered. InputError if something is missing, has
+    another length, or is out of its range.
     """
 
     session: IntArray
@@ -90,19 +83,16 @@ class LoggedSteps:
     """(N,) the evaluated policy's probability of it, in [0, 1]; 0 where it cannot choose it."""
     model: Modelled | None = None
     user: IntArray | None = None
-    """(S,) whose session it is: sessions of one user are resampled together. None where every
-    session is of another user."""
+    """(S,) whose session it is, resampled together; None where each is of another user."""
     discount: float = 1.0
     """γ in (0, 1]: a reward at step t (from 0) counts γ^t."""
     cluster_propensity: Float64Array | None = None
-    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS
-    (Saito & Joachims, ICML 2022), e.g. k-means of item embeddings."""
+    """(N,) the behavior policy's probability of the logged action's cluster, for MIPS."""
     cluster_target: Float64Array | None = None
     """(N,) the evaluated policy's probability of it."""
     groups: ItemGroups | None = None
     densities: bool = False
-    """Whether `propensity` and `target` are probability densities of vector actions, which may
-    exceed 1."""
+    """Whether `propensity` and `target` are densities of vector actions, which may exceed 1."""
     per_decision: Float64Array | None = None
     """(N,) terms of PDIS, where steps are sums of whole sessions (`ucfrec.off_policy.scored`)."""
     by_step: Float64Array | None = None
@@ -151,7 +141,7 @@ class LoggedSteps:
         """(S,) users numbered from 0; each session is one where users are unknown."""
         if self.user is None:
             return np.arange(len(self.first))
-        return np.asarray(np.unique(self.user, return_inverse=True)[1])
+        return np.unique(self.user, return_inverse=True)[1]
 
     @cached_property
     def lacking(self) -> BoolArray:
@@ -202,7 +192,7 @@ class LoggedSteps:
 
     def per_session(self, values: Float64Array) -> Float64Array:
         """(S,) sums of values (N,)."""
-        return np.asarray(np.add.reduceat(values, self.first))
+        return np.add.reduceat(values, self.first)
 
     def shift(self, products: Float64Array) -> Float64Array:
         """(N,) w_i,t−1 of products w_it (N,): 1 at the first step."""
@@ -229,14 +219,13 @@ class LoggedSteps:
 
     def regroup(self, rows: IntArray, session: IntArray, user: IntArray | None) -> "LoggedSteps":
         """Steps of numbers (M,) in sessions (M,) of users (S,) of their own."""
-        values = {name: getattr(self, name) for name in (*_COLUMNS, "model", "groups")}
-        taken: dict[str, Any] = {
-            name: replace(value, **{key: column[rows] for key, column in vars(value).items()})
-            if name in ("model", "groups")
-            else value[rows]
-            for name, value in values.items()
-            if value is not None
-        }
+        taken: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if name in _COLUMNS and value is not None:
+                taken[name] = value[rows]
+            elif isinstance(value, (Modelled, ItemGroups)):
+                columns = {key: column[rows] for key, column in vars(value).items()}
+                taken[name] = replace(value, **columns)
         return replace(self, session=session, user=user, **taken)
 
     def _multiply(self, ratios: Float64Array) -> Float64Array:
@@ -247,7 +236,7 @@ class LoggedSteps:
         for place in range(1, int(lengths[0])):
             at = starts[: np.searchsorted(-lengths, -place, side="left")] + place
             ratios[at] = np.minimum(ratios[at] * ratios[at - 1], _LARGEST)
-        return np.asarray(np.minimum(ratios, _LARGEST))
+        return np.minimum(ratios, _LARGEST)
 
 
 def _convert_to_floats(name: str, values: Any) -> Float64Array:
@@ -258,7 +247,7 @@ def _convert_to_floats(name: str, values: Any) -> Float64Array:
         raise InputError(f"{name} is no array of numbers ({error!s:.200})") from None
     if column.ndim != 1:
         raise InputError(f"{name} has shape {column.shape}; give one number a step")
-    return np.asarray(column)
+    return column
 
 
 def _number_users(values: Any) -> Array:
@@ -267,13 +256,11 @@ def _number_users(values: Any) -> Array:
     if users.dtype.kind in "iu":
         return users
     try:
-        missing = int(np.sum(users != users))
-        numbers = np.unique(users, return_inverse=True)[1]
+        if not np.sum(users != users):
+            return np.unique(users, return_inverse=True)[1]
     except TypeError:
-        missing = 1
-    if missing:
-        raise InputError("users are missing, or of several types: give all as text, or none")
-    return np.asarray(numbers)
+        pass
+    raise InputError("users are missing, or of several types: give all as text, or none")
 
 
 def _require_finite(name: str, values: Any) -> Float64Array:
@@ -290,16 +277,13 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
     if above.any() and not densities:
         values = np.where(above, 1.0, values)
     inside = np.isfinite(values) if densities else values <= 1
+    outside = ~((values > 0) & inside | np.isnan(values))
+    rule = "propensities must be above 0 and at most 1, the probability of the item shown and not a"
+    rule += " density"
+    remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
     if name in _TARGETS:
         outside = ~((values >= 0) & inside)
         rule, remedy = "probabilities of the evaluated policy lie between 0 and 1", ""
-    else:
-        outside = ~((values > 0) & inside | np.isnan(values))
-        rule = (
-            "propensities must be above 0 and at most 1, the probability of the item shown and not "
-            "a density"
-        )
-        remedy = "; correct that column (arrays of vector actions: LoggedSteps(densities=True))"
     if outside.any():
         raise InputError(
             f"{rule}; {outside.sum():,} of {len(values):,} are outside, the first is "
@@ -310,19 +294,13 @@ def _check_probabilities(name: str, values: Any, densities: bool) -> Float64Arra
 
 def as_pages(steps: LoggedSteps, page: IntArray, position: IntArray | None = None) -> LoggedSteps:
     """Put sessions of one step each together to pages: a session a page, in order of the numbers of
-    `page`, each of the user of its first step.
-
-    The evaluated policy chooses each position without knowing what the others got; its probability
-    of a page is the product of those of the positions. A model of the steps' reward stays: in DR it
-    is a control variate, whose errors the weights correct.
+    `page`, each of the user of its first step. The evaluated policy's probability of a page is the
+    product of those of the positions. A model of the steps' reward stays, as a control variate.
 
     Args:
-        page: (N,) whose equal numbers mark one page.
+        page: (N,) whose equal numbers mark one page; InputError if a session has several steps.
         position: (N,) by which the steps of a page are ordered, the cascade's first in front; None
             for the order of the steps.
-
-    Raises:
-        InputError: a session has several steps, or `page` has another shape.
     """
     if len(steps.first) < len(steps.session):
         raise InputError(
@@ -347,23 +325,3 @@ def number_pages(user: IntArray, time: IntArray) -> IntArray:
     page = np.empty(len(order), dtype=np.int64)
     page[order] = np.cumsum(begins) - 1
     return page
-
-
-def independent_terms(steps: LoggedSteps) -> dict[str, tuple[Float64Array, Float64Array]]:
-    """Of each estimator under the independent model: the terms (S,) whose mean is the estimate, and
-    what each page counts (S,), its mean ratio. Propensities of all steps are known."""
-    ratios = steps.target / steps.propensity
-    rewards = steps.discounts * ratios * steps.reward
-    counts = steps.per_session(ratios) / steps.lengths
-    terms = {"IIPS": (steps.per_session(rewards), counts)}
-    # Means over pages, by position, of ρ, of ρ r γ^t over it, and of there being such a position.
-    pages = len(steps.first)
-    below = np.bincount(steps.step, ratios) / pages
-    if (below > _LEAST_RATIO).all():
-        mean = np.bincount(steps.step, rewards) / pages / below
-        positions = np.bincount(steps.step) / pages
-        # The estimate Σ_t positions_t mean_t, plus each page's influence on it.
-        beyond = (steps.discounts * steps.reward - mean[steps.step]) * ratios
-        influence = (positions / below)[steps.step] * beyond + mean[steps.step]
-        terms["SNIIPS"] = (steps.per_session(influence), counts)
-    return terms

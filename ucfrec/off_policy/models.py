@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import softmax
 from torch import Tensor
 
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
@@ -31,15 +32,14 @@ class StepInputs:
     states: Tensor
     """(B, S)."""
     window: Tensor
-    """(B, 1 + F): the return that is left of the target, and last-layer features of the policy's
-    window, which item-knn and crm-greedy lack."""
+    """(B, 1 + F): the return left of the target, and last-layer features of the window, if any."""
     chosen: Tensor
     """(B, D) embedding of the logged item; zeros for an item that the run does not know."""
     shown: Tensor
     """(B, D) mean embedding over the items that the evaluated policy shows."""
     scores: Tensor
-    """(B, 2) logarithm of the policy's probability of the logged item, and its mean over the items
-    that the evaluated policy shows; an unknown item has the mean."""
+    """(B, 2) log-probability of the logged item, and its mean over the items that the evaluated
+    policy shows; an unknown item has the mean."""
 
     def features(self) -> tuple[Float32Array, Float32Array]:
         """Features (B, P) of state and logged item, and their mean over the evaluated policy's."""
@@ -49,14 +49,10 @@ class StepInputs:
         )
 
     def _cross(self, items: Tensor, score: Tensor) -> Float32Array:
-        """Features (B, P), linear in item embeddings (B, D) and score (B, 1): a constant 1, state,
-        window, item, and products.
-
-        The three embeddings at the start of a state (`ucfrec.episodes.states.ItemStates`) and the
-        return left are multiplied with the item's own, dimension by dimension. The rest of the
-        state (user, observation) is multiplied with as many of the item's first dimensions as
-        `_PRODUCTS` allows.
-        """
+        """Features (B, P), linear in item embeddings (B, D) and score (B, 1)."""
+        # The three embeddings at the start of a state (`ItemStates`) and the return left are
+        # multiplied with the item's own, dimension by dimension; the rest of the state (user,
+        # observation) with as many of the item's first dimensions as `_PRODUCTS` allows.
         dim, left = items.shape[1], self.window[:, [0]]
         embeddings, remainder = self.states[:, : 3 * dim], self.states[:, 3 * dim :]
         leading = items[:, : _PRODUCTS // max(remainder.shape[1], 1)]
@@ -67,13 +63,8 @@ class StepInputs:
 
 
 def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tensor, StepInputs]:
-    """Compute the policy's probability and the models' inputs for B logged steps.
-
-    An item that the run does not know (−1) has probability 0 and an embedding of zeros.
-
-    Returns:
-        The evaluated policy's probability (B,) of the logged item, and (B, n_items) of all items;
-        and what the models see.
+    """The evaluated policy's probability (B,) of the logged item, 0 of an unknown one, and
+    (B, n_items) of all items; and what the models see of the steps.
     """
     assert trained.item_states is not None
     embeddings = trained.item_states.embeddings
@@ -84,11 +75,12 @@ def make_inputs(trained: TrainedPolicy, batch: ScoredSteps) -> tuple[Array, Tens
     scores = batch.scores.log_softmax(-1).clamp(min=_LOWEST_SCORE)
     mean_score = (probabilities * scores).sum(1)
     score = torch.where(in_catalogue, scores.gather(1, column)[:, 0], mean_score)
-    window = [batch.returns_left[:, None]]
-    window += [] if batch.features is None else [batch.features]
+    window = batch.returns_left[:, None].float()
+    if batch.features is not None:
+        window = torch.cat([window, batch.features.float()], dim=1)
     inputs = StepInputs(
         states=batch.states.float(),
-        window=torch.cat([part.float() for part in window], dim=1),
+        window=window,
         chosen=embeddings[batch.items] * in_catalogue[:, None],
         shown=probabilities @ embeddings,
         scores=torch.stack([score, mean_score], dim=1),
@@ -128,11 +120,8 @@ class InputsFile:
 
 
 def array_on_disk(shape: tuple[int, int]) -> Float32Array:
-    """An array of zeros whose memory the system can take back, writing it to a file without a name.
-
-    Raises:
-        OSError: the disk of the system's temporary folder is full.
-    """
+    """Zeros whose memory the system can take back, writing them to a file without a name; OSError
+    if the disk of the system's temporary folder is full."""
     if 0 in shape:
         return np.zeros(shape, dtype=np.float32)
     with tempfile.TemporaryFile(prefix="ucfrec-") as file:
@@ -149,19 +138,14 @@ _BEHAVIOR_FOLDS: Final = 3
 _MOST_ROWS = 20_000
 """Steps that a model is fitted on, drawn at random: it has some thousand weights."""
 _SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
-"""How much of the group's share in the logs may be mixed in; never nothing, so that no probability
-is 0."""
+"""How much of the group's share in the logs may be mixed in, so that no probability is 0."""
 _TEMPERATURES = (0.7, 1.0, 1.4, 2.0, 3.0)
 _MOST_ITEM_GROUPS = 32
 
 
 def group_items(embeddings: Float32Array, groups: int, seed: int) -> IntArray:
-    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D).
-
-    Items of equal embeddings are in one group, so there may be fewer than `groups`.
-
-    Args:
-        groups: how many; 0 for the root of the number of items, from 2 to 32.
+    """(n_items,) group of every item, from 0, by k-means of embeddings (n_items, D): at most so
+    many `groups` as there are different ones; 0 for the root of the number of items, from 2 to 32.
     """
     groups = groups or int(np.clip(round(len(embeddings) ** 0.5), 2, _MOST_ITEM_GROUPS))
     if groups == 1:
@@ -188,7 +172,7 @@ class BehaviorModel:
     """The same of the groups' shares in the logs, which ignore the state."""
     calibration_error: float
     """Mean absolute difference between what is predicted and what occurs, over groups and tenths
-    of the predicted probability, weighted by their steps."""
+    of the predicted probability."""
 
     def __str__(self) -> str:
         return (
@@ -205,13 +189,9 @@ def fit_behavior(
     seed: int,
     user: IntArray | None = None,
 ) -> BehaviorModel:
-    """Estimate the probabilities with which the logged items and their groups were chosen.
-
-    Args:
-        states: reads what was known before each step.
-        item: (N,) logged items; −1, unknown, gets probability 1 and is fitted on nowhere.
-        group: (N,) their groups, from 0.
-        session: (N,) as of `LoggedSteps`, as is `user`.
+    """Estimate the probabilities with which the logged items (N,) and their groups (N,), from 0,
+    were chosen; `session` and `user` as of `LoggedSteps`. Item −1, unknown, gets probability 1 and
+    is fitted on nowhere.
     """
     rng = np.random.default_rng(seed)
     owner = session if user is None else np.unique(user, return_inverse=True)[1][session]
@@ -233,8 +213,8 @@ def fit_behavior(
             bar.update()
     calibration = _calibrate(models, look_up, group, folds, sample)
     of_group, begin = np.ones(len(item)), 0
-    # By group and tenth of the probability: what is expected, and what occurs.
-    table = np.zeros((2, count, 10))
+    # By group and tenth of the probability: what is expected, less what occurs.
+    table = np.zeros((count, 10))
     for batch in states():
         part = slice(begin, begin + len(batch))
         probabilities = np.empty((len(batch), count))
@@ -243,20 +223,18 @@ def fit_behavior(
             probabilities[rows] = model.predict(batch[rows], *calibration)
         of_group[part] = np.take_along_axis(probabilities, group[part][:, None], axis=1)[:, 0]
         rows = np.flatnonzero(in_catalogue[part])
-        tenth = np.minimum((probabilities[rows] * 10).astype(np.int64), 9)
-        logged = group[part][rows]
-        np.add.at(table[0], (np.arange(count)[None, :], tenth), probabilities[rows])
-        np.add.at(table[1], (logged, tenth[np.arange(len(rows)), logged]), 1.0)
+        beyond = probabilities[rows]
+        tenth = np.minimum((beyond * 10).astype(np.int64), 9)
+        beyond[np.arange(len(rows)), group[part][rows]] -= 1
+        np.add.at(table, (np.arange(count), tenth), beyond)
         begin = part.stop
-    mean_shares = np.stack([model.shares for model in models])[
-        folds[in_catalogue], group[in_catalogue]
-    ]
+    shares = np.stack([model.shares for model in models])[folds, group]
     return BehaviorModel(
         group=np.where(in_catalogue, of_group, 1.0),
         item=np.where(in_catalogue, of_group * _item_shares(item, group, folds), 1.0),
         log_loss=float(-np.log(of_group[in_catalogue]).mean()),
-        share_log_loss=float(-np.log(mean_shares).mean()),
-        calibration_error=float(np.abs(table[0] - table[1]).sum() / max(table[1].sum(), 1.0)),
+        share_log_loss=float(-np.log(shares[in_catalogue]).mean()),
+        calibration_error=float(np.abs(table).sum() / max(in_catalogue.sum(), 1)),
     )
 
 
@@ -283,10 +261,9 @@ class _GroupModel:
         scores = self._model.decision_function(self._scale(states)) / temperature
         if scores.ndim == 1:
             scores = np.stack([-scores / 2, scores / 2], axis=1)
-        exponents = np.exp(scores - scores.max(axis=1, keepdims=True))
         probabilities = np.zeros((len(states), len(self.shares)))
-        probabilities[:, self._present] = exponents / exponents.sum(axis=1, keepdims=True)
-        return np.asarray((1 - share) * probabilities + share * self.shares)
+        probabilities[:, self._present] = softmax(scores, axis=1)
+        return (1 - share) * probabilities + share * self.shares
 
     def _scale(self, states: Float32Array) -> Float32Array:
         scaled = np.asarray(states - self._mean, dtype=np.float32)
@@ -328,8 +305,7 @@ def _calibrate(
 
 
 def _item_shares(item: IntArray, group: IntArray, folds: IntArray) -> Float64Array:
-    """(N,) share of the item among its group's steps in the other folds, one step added to each
-    item."""
+    """(N,) share of the item in its group in the other folds, one step added to each item."""
     in_catalogue, items, shares = item >= 0, int(item.max()) + 1, np.ones(len(item))
     group_of = np.zeros(items, dtype=np.int64)
     group_of[item[in_catalogue]] = group[in_catalogue]
@@ -342,15 +318,13 @@ def _item_shares(item: IntArray, group: IntArray, folds: IntArray) -> Float64Arr
 
 
 Chunks = Callable[[], Iterator[tuple[Float32Array, Float32Array]]]
-"""Reads the N steps from the start, some at once, in order: features (B, P) of state and logged
-action, the first of them 1, and (B, P) their mean over the evaluated policy's actions in the same
-states (what is linear in features has its exact mean over these actions)."""
+"""Reads the N steps in order, some at once: features (B, P) of state and logged action, the first
+of them 1, and (B, P) their mean over the evaluated policy's actions in the same states."""
 
 _RETURN_FOLDS: Final = 5
 _CLOSE = 1e-6
 _ROUNDS = 10
-"""Regressions of FQE for each step of the longest session, unless they settle before: a linear Q
-is still on its way when as many steps as there are have been looked ahead."""
+"""Regressions of FQE for each step of the longest session, unless they settle before."""
 
 
 @dataclass(frozen=True)
@@ -386,13 +360,8 @@ def fit_models(
     discount: float = 1.0,
 ) -> tuple[Modelled, ModelReport]:
     """Linear models of reward and Q, cross-fitted over at least two users: no session is predicted
-    by a model that saw it, nor by one that saw another session of its user.
-
-    Args:
-        reward: (N,) as of `LoggedSteps`, as are `session`, `user` and `discount`.
-
-    Returns:
-        What the models say of the N steps, and how good they are.
+    by a model that saw it, nor by one that saw another session of its user. What they say of the N
+    steps, and how good they are; arguments as of `LoggedSteps`.
     """
     sessions = np.arange(int(session[-1]) + 1)
     group = sessions if user is None else np.unique(user, return_inverse=True)[1]
@@ -407,7 +376,7 @@ def fit_models(
             _fit_to_others(sums, fold, reward[folds != fold], horizon, discount)
             for fold in range(len(sums.rows))
         ]
-        weights = np.stack([fit.weights for fit in fits], axis=2)
+        weights = np.stack([models for models, _, _ in fits], axis=2)
         predictions, begin = np.empty((2, 2, len(reward))), 0
         for batch in chunks():
             fold = folds[begin : begin + len(batch[0]), None]
@@ -426,8 +395,8 @@ def fit_models(
         reward_r2=1 - left / variance if variance > 0 else 0.0,
         td_loss=float((errors**2).mean()),
         td_bias=float(errors.mean()),
-        iterations=max(fit.iterations for fit in fits),
-        converged=all(fit.converged for fit in fits),
+        iterations=max(count for _, count, _ in fits),
+        converged=all(below for _, _, below in fits),
     )
 
 
@@ -444,21 +413,13 @@ class _Sums(NamedTuple):
     """(F,)."""
 
 
-class _Fit(NamedTuple):
-    weights: Float64Array
-    """(2, P) of the reward model and of Q."""
-    iterations: int
-    converged: bool
-
-
 def _fit_to_others(
     sums: _Sums, fold: int, reward: Float64Array, horizon: int, discount: float
-) -> _Fit:
-    """The models that know all folds but one, with the rewards of these others.
-
-    The ridge penalty counts features by their root mean square, and gives all P of them together
-    the variance of the noise; the constant goes free.
-    """
+) -> tuple[Float64Array, int, bool]:
+    """Weights (2, P) of the reward model and of Q that know all folds but one, with the rewards of
+    these others; how many regressions they took, and whether Q stayed in bounds."""
+    # The ridge penalty counts features by their root mean square, and gives all P of them together
+    # the variance of the noise; the constant goes free.
     gram, follows, rewards, rows = (total.sum(axis=0) - total[fold] for total in sums)
     mean_square = np.diag(sums.gram.sum(axis=0)) / int(sums.rows.sum())
     # A feature that is always 0 has no weight to find.
@@ -480,7 +441,7 @@ def _fit_to_others(
         change = weights - previous
         if change @ gram @ change / rows <= (_CLOSE * most) ** 2:
             break
-    return _Fit(np.stack([first, weights]), iterations, converged)
+    return np.stack([first, weights]), iterations, converged
 
 
 def _add_up(

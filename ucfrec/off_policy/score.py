@@ -1,7 +1,7 @@
 """Logs read as a policy's training logs were, and its probability of each logged choice."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import gettempdir
@@ -37,8 +37,13 @@ UNKNOWN_ITEMS = "unknown_item_rows"
 _STEPS_AT_ONCE = 1024
 _LOGITS_AT_ONCE = 2**24
 MOST_SEEN: Final = 0.05
-"""Largest share of rows seen in training with which an estimate is accepted. It is above 0 because
-with coarse timestamps some rows of other logs have the same user, item and time coincidentally."""
+"""Largest share of rows seen in training with which an estimate is accepted: with coarse timestamps
+rows of other logs may have the same user, item and time."""
+
+HISTORY_LACKING: Final = (
+    "the store of the run is gone or has changed: users are ranked without what they were shown "
+    "before these logs; move the run together with its store"
+)
 
 KeyArray = npt.NDArray[np.uint64]
 
@@ -51,21 +56,11 @@ class LoggedSessions:
     users: Array
     """(E,): identifier of each session's user."""
     report: dict[str, Any]
-    """Counts of what was read and dropped, for `ucfrec.logs.summary.format_report`; of a split of
-    a store, only "dropped"."""
+    """Counts of what was read and dropped (`format_report`); of a split, only "dropped"."""
     rows: UserRows
     """The rows of the users, those of the run's store too."""
     unknown_items: int = 0
     """Number of steps that show an item which the run does not know."""
-
-    @property
-    def history_lacking(self) -> str:
-        """A warning where users are taken to have no earlier rows; empty otherwise."""
-        text = (
-            "the store of the run is gone or has changed: users are ranked without what they were "
-            "shown before these logs; move the run together with its store"
-        )
-        return text if self.rows.earlier is None else ""
 
 
 @dataclass(frozen=True)
@@ -87,27 +82,23 @@ class ScoredSteps:
     returns_left: Tensor
     """(B,) target return less the session's reward before the step."""
     features: Tensor | None
-    """(B, d) last-layer features of the policy's window; None of a policy that is not a network of
-    features (item-knn, crm-greedy)."""
+    """(B, d) last-layer features of the policy's window; None of item-knn and crm-greedy."""
 
 
-@contextmanager
 def read_logged_sessions(
     trained: TrainedPolicy,
     files: Sequence[Path],
     mapping: LogMapping,
     keep_unknown: bool = False,
     memory_limit: str = "2GB",
-) -> Iterator[LoggedSessions]:
+) -> AbstractContextManager[LoggedSessions]:
     """Read logs in the same way as the training logs of a run; they are on disk until the block of
     this context manager ends.
 
     Args:
-        mapping: which columns of the logs mean what; what it leaves open is as in the training
-            logs.
-        keep_unknown: keep rows whose item the run does not know, as item −1, and count them in
-            `LoggedSessions.unknown_items`; else they are dropped and counted in the report.
-        memory_limit: of the process while it reads, such as "2GB"; rows spill to disk.
+        mapping: which columns mean what; what it leaves open is as in the training logs.
+        keep_unknown: keep rows whose item the run does not know, as item −1; else they are dropped
+            and counted in the report.
 
     Raises:
         InputError: the policy's actions are vectors, the logs cannot be used, none of their items
@@ -115,8 +106,7 @@ def read_logged_sessions(
     """
     require_items(trained)
     mapping, options = training_options(trained, mapping, memory_limit)
-    with prepare_sessions(trained, files, mapping, options, keep_unknown) as logged:
-        yield logged
+    return prepare_sessions(trained, files, mapping, options, keep_unknown)
 
 
 def training_options(
@@ -159,7 +149,6 @@ def prepare_sessions(
             strangers = report["users"] - int((numbers >= 0).sum())
             name, where = str(files[0]), "the run was trained on"
             note_unknown(name, schema.USER_ID, strangers, report["users"], where)
-        store = _select_observations(store, trained)
         users = np.asarray(pq.read_table(folder / EPISODE_USERS).column(schema.USER_ID))
         store, rows = _add_history(trained, store, users, _readable_store(trained))
         yield LoggedSessions(store, users, report, rows, unknown)
@@ -169,8 +158,8 @@ def _add_history(
     trained: TrainedPolicy, store: EpisodeStore, users: Array, earlier: EpisodeStore | None
 ) -> tuple[EpisodeStore, UserRows]:
     """The sessions and all rows of their users; earlier rows of a session that goes on are a part
-    of it, as in `recommend`. Session ids of the store are not kept: such sessions begin with the
-    logs."""
+    of it, as in `recommend`, but where sessions have ids, which the store does not keep."""
+    store = _select_observations(store, trained)
     if earlier is not None:
         earlier = _select_observations(earlier, trained)
     rows = UserRows.of(store, users, earlier)
@@ -198,11 +187,8 @@ def score_steps(
     seen: UserRows | None = None,
 ) -> Iterator[ScoredSteps]:
     """Compute the policy's probabilities at every step of `store`, in order and in batches, under
-    its own rule or another.
-
-    Args:
-        seen: rows of the users; items that a user was shown before a step are excluded there, as
-            `recommend` and `serve` exclude them by default. None to exclude none.
+    its own rule or another; with `seen`, the rows of the users, without what a user was shown
+    before a step, as `recommend` and `serve` do by default.
     """
     n_items, total, scorer = len(trained.items), store.n_steps, trained.scorer(rule)
     at_once = max(1, min(_STEPS_AT_ONCE, _LOGITS_AT_ONCE // n_items))
@@ -214,7 +200,14 @@ def score_steps(
             shown = seen_before(store, episodes, steps) if scorer.rule.exclude_seen else None
             windows = scorer.windows(sessions)
             query = scorer.query(sessions, windows)
-            excluded = None if seen is None else _find_seen_items(seen, numbers, n_items)
+            excluded = None
+            if seen is not None:
+                rows, seen_items = seen.seen(numbers)
+                pairs = np.unique((rows * n_items + seen_items)[seen_items < n_items])
+                rows, seen_items = np.divmod(pairs, n_items)
+                # A step that would have no item left excludes none.
+                left = np.bincount(rows, minlength=len(numbers))[rows] < n_items
+                excluded = torch.from_numpy(rows[left]), torch.from_numpy(seen_items[left])
             scores = scorer.scores_of(query, excluded, shown)
             items = store.step_values(schema.ITEM, episodes, steps).astype(np.int64)
             yield ScoredSteps(
@@ -230,51 +223,40 @@ def score_steps(
             bar.update(len(steps))
 
 
-def _find_seen_items(seen: UserRows, steps: IntArray, n_items: int) -> tuple[Tensor, Tensor]:
-    """Rows (M,) and items (M,) of what users were shown before steps; none of a row that would
-    have no item left."""
-    rows, items = seen.seen(steps)
-    in_catalogue = items < n_items
-    pairs = np.unique(rows[in_catalogue] * n_items + items[in_catalogue])
-    rows, items = np.divmod(pairs, n_items)
-    some_left = np.bincount(rows, minlength=len(steps))[rows] < n_items
-    return torch.from_numpy(rows[some_left]), torch.from_numpy(items[some_left])
-
-
 def score(
     trained: TrainedPolicy,
     logged: LoggedSessions,
     rule: DecisionRule | None = None,
     filter_seen: bool = False,
 ) -> Iterator[pd.DataFrame]:
-    """Compute the policy's probability of every logged choice, under its own rule or another.
-
-    Args:
-        logged: the logs, without unknown items.
-        filter_seen: exclude items that the user was shown before a step.
+    """Compute the policy's probability of every logged choice, under its own rule or another, in
+    logs without unknown items; with `filter_seen`, without what users were shown before a step.
 
     Yields:
         Frames, one row a logged step, in order of user, session and time: `user_id`, `session`
-        (number, from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (where the logs have
-        one), `probability` of the logged item under the rule, its `rank` (from 1) among all items,
-        and `greedy_item_id`, the best one.
+        (from 0), `timestamp` (ms), `item_id`, `reward`, `propensity` (if logged), `probability` of
+        the logged item, its `rank` (from 1) among all, and `greedy_item_id`, the best one.
     """
     store, item_ids = logged.store, trained.items.ids
     for batch in score_steps(trained, store, rule, logged.rows if filter_seen else None):
-        column, places = batch.items.unsqueeze(1), (batch.episodes, batch.steps)
+        column = batch.items.unsqueeze(1)
+        values: dict[str, Any] = {
+            name: store.step_values(name, batch.episodes, batch.steps)
+            for name in (schema.TIMESTAMP, schema.REWARD, schema.PROPENSITY)
+            if name in store.record.columns
+        }
+        probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
+        better = batch.scores > batch.scores.gather(1, column)
         columns = {
             schema.USER_ID: logged.users[batch.episodes],
             SESSION: batch.episodes,
-            schema.TIMESTAMP: store.step_values(schema.TIMESTAMP, *places),
+            schema.TIMESTAMP: values.pop(schema.TIMESTAMP),
             schema.ITEM_ID: item_ids[batch.items.numpy()],
-            schema.REWARD: store.step_values(schema.REWARD, *places),
+            **values,
+            PROBABILITY: probability.numpy(),
+            RANK: 1 + better.sum(1).numpy(),
+            GREEDY: item_ids[batch.scores.argmax(1).numpy()],
         }
-        if schema.PROPENSITY in store.record.columns:
-            columns[schema.PROPENSITY] = store.step_values(schema.PROPENSITY, *places)
-        probability = batch.log_probabilities.gather(1, column)[:, 0].double().exp()
-        columns[PROBABILITY] = probability.numpy()
-        columns[RANK] = 1 + (batch.scores > batch.scores.gather(1, column)).sum(1).numpy()
-        columns[GREEDY] = item_ids[batch.scores.argmax(1).numpy()]
         yield pd.DataFrame(columns)
 
 
@@ -284,11 +266,8 @@ def about_scores(trained: TrainedPolicy, rule: DecisionRule | None = None) -> di
 
 
 def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
-    """The test split of the store that policies were trained on, whose rows none of them has seen.
-
-    Raises:
-        InputError: the actions are vectors, the store is gone or has no test split, or a policy is
-            a refit, trained on all rows.
+    """The test split of the store that policies were trained on; InputError if the actions are
+    vectors, the store is gone or has no test split, or a policy is a refit, trained on all rows.
     """
     for policy in trained:
         require_items(policy)
@@ -303,8 +282,7 @@ def held_out_sessions(trained: Sequence[TrainedPolicy]) -> LoggedSessions:
         raise InputError(f"{store.path} has no test split; name later logs")
     users = test.episode_values(schema.USER)
     earlier = np.flatnonzero(store.episode_values(schema.SPLIT) != schema.SPLITS.index("test"))
-    sessions = _select_observations(test, first)
-    sessions, rows = _add_history(first, sessions, users, store.select(earlier))
+    sessions, rows = _add_history(first, test, users, store.select(earlier))
     return LoggedSessions(sessions, users, {"dropped": {}}, rows)
 
 
@@ -318,18 +296,16 @@ def require_items(trained: TrainedPolicy) -> None:
 
 
 def share_seen(trained: TrainedPolicy, logged: EpisodeStore) -> float | None:
-    """The share of logged rows that are in the run's training or validation data; None if the run's
-    store has been moved, deleted or changed.
-
-    Rows are the same if their user, item and time are, which both stores number alike
-    (`ucfrec.logs.prepare(like=…)`). A refit was trained on its test split too.
+    """The share of logged rows whose user, item and time are in the run's training or validation
+    data, for a refit in its test split too; None if the run's store has been moved, deleted or
+    changed. Both stores number users and items alike (`ucfrec.logs.prepare(like=…)`).
     """
     record = trained.record
     if record.fingerprint == logged.record.fingerprint:
-        held_out = np.zeros(logged.n_episodes, dtype=bool)
+        in_training = np.ones(logged.n_episodes, dtype=bool)
         if record.refit_of is None:
-            held_out = logged.episode_values(schema.SPLIT) == schema.SPLITS.index("test")
-        return float((~held_out)[logged.all_steps()[0]].mean())
+            in_training = logged.episode_values(schema.SPLIT) != schema.SPLITS.index("test")
+        return float(in_training[logged.all_steps()[0]].mean())
     return share_of_rows_seen(trained, np.concatenate(list(_hash_store(logged))))
 
 
@@ -357,21 +333,19 @@ def _readable_store(trained: TrainedPolicy) -> EpisodeStore | None:
 
 def seen_too_often(seen: float | None) -> list[str]:
     """What to say of a share of rows seen in training (`share_seen`); nothing if it is small."""
-    if seen is None or seen <= MOST_SEEN:
-        return []
-    return [
-        f"{seen:.0%} of the rows were seen in training: on these a policy looks "
+    text = (
+        f"{seen or 0:.0%} of the rows were seen in training: on these a policy looks "
         "better than it is; give later logs, or no logs for the test split"
-    ]
+    )
+    return [text] if seen is not None and seen > MOST_SEEN else []
 
 
 def _hash_store(store: EpisodeStore) -> Iterator[KeyArray]:
     """`hash_rows` of all steps, some at a time, in order."""
     users: Array = store.episode_values(schema.USER)
     for episodes, steps in store.step_batches() if store.n_episodes else ():
-        items, times = (
-            store.step_values(name, episodes, steps) for name in (schema.ITEM, schema.TIMESTAMP)
-        )
+        items = store.step_values(schema.ITEM, episodes, steps)
+        times = store.step_values(schema.TIMESTAMP, episodes, steps)
         yield hash_rows(users[episodes], items, times)
 
 

@@ -1,8 +1,7 @@
 """Scored rows of any number: written by workers of Spark, and the return that follows from them.
 
-For an estimate the rows are read twice, in batches, and summed to sessions: in memory is a row a
-session. What needs models of the reward (DM, FQE, DR) or the probabilities of other items (MIPS)
-needs the logs.
+The rows are read twice, in batches, and summed to sessions, one row each in memory.
+DM, FQE, DR and MIPS need the logs.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -57,12 +57,8 @@ def evaluate_scored(
     seed: int,
     options: EstimateOptions,
 ) -> OffPolicyReport:
-    """Estimate the mean return of a session under a policy, from what `score` made of logs.
-
-    Args:
-        paths: files of `score`, or folders of their parts.
-        rule: the decision rule, by which the rows were scored.
-        seed: of the bootstrap.
+    """Estimate the mean return of a session under a policy, from files of `score`, or
+    folders of their parts.
 
     Raises:
         InputError: a file is missing, damaged, has no propensities, was scored by another run or
@@ -73,11 +69,9 @@ def evaluate_scored(
             "pages, estimated propensities and a reward range (of single steps) need the logs; "
             "leave --scored out"
         )
-    files = [
-        file
-        for path in map(Path, paths)
-        for file in (sorted(path.glob("*.parquet")) if path.is_dir() else [path])
-    ]
+    files: list[Path] = []
+    for path in map(Path, paths):
+        files += sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     if not files:
         raise InputError(f"{paths[0]} has no .parquet file; name what ucfrec score wrote")
     described = [_read_metadata(file, trained, rule) for file in files]
@@ -91,7 +85,7 @@ def evaluate_scored(
             keys.append(hash_rows(users, items, times))
     seen = share_of_rows_seen(trained, np.concatenate(keys))
     evidence = Evidence(sessions, rows, {"seen_in_training": seen})
-    evidence.remarks = ["from scored rows: without models of the reward there is no DR"]
+    evidence.remarks.append("from scored rows: without models of the reward there is no DR")
     counts = [(metadata.metadata or {}).get(UNKNOWN_ITEMS.encode(), b"") for metadata in described]
     if not all(count.isdigit() for count in counts):
         evidence.remarks.append(
@@ -191,7 +185,7 @@ def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedStep
         if not steps.lacking.all():
             part = StepSums.of(steps.weighable, steps.weighable.reward)
             sums = part if sums is None else sums + part
-    columns: list[tuple[Array, ...]] = []
+    parts = []
     for steps, users in _read_steps(files, options.discount):
         complete = ~steps.lacking
         weights = np.full(len(complete), np.nan)
@@ -202,19 +196,21 @@ def _sum_sessions(files: Sequence[Path], options: EstimateOptions) -> LoggedStep
             per_decision[complete] = some.per_session(some.discounts * some.weights * some.reward)
             if sums.totals.all():
                 by_step[complete] = normalise_by_step(some, some.reward, None, sums)
-        columns.append((users, steps.returns, weights, per_decision, by_step))
-    if not columns:
+        values = {"returns": steps.returns, "per_decision": per_decision, "by_step": by_step}
+        parts.append(pd.DataFrame({"user": users, "weight": weights, **values}))
+    if not parts:
         raise InputError(f"{files[0]} has no rows; give logs with rows of known items to score")
-    users, returns, weights, per_decision, by_step = map(np.concatenate, zip(*columns, strict=True))
+    rows = pd.concat(parts, ignore_index=True)
+    weights = rows["weight"].to_numpy()
     heaviest = np.fmax(weights, 1.0)
     return LoggedSteps(
-        session=np.arange(len(users)),
-        reward=returns,
+        session=np.arange(len(rows)),
+        reward=rows["returns"].to_numpy(),
         propensity=np.where(np.isnan(weights), np.nan, 1 / heaviest),
         target=np.nan_to_num(weights) / heaviest,
-        user=users if options.users_known else None,
-        per_decision=per_decision,
-        by_step=by_step,
+        user=rows["user"].to_numpy() if options.users_known else None,
+        per_decision=rows["per_decision"].to_numpy(),
+        by_step=rows["by_step"].to_numpy(),
     )
 
 
@@ -230,13 +226,11 @@ def score_with_spark(
     filter_seen: bool = False,
     memory_limit: str = "2GB",
 ) -> int:
-    """Write the probability of every choice of logs, as `score` finds it; returns how many sessions
-    there are.
+    """Write the probability of every choice of logs, as `score` finds it, to Parquet parts in the
+    folder `out`, sessions numbered throughout; returns how many sessions there are.
 
     Args:
         files: logs, which every worker sees, as the run folder and `out`.
-        mapping: of the logs' columns; what it leaves open is as in the training logs.
-        out: folder for the scores, Parquet parts with sessions numbered throughout.
         master: Spark's master, e.g. "local[*]" or "spark://host:7077".
         checkpoint: with which `trained` was loaded.
         memory_limit: of a worker while it reads its rows.

@@ -1,15 +1,13 @@
 """Choosing among several policies, target returns or rules by estimates from the same logs.
 
-The largest of several estimates is too large: what was chosen was also lucky. And one interval at a
-time does not hold for the one that was picked after seeing all. Hence three things are computed
-together, from one bootstrap that draws users and treats all candidates alike:
+The largest of several estimates is too large: what was chosen was also lucky. Hence three things
+are computed together, from one bootstrap that draws users and treats all candidates alike:
 
-- a simultaneous band: with 95% probability it holds the values of all candidates (max-t: Romano &
-  Wolf, Econometrica 2005), whichever is then chosen;
+- a band that holds the values of all candidates with 95% probability (max-t: Romano & Wolf,
+  Econometrica 2005);
 - the probability of being best, the share of resamples in which a candidate is first;
 - the value of the chosen one without its luck: what the first of a resample loses, on average,
-  when it is valued by the whole sample (bias of a maximum by bootstrap: Efron & Tibshirani 1993,
-  chapter 10).
+  when it is valued by the whole sample (Efron & Tibshirani 1993, chapter 10).
 """
 
 import math
@@ -21,7 +19,7 @@ import numpy as np
 
 from ucfrec.arrays import Float64Array, IntArray
 from ucfrec.errors import InputError
-from ucfrec.off_policy.estimators import Resamples, resample
+from ucfrec.off_policy.estimators import resample
 
 if TYPE_CHECKING:
     from ucfrec.off_policy.evaluate import OffPolicyReport
@@ -55,8 +53,8 @@ class Selection:
     corrected: float
     """Value of the first without the luck of having been chosen."""
     regret: float
-    """With 95% confidence the first is at most this far below the best of them; 0 if it is
-    best beyond doubt (Hsu, Annals of Statistics 1984, with the clustered bootstrap)."""
+    """With 95% confidence the first is at most this far below the best of them (Hsu, Annals of
+    Statistics 1984, with the clustered bootstrap)."""
     excluded: Mapping[str, str] = field(default_factory=dict)
     """Name of each candidate that is not ranked, and what forbids a conclusion on it."""
 
@@ -70,10 +68,8 @@ class Selection:
             return f"{first.name} is the only candidate"
         sure = f"best with probability {first.probability_best:.2f}"
         if self.regret == 0:
-            return (
-                f"No other has a higher value than {first.name}: "
-                f"{self.corrected:.4g} per session, {sure}"
-            )
+            value = f"{self.corrected:.4g} per session, {sure}"
+            return f"No other has a higher value than {first.name}: {value}"
         return (
             f"{first.name} comes first: {self.corrected:.4g} per session once corrected for the "
             f"choice ({first.value:.4g} before), {sure}, at most {self.regret:.4g} below the best"
@@ -82,32 +78,25 @@ class Selection:
     def columns(self, name: str) -> dict[str, Any]:
         """What the rows of a candidate record of it."""
         columns: dict[str, Any] = {"selection": self.headline}
-        for standing in self.standings:
-            if standing.name == name:
-                columns |= {
-                    "band_low": standing.low,
-                    "band_high": standing.high,
-                    "probability_best": standing.probability_best,
-                    "rank": standing.rank,
-                    "candidates": len(self.standings),
-                }
-                if standing.rank == 1:
-                    columns |= {"corrected": self.corrected, "regret": self.regret}
+        standing = next((place for place in self.standings if place.name == name), None)
+        if standing is not None:
+            columns |= {"band_low": standing.low, "band_high": standing.high}
+            columns |= {"probability_best": standing.probability_best, "rank": standing.rank}
+            columns["candidates"] = len(self.standings)
+            if standing.rank == 1:
+                columns |= {"corrected": self.corrected, "regret": self.regret}
         return columns
 
 
 def select(
     names: Sequence[str], terms: Float64Array, seed: int, user: IntArray | None = None
 ) -> Selection:
-    """Rank candidates by estimates on the same sessions.
+    """Rank K candidates by estimates on the same sessions.
 
     Args:
-        names: K candidates.
-        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR.
+        terms: (S, K) whose means over sessions are the estimates, e.g. `influences` of DR;
+            InputError if shapes differ or one is not finite.
         user: (S,) whose session each is; None where each is of another user.
-
-    Raises:
-        InputError: there is no candidate, shapes differ, or a term is not finite.
     """
     if terms.ndim != 2 or terms.shape[1] != len(names) or not len(names) or not len(terms):
         raise InputError(f"terms have shape {terms.shape}; give a column to each of {len(names)}")
@@ -115,15 +104,15 @@ def select(
         raise InputError(f"terms are not finite at {(~np.isfinite(terms)).sum()} places")
     resamples = resample(terms, np.ones_like(terms), user, seed)
     value, error = resamples.value, resamples.error
-    half = _critical(np.abs(_studentise(resamples))) * error
+    half = _critical(np.abs(resamples.studentised)) * error
     again = value + resamples.shift
     best = again == again.max(axis=1, keepdims=True)
     share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
     standings = []
+    columns = np.stack([value, error, value - half, value + half, share], axis=1).tolist()
     for rank, k in enumerate(np.argsort(-value, kind="stable"), start=1):
-        low, high = float(value[k] - half[k]), float(value[k] + half[k])
-        worth, best_share = float(value[k]), float(share[k])
-        standings.append(Standing(names[k], worth, float(error[k]), low, high, best_share, rank))
+        worth, spread, low, high, best_share = columns[k]
+        standings.append(Standing(names[k], worth, spread, low, high, best_share, rank))
     # What the first of each resample is worth there, beyond its worth in the whole sample.
     luck = resamples.shift[np.arange(len(again)), again.argmax(axis=1)].mean()
     first = int(np.argmax(value))
@@ -132,34 +121,21 @@ def select(
         # Upper end of how much better than the first any other may be.
         lead = np.delete(terms, first, axis=1) - terms[:, [first]]
         leads = resample(lead, np.ones_like(lead), user, seed)
-        upper = leads.value + _critical(-_studentise(leads)) * leads.error
+        upper = leads.value + _critical(-leads.studentised) * leads.error
         # Candidates that never differ are neither better nor worse.
-        regret = float(upper[leads.spreads].max(initial=0.0))
+        differ = np.isfinite(leads.studentised).any(axis=0)
+        regret = float(upper[differ].max(initial=0.0))
     return Selection(tuple(standings), corrected, regret)
 
 
-def _studentise(resamples: Resamples) -> Float64Array:
-    """(B, K) deviations in standard errors of the resample; 0 where there is none."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        deviations = resamples.shift / resamples.errors
-    return np.where(resamples.usable & resamples.spreads, deviations, 0.0)
-
-
 def _critical(deviations: Float64Array) -> float:
-    """Quantile of the largest deviation over candidates."""
-    return float(np.quantile(deviations.max(axis=1), LEVEL))
+    """Quantile of the largest deviation over candidates, 0 of one without a spread."""
+    return float(np.quantile(np.nan_to_num(deviations).max(axis=1), LEVEL))
 
 
 def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
-    """Rank the candidates whose verdicts stand.
-
-    Args:
-        reports: of each candidate by name, all made from the same logs.
-        seed: draws the bootstrap's resamples.
-
-    Raises:
-        InputError: the candidates' runs read the logs as different sessions or rewards.
-    """
+    """Rank the candidates, by name, whose verdicts stand; InputError if their runs read the logs as
+    different sessions or rewards."""
     first, *names = reports
     returns = reports[first].returns
     for name in names:
@@ -170,13 +146,15 @@ def choose(reports: "Mapping[str, OffPolicyReport]", seed: int) -> Selection:
                 "stores were prepared in different ways), so their estimates cannot be compared; "
                 "evaluate them one at a time"
             )
-    verdicts = {name: report.verdict for name, report in reports.items()}
-    excluded = {name: "; ".join(v.reasons) for name, v in verdicts.items() if not v.reliable}
-    terms = {name: report.terms for name, report in reports.items() if name not in excluded}
-    columns = [values for values in terms.values() if values is not None]
-    if not columns:
+    excluded, terms = dict[str, str](), dict[str, Float64Array]()
+    for name, report in reports.items():
+        if report.verdict.reliable and report.terms is not None:
+            terms[name] = report.terms
+        else:
+            excluded[name] = "; ".join(report.verdict.reasons)
+    if not terms:
         return Selection((), math.nan, math.nan, excluded)
-    ranked = select(list(terms), np.stack(columns, axis=1), seed, reports[first].user)
+    ranked = select([*terms], np.stack([*terms.values()], axis=1), seed, reports[first].user)
     return replace(ranked, excluded=excluded)
 
 

@@ -1,8 +1,8 @@
 """Whether to believe an off-policy estimate, and what it says: computed, in plain words.
 
-With true propensities, and a behavior policy that could choose whatever the evaluated policy may,
-ratios have mean 1 at every step, and so have their products. Means below 1 come of choices that the
-logs lack or of propensities that are too large; means above 1 of propensities that are too small.
+With true propensities, ratios have mean 1 at every step, and so have their products. Means below 1
+come of choices that the logs lack or of propensities that are too large; means above 1 of too small
+ones.
 """
 
 import math
@@ -14,15 +14,19 @@ from typing import Any, Final
 import numpy as np
 
 from ucfrec.arrays import BoolArray, Float64Array, IntArray
-from ucfrec.off_policy.estimators import cluster_intervals, cluster_mean, session_terms
+from ucfrec.off_policy.estimators import (
+    NO_INTERVAL,
+    cluster_intervals,
+    cluster_mean,
+    session_terms,
+)
 from ucfrec.off_policy.logged_steps import LoggedSteps
 from ucfrec.results.statistics import effective_number
 
 ENOUGH_TO_TEST: Final = 30
 """Users below which a mean weight is not tested."""
 ENOUGH_USERS: Final = 200
-"""Effective users below which no estimate stands: in `benchmarks/off_policy_coverage.py` intervals
-of fewer hold the truth too seldom."""
+"""Effective users below which no estimate stands (`benchmarks/off_policy_coverage.py`)."""
 ENOUGH_REWARDED: Final = 30
 """Users with weight and reward."""
 LEAST_SHOWN: Final = 0.01
@@ -32,8 +36,7 @@ DOMINANT: Final = 0.1
 HEAVY_TAIL: Final = 0.5
 """Pareto shape from which on the variance is infinite, and no interval means anything."""
 FAR_OFF: Final = 0.1
-"""A mean session weight further from 1 shows that the heaviest sessions are missing, or too many,
-though their number may be too small for a test to show it."""
+"""Distance of a mean session weight from 1 that counts, though no test may show it."""
 MOST_LEFT_OUT: Final = 0.05
 """Largest share of sessions, or rows, without which an estimate stands."""
 _SIGNIFICANCE, _TOLERANCE, _ERRORS = 0.01, 0.02, 3.0
@@ -66,8 +69,7 @@ class Diagnosis:
     """Mean ratio of steps; None where nothing can be weighed, as in the rest."""
     tests: tuple[WeightTest, ...] = ()
     effective_by_step: tuple[float, ...] = ()
-    """(T,) effective users at each step, of the products up to it; empty of steps that are sums of
-    sessions."""
+    """(T,) effective users at each step, of the products up to it; empty of sums of sessions."""
     effective_users: float = 0.0
     """Of the session products, summed by user."""
     largest_weight: float = 1.0
@@ -79,8 +81,8 @@ class Diagnosis:
     tail: float | None = None
     """Shape k of the Pareto tail of the weights (`pareto_tail`)."""
     bounds: tuple[float, float] | None = None
-    """Between these lies the value if the propensities are true, whatever the choices that the logs
-    lack are worth; up to the sampling error of PDIS. None of steps that are sums of sessions."""
+    """Of the value, if propensities are true, whatever the choices that the logs lack are worth;
+    up to the sampling error of PDIS. None of steps that are sums of sessions."""
 
     def as_columns(self) -> dict[str, Any]:
         """What speaks against the estimates, by name."""
@@ -89,18 +91,17 @@ class Diagnosis:
             "users": self.users,
             "sessions_without_propensity": self.left_out,
             "effective_users": self.effective_users,
-            "effective_by_step": list(self.effective_by_step),
+            "effective_by_step": self.effective_by_step,
             "unsupported_from_step": self.unsupported_from_step,
             "weight_tests": [asdict(test) for test in self.tests],
             "mean_weight": self.mean_weight,
             "pareto_tail": self.tail,
-            "bounds": None if self.bounds is None else list(self.bounds),
+            "bounds": self.bounds,
         }
 
     @property
     def unsupported_from_step(self) -> int | None:
-        """First step (from 1) with fewer effective users than an estimate needs; None if the logs
-        suffice to the end."""
+        """First step (from 1) with fewer effective users than an estimate needs, if any."""
         places = enumerate(self.effective_by_step, start=1)
         return next((place for place, users in places if users < ENOUGH_USERS), None)
 
@@ -110,11 +111,8 @@ def diagnose(
     reward_range: tuple[float, float] | None = None,
     segment: IntArray | None = None,
 ) -> Diagnosis:
-    """Look for what forbids an estimate.
-
-    Args:
-        reward_range: least and greatest reward of a step; None for those observed.
-        segment: (S,) number of each session's segment (of users, of weeks), tested alone.
+    """Look for what forbids an estimate: `reward_range` is the least and greatest reward of a step,
+    None for those observed; each segment (S,) of sessions, of users or weeks, is tested alone.
     """
     incomplete, users = steps.lacking, int(steps.users.max()) + 1
     if incomplete.all():
@@ -123,21 +121,30 @@ def diagnose(
     weights = weighable.session_weights
     by_user = np.bincount(weighable.users, weights).astype(np.float64)
     rewarded = np.bincount(weighable.users, np.abs(weights * weighable.returns))
-    summed = weighable.per_decision is not None
-    reward_range = reward_range or (float(steps.reward.min()), float(steps.reward.max()))
+    # An ended session keeps the weight of its last step.
+    totals, effective = np.bincount(weighable.users).astype(np.float64), []
+    changes = weighable.weights - weighable.shift(weighable.weights)
+    step_user = weighable.users[weighable.session]
+    for rows in _rows_by_place(weighable):
+        totals = np.maximum(totals + np.bincount(step_user[rows], changes[rows], len(totals)), 0)
+        effective.append(effective_number(totals))
+    bounds = None
+    if weighable.per_decision is None:
+        observed = float(steps.reward.min()), float(steps.reward.max())
+        bounds = identification_bounds(weighable, reward_range or observed)
     return Diagnosis(
         sessions=len(incomplete),
         users=users,
         left_out=int(incomplete.sum()),
         overlap=float((weighable.target / weighable.propensity).mean()),
         tests=weight_tests(weighable, None if segment is None else segment[~incomplete]),
-        effective_by_step=() if summed else _effective_by_step(weighable),
+        effective_by_step=tuple(effective),
         effective_users=effective_number(by_user),
         largest_weight=float(by_user.max() / by_user.sum()) if by_user.any() else 1.0,
         rewarded_users=int((rewarded > 0).sum()),
         mean_weight=float(weights.mean()),
         tail=pareto_tail(by_user),
-        bounds=None if summed else identification_bounds(weighable, reward_range),
+        bounds=bounds,
     )
 
 
@@ -146,16 +153,13 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     those of each segment (S,) and item group. Errors are clustered by user; what fewer than 30
     users have is excluded. A mean passes within 2% of 1, or if it is not significantly away from
     it: 1% for all tests together (Bonferroni).
-
-    Over all steps, the ratios of an item group's own have the mean of the evaluated policy's
-    probability of the group; their quotient is tested.
     """
     ratios, weights = steps.target / steps.propensity, steps.session_weights
     step_user = steps.users[steps.session]
-    samples = []
-    # Of sums of sessions the ratios are the session products.
-    for place, rows in enumerate(_rows_by_place(steps) if steps.per_decision is None else []):
-        samples.append((f"step {place + 1}", ratios[rows], step_user[rows]))
+    samples = [
+        (f"step {place}", ratios[rows], step_user[rows])
+        for place, rows in enumerate(_rows_by_place(steps), start=1)
+    ]
     samples.append((SESSION_PRODUCTS, weights, steps.users))
     for number in [] if segment is None else np.unique(segment):
         inside = segment == number
@@ -167,6 +171,7 @@ def weight_tests(steps: LoggedSteps, segment: IntArray | None = None) -> tuple[W
     ]
     if steps.groups is not None:
         for number, target in enumerate(steps.groups.target.T):
+            # Over all steps, the group's ratios have the mean of its probability.
             inside = steps.groups.number == number
             expected = target.astype(np.float64)
             share = float(expected.mean())
@@ -190,30 +195,25 @@ def check_mean_weight(name: str, weights: Float64Array, user: IntArray) -> Weigh
 def check_catalogue_size(
     steps: LoggedSteps, in_catalogue: BoolArray, items: int
 ) -> WeightTest | None:
-    """Test that the propensities of a catalogue can add up to 1.
-
-    The mean of 1 / propensity over the logged choices in the catalogue (N,) of `items` items is the
-    number of these that the behavior policy chose from, at most all of them: a one-sided test, at
-    1%, of the share of the items. None with fewer than 30 users that have a propensity.
-    """
+    """One-sided test, at 1%, that the mean of 1 / propensity over the logged choices in the
+    catalogue (N,), the number of items that the behavior policy chose from, is at most `items`;
+    None with fewer than 30 users that have a propensity."""
     rows = np.flatnonzero(~np.isnan(steps.propensity))
     user = steps.users[steps.session[rows]]
     if len(np.unique(user)) < ENOUGH_TO_TEST:
         return None
     shares = np.where(in_catalogue[rows], 1 / steps.propensity[rows], 0.0) / items
     mean, error = cluster_mean(shares, user)
-    limit = NormalDist().inv_cdf(1 - _SIGNIFICANCE)
-    passed = mean - 1 <= max(_TOLERANCE, limit * error)
+    passed = mean - 1 <= max(_TOLERANCE, NormalDist().inv_cdf(1 - _SIGNIFICANCE) * error)
     return WeightTest("items to choose from", mean, error, passed)
 
 
 def pareto_tail(weights: Float64Array) -> float | None:
     """Shape k of a generalised Pareto distribution fitted to the largest weights (n,).
 
-    From 0.5 on the variance is infinite; from 0.7 on a mean, and its interval, is unreliable
-    whatever the sample (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted by Zhang &
-    Stephens, Technometrics 2009. None where the largest fifth, or 3√n, have fewer than ten
-    different values: no tail.
+    From 0.5 on the variance is infinite (Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 2024). Fitted
+    by Zhang & Stephens, Technometrics 2009. None where the largest fifth, or 3√n, have fewer than
+    ten different values: no tail.
     """
     size = int(min(0.2 * len(weights), 3 * len(weights) ** 0.5))
     ordered = np.sort(weights)
@@ -239,8 +239,7 @@ def identification_bounds(
 
     At step t a share 1 − E_n[w_t] of the evaluated policy's sessions has left what the logs support
     (Manski 1990, for weights: Khan et al., AISTATS 2024); each of their steps has a reward in
-    `reward_range`, or nothing once the session has ended. No session is longer than the longest
-    logged.
+    `reward_range`, or nothing once the session, not longer than the longest logged, has ended.
     """
     totals = steps.step_totals() / len(steps.first)
     unsupported = np.maximum(1 - totals, 0)
@@ -254,21 +253,11 @@ def identification_bounds(
 
 
 def _rows_by_place(steps: LoggedSteps) -> list[IntArray]:
-    """The rows of every place in a session, sessions in order."""
+    """The rows of every place in a session, sessions in order; none of sums of sessions."""
+    if steps.per_decision is not None:
+        return []
     order = np.argsort(steps.step, kind="stable")
     return np.split(order, np.cumsum(np.bincount(steps.step))[:-1])
-
-
-def _effective_by_step(steps: LoggedSteps) -> tuple[float, ...]:
-    users, weights = steps.users, steps.weights
-    changes = weights - steps.shift(weights)
-    # An ended session keeps the weight of its last step.
-    totals, effective = np.bincount(users).astype(np.float64), []
-    for rows in _rows_by_place(steps):
-        change = np.bincount(users[steps.session[rows]], changes[rows], len(totals))
-        totals = np.maximum(totals + change, 0)
-        effective.append(effective_number(totals))
-    return tuple(effective)
 
 
 BEST_FIRST: Final = ("DR", "SNPDIS")
@@ -339,15 +328,9 @@ def conclude(
     declared: str = "",
     filter_seen: bool = False,
 ) -> Verdict:
-    """Compare the evaluated policy with the behavior policy, if the logs allow it.
-
-    Args:
-        seed: draws the bootstrap's resamples.
-        diagnosis: of the same steps; None to make it.
-        wanted_lift: return per session that a launch should gain; None for 5% of the mean logged.
-        forbidden: what else forbids a conclusion.
-        declared: what the estimate rests on beside the logs, said with the verdict.
-        filter_seen: whether the policy was evaluated without items that users had seen.
+    """Compare the evaluated policy with the behavior policy, if the logs allow it, and nothing else
+    is `forbidden`. `wanted_lift` is the return per session that a launch should gain; None for 5%
+    of the mean logged.
     """
     diagnosis = diagnosis or diagnose(steps)
     reasons = [*forbidden, *_list_reasons(diagnosis, filter_seen)]
@@ -364,14 +347,15 @@ def conclude(
             reasons.append("the sessions do not differ enough for an interval")
         elif wanted_lift > 0:
             needed = math.ceil(len(lifts) * (_DETECTED * interval.error / wanted_lift) ** 2)
+    low, high, _, better = interval or NO_INTERVAL
     return Verdict(
         reliable=name is not None and not reasons,
         reasons=tuple(reasons),
         estimator=name,
         lift=lift,
-        lift_low=None if interval is None else interval.low,
-        lift_high=None if interval is None else interval.high,
-        probability_better=None if interval is None else interval.above_zero,
+        lift_low=low,
+        lift_high=high,
+        probability_better=better,
         wanted_lift=wanted_lift,
         sessions_needed=needed,
         declared=declared,
@@ -443,9 +427,8 @@ def _explain_failure(diagnosis: Diagnosis, filter_seen: bool) -> str:
     """What the worst of the failed tests shows."""
     failed = [test for test in diagnosis.tests if not test.passed]
     # The products show the size of the error; else the test that is furthest off.
-    worst = next((test for test in failed if test.name == SESSION_PRODUCTS), None) or max(
-        failed, key=lambda test: abs(math.log(max(test.mean, 1e-12)))
-    )
+    off = {test: abs(math.log(max(test.mean, 1e-12))) for test in failed}
+    worst = max(failed, key=lambda test: (test.name == SESSION_PRODUCTS, off[test]))
     alone = len(failed) == 1 and worst.name == SESSION_PRODUCTS
     # Where few users have most of the weight, tests that take means for normal reject too often.
     few_weigh = (diagnosis.tail or 0.0) > HEAVY_TAIL or diagnosis.effective_users < ENOUGH_USERS

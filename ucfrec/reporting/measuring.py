@@ -45,7 +45,7 @@ def rank_policies(
     from ucfrec.evaluation.ranking import Later, LikedExpression
     from ucfrec.evaluation.ranking_table import PolicyRanker, ranking_rows
     from ucfrec.logs.expressions import Expression
-    from ucfrec.off_policy.score import seen_too_often, share_seen
+    from ucfrec.off_policy.score import HISTORY_LACKING, seen_too_often, share_seen
 
     trained, later = candidates[0][0], Later(logged.store, logged.rows, filter_seen)
     condition = None
@@ -65,8 +65,8 @@ def rank_policies(
     warnings = []
     for number, ((policy, _), row) in enumerate(zip(candidates, rows, strict=False)):
         doubts = [] if logs == TEST_SPLIT else seen_too_often(share_seen(policy, logged.store))
-        if logged.history_lacking and number == 0:
-            doubts.append(logged.history_lacking)
+        if logged.rows.earlier is None and number == 0:
+            doubts.append(HISTORY_LACKING)
         add_ranking(policy.folder, row, logs, doubts)
         alone = len(candidates) == 1
         warnings += [doubt if alone else f"{policy.folder}: {doubt}" for doubt in doubts]

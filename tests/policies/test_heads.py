@@ -1,6 +1,5 @@
 """Heads: ranges, likelihoods, and what sampling the softmax may and may not change."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -54,15 +53,6 @@ def test_vectors_stay_in_range_and_their_error_is_in_shares_of_it(
 
 
 # Items.
-
-
-def test_item_loss_is_the_negative_log_likelihood() -> None:
-    head = item_head()
-    features, actions = steps(head, 9)
-    probabilities = head.predict(features).softmax(-1).detach()
-    torch.testing.assert_close(probabilities.sum(-1), torch.ones(9))
-    expected = -sum(math.log(float(probabilities[m, a])) for m, a in enumerate(actions)) / 9
-    assert float(head.loss(features, actions).detach()) == pytest.approx(expected, rel=1e-5)
 
 
 def test_an_untrained_policy_recommends_what_is_popular() -> None:

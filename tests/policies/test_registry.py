@@ -29,19 +29,15 @@ from ucfrec.settings import settings_table
 
 @settings_table("policy")
 class MineConfig(PolicyConfig):
-    """Settings of mine."""
-
     depth: Annotated[int, Field(ge=1, le=4)] = 2
     """Layers."""
 
 class Mine(SequencePolicy):
     Config = MineConfig
-
     def __init__(self, config, sizes):
         super().__init__(config, sizes)
         given = [sizes["state"]] + [config.dim] * config.depth
         self.net = nn.Sequential(*map(nn.Linear, given, given[1:]))
-
     def features(self, windows):
         return self.net(windows.states)
 
@@ -50,7 +46,6 @@ class Tied(Mine):
         super().__init__(config, sizes)
         self.one, self.two = (nn.Linear(config.dim, config.dim) for _ in range(2))
         self.two.weight = self.one.weight
-
     def features(self, windows):
         return self.two(self.one(self.net(windows.states)))
 

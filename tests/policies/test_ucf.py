@@ -164,21 +164,6 @@ def test_padding_is_inert(name: str, sizes: dict[str, int]) -> None:
     torch.testing.assert_close(losses[0], losses[1])
 
 
-def test_attention_rows_sum_to_one_and_see_only_what_is_revealed() -> None:
-    policy = build("ucf", VECTORS)
-    assert isinstance(policy, UCFPolicy)
-    windows = random_windows(VECTORS)
-    _, attention = policy.attend(windows)
-    assert attention.shape == (B, 2, K, 3 * K)
-    torch.testing.assert_close(attention.sum(-1), torch.ones(B, 2, K))
-    for t in range(K):
-        assert attention[:, :, t, 3 * t + 2 :].abs().max() == 0
-    hidden = ~windows.mask.repeat_interleave(3, dim=1)
-    for b in range(B):
-        valid = windows.mask[b]
-        assert attention[b][:, valid][..., hidden[b]].abs().sum() == 0
-
-
 def test_only_the_predicting_rows_are_computed_and_they_are_the_full_ones() -> None:
     policy = build("ucf", VECTORS)
     assert isinstance(policy, UCFPolicy)

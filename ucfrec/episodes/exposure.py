@@ -159,8 +159,8 @@ class Likeness(nn.Module):
         ones = torch.ones_like(rows, dtype=self.directions.dtype)
         shape = len(tags), self._count()
         # Tags of a file are checked once, with all items.
-        checked = tags is self.tags
-        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=checked).coalesce()
+        check_all = tags is self.tags
+        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=check_all).coalesce()
         return matrix.to_dense() if dense else matrix
 
 

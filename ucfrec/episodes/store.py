@@ -304,20 +304,23 @@ class UserRows:
         if earlier is not None and later.has_users and earlier.has_users:
             begins = np.full(len(users), np.iinfo(np.int64).max)
             np.minimum.at(begins, owner, times)
-            known = later.episode_values(schema.USER).astype(np.int64)
+            users_later = later.episode_values(schema.USER).astype(np.int64)
+            users_earlier = earlier.episode_values(schema.USER).astype(np.int64)
             # Owner of each user of the earlier store, and −1 for the user −1, the last.
-            owner_of = np.full(max(int(known.max(initial=-1)), 0) + 2, -1)
-            owner_of[known[known >= 0]] = owners[known >= 0]
-            before = earlier.episode_values(schema.USER).astype(np.int64)
-            before = owner_of[np.where(before < len(owner_of) - 1, before, -1)]
+            owner_of = np.full(max(int(users_later.max(initial=-1)), 0) + 2, -1)
+            owner_of[users_later[users_later >= 0]] = owners[users_later >= 0]
+            is_listed = users_earlier < len(owner_of) - 1
+            owners_earlier = owner_of[np.where(is_listed, users_earlier, -1)]
             parts, taken = [(owner, times, source)], 0
             for episodes, steps in earlier.step_batches():
-                rows = np.flatnonzero(before[episodes] >= 0)
-                owner, at = before[episodes[rows]], _times(earlier, episodes[rows], steps[rows])
-                kept = at < begins[owner]
-                parts.append((owner[kept], at[kept], -1 - (taken + rows[kept])))
+                owner = owners_earlier[episodes]
+                rows = np.flatnonzero(owner >= 0)
+                times = _times(earlier, episodes[rows], steps[rows])
+                is_earlier = times < begins[owner[rows]]
+                rows = rows[is_earlier]
+                parts.append((owner[rows], times[is_earlier], -1 - (taken + rows)))
                 taken += len(steps)
-            owner, times, source = (np.concatenate(each) for each in zip(*parts, strict=True))
+            owner, times, source = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         order = np.lexsort((times, owner))
         source = source[order]
         rows = np.flatnonzero(source >= 0)
@@ -363,16 +366,16 @@ class UserRows:
         counts = np.minimum(begin - self._begins(begin, gap_ms), LONGEST_HISTORY)
         if not counts.any():
             return self.later
-        return EpisodeStore(self._continued_columns(begin, counts))
+        return EpisodeStore(self._continue_columns(begin, counts))
 
-    def _continued_columns(self, begin: IntArray, counts: IntArray) -> Columns:
+    def _continue_columns(self, begin: IntArray, counts: IntArray) -> Columns:
         """The columns of the later episodes, with the `counts` (E,) rows before `begin` (E,)."""
         later, lengths = self.later, self.later.lengths + counts
         offsets = _offsets(lengths)
         inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
         numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
-        before = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
-        source = np.where(inside >= 0, numbers, before)
+        earlier_source = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
+        source = np.where(inside >= 0, numbers, earlier_source)
         names = [name for name in schema.EPISODE_DTYPES if later._columns.has_episode_column(name)]
         arrays = {name: later.episode_values(name) for name in names}
         arrays[schema.OFFSETS] = offsets

@@ -79,11 +79,9 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
 def test_every_learner_learns_from_sampled_items(name: str) -> None:
     settings = {"sampled_above": ITEMS - 1, "sampled_items": 4, **ADDITIONS, "exposure": True}
     policy, windows = build(name, TAGGED, **settings), random_windows(TAGGED)
-    everything = build(name, TAGGED, **{**settings, "sampled_above": ITEMS})
     assert isinstance(policy.head, ItemHead)
     with torch.no_grad():
-        expected = everything.eval().action_loss(windows)
-        torch.testing.assert_close(policy.eval().action_loss(windows), expected)
+        expected = policy.eval().action_loss(windows)
     optimizer = RowAdamW(policy.parameters(), lr=1e-2)
     policy.train()
     for step in range(20):
@@ -159,9 +157,6 @@ def test_the_largest_return_is_in_reward_units() -> None:
     assert torch.equal(policy.max_return(asked), policy.max_return(windows))
 
 
-WIDTH = 16
-
-
 def expectile(returns: Tensor, share: float) -> float:
     """By bisection: upward and downward deviations balance as share to 1 − share."""
     low, high = float(returns.min()), float(returns.max())
@@ -192,8 +187,8 @@ def test_the_loss_is_least_at_the_mean_and_the_expectile(sample: list[float]) ->
 @pytest.mark.parametrize("t", [0, 3])
 def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
     torch.manual_seed(0)
-    head, windows = ValueHead(VECTORS["state"], WIDTH), random_windows(VECTORS, padding=(0, 0, 0))
-    actions = torch.randn(len(windows.mask), K, WIDTH, requires_grad=True)
+    head, windows = ValueHead(VECTORS["state"], 16), random_windows(VECTORS, padding=(0, 0, 0))
+    actions = torch.randn(len(windows.mask), K, 16, requires_grad=True)
     before = head(windows, actions)
     assert not torch.autograd.grad(before.sum(), actions, allow_unused=True)[0]
     states, played = windows.states.clone(), actions.detach().clone()
@@ -210,10 +205,7 @@ def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
     assert not torch.allclose(before[:, t], later[:, t])
 
 
-returns_and_values = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1)
-
-
-@given(returns_and_values)
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1))
 def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float, float]]) -> None:
     returns, means = torch.tensor(pairs, dtype=torch.float64).unbind(1)
     values = torch.stack([means, torch.full_like(means, 99.0)], dim=1).requires_grad_()
@@ -224,14 +216,10 @@ def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float,
     assert float(weights.max() / weights.min()) <= torch.e**8 * (1 + 1e-6)
     advantage = returns - means
     spread = float(advantage.std(correction=0))
+    if spread == 0:
+        assert (weights == 1).all()
     if spread > 1e-3:
         expected = (advantage / spread).clamp(-5, 3).exp()
         torch.testing.assert_close(weights, expected / expected.mean())
     order = advantage.argsort()
     assert (weights[order].diff() >= -1e-12).all()
-
-
-def test_steps_without_advantage_count_alike() -> None:
-    values = torch.tensor([[2.0, 3.0]]).repeat(4, 1)
-    assert advantage_weights(values, torch.full((4,), 2.0)).tolist() == [1, 1, 1, 1]
-    assert advantage_weights(values[:1], torch.tensor([5.0])).tolist() == [1]

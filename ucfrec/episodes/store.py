@@ -73,8 +73,7 @@ class EpisodeStore(EpisodeView):
             lengths: (E,) number of steps of each episode, at least 1, with sum N.
             episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
                 are in the training split.
-            reward: the expression that computed the rewards, for the record.
-            source: what the store was made from, for the record.
+            reward, source: the expression of the rewards, and what the store was made from.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
 
         Raises:
@@ -226,12 +225,9 @@ class EpisodeStore(EpisodeView):
     def with_returns_to_go(
         self, values: Float32Array, definition: ReturnToGo | None = None
     ) -> "EpisodeStore":
-        """A view of the same episodes with other returns-to-go; the files are not changed.
-
-        Args:
-            values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
-            definition: what they count; None for what they counted before.
-        """
+        """A view of the same episodes with other returns-to-go (n_steps,), in reward units and the
+        order of `all_steps`, that count what `definition` says, or None for what they counted
+        before. The files are not changed."""
         name, n_steps = schema.RETURN_TO_GO, self.record.n_steps
         returns = self._columns.step_column(name).take(np.arange(n_steps))
         episodes, steps = self.all_steps()
@@ -256,10 +252,8 @@ class EpisodeStore(EpisodeView):
 
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation, each (S,) float32, of the states of the view.
-
-        Computed in float64 from at most 100,000 steps, evenly spaced over the view.
-        """
+        """Mean and standard deviation, each (S,) float32, of the states of the view, computed in
+        float64 from at most 100,000 steps, evenly spaced over it."""
         stride = -(-self.n_steps // _STATISTICS_STEPS)
         total = torch.zeros(self.state_size, dtype=torch.float64)
         squares, count = total.clone(), 0

@@ -118,8 +118,7 @@ class ConservativeQ(nn.Module):
 def relabel(
     store: EpisodeStore, steps: int, weight: float, folder: Path, seed: int
 ) -> EpisodeStore:
-    """The store, without augmented episodes, with returns-to-go raised by CQL's state values
-    (EDT4Rec).
+    """The store, without augmented episodes, with returns-to-go raised by CQL's state values.
 
     Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)). The folder keeps the Q
     function, trained for `steps` updates with the weight α of the conservative term.

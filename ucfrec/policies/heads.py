@@ -18,9 +18,8 @@ class Proposal:
     half evenly.
 
     By counts alone, items that the logs hardly show but the policy likes would be drawn too rarely
-    for their weight; evenly alone, popular items would (`benchmarks/LOG.md` has all three). The
-    unit interval is cut into as many equal parts as there are draws, and every part has one: the
-    draws of an item then deviate from their expectation by less than two.
+    for their weight; evenly alone, popular items would (`benchmarks/LOG.md`). Equal parts of
+    the unit interval have one draw each: an item's are fewer than two off their expectation.
     """
 
     def __init__(self, counts: Tensor) -> None:

@@ -12,7 +12,6 @@ from torch import Tensor
 from tests.policies.test_ucf import (
     CATALOG,
     ITEMS,
-    SMALL,
     VECTORS,
     K,
     changed_at,
@@ -20,6 +19,7 @@ from tests.policies.test_ucf import (
     sessions_of,
     trained,
 )
+from tests.policies.test_ucf import build as build_plain
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.states import ItemStates
@@ -28,7 +28,6 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import BEST, SequencePolicy, ValueHead, advantage_weights
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.registry import policy_class
 
 TAGGED = {**CATALOG, "tags": 2}
 POLICIES = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")
@@ -38,18 +37,11 @@ kinds = pytest.mark.parametrize("sizes", [VECTORS, TAGGED], ids=["vectors", "ite
 
 
 def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
-    torch.manual_seed(0)
-    policy_type = policy_class(name)
-    small = {**SMALL, "dropout": 0.0, **({"kernel_groups": 4} if name == "lsdt" else {})}
-    policy = policy_type(policy_type.Config(**{**small, "exposure": False, **settings}), sizes)
-    if sizes["items"]:
-        generator = torch.Generator().manual_seed(4)
-        embeddings = torch.randn(ITEMS, 4, generator=generator)
-        policy.head.start_from(embeddings, torch.rand(ITEMS, generator=generator))
-        if policy.head.exposure is not None:  # type: ignore[union-attr]
-            tags = torch.randint(-1, 4, (ITEMS, 2), generator=generator)
-            states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0, tags=tags)
-            policy.head.exposure.start_from(states, torch.rand(99))  # type: ignore[union-attr]
+    policy = build_plain(name, sizes, **{"dropout": 0.0, "exposure": False, **settings})
+    if isinstance(policy.head, ItemHead) and policy.head.exposure is not None:
+        tags = torch.randint(-1, 4, (ITEMS, 2))
+        states = ItemStates(policy.head.embeddings, torch.zeros(0, 0), 0.0, 1.0, tags=tags)
+        policy.head.exposure.start_from(states, torch.rand(99))
     return policy
 
 

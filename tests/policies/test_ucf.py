@@ -42,7 +42,7 @@ def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
     torch.manual_seed(0)
     policy_type = policy_class(name)
     own = {"kernel_groups": 4} if name == "lsdt" else {}
-    policy = policy_type(policy_type.Config(**SMALL, **own, **settings), sizes)
+    policy = policy_type(policy_type.Config(**{**SMALL, **own, **settings}), sizes)
     if sizes["items"]:
         policy.head.start_from(torch.randn(ITEMS, 4), torch.rand(ITEMS))
     for parameter in policy.parameters():
@@ -222,8 +222,8 @@ def test_supervision_draws_attention_to_the_parents() -> None:
 def test_parameters_are_the_official_ones_less_the_unused(
     name: str, dim: int, official: int, unused: int
 ) -> None:
-    policy_type = policy_class(name)
-    policy = policy_type(policy_type.Config(dim=dim), {"state": 11, "action": 3, "items": 0})
+    kind = policy_class(name)
+    policy = kind(kind.Config(dim=dim), {"state": 11, "action": 3, "items": 0})
     assert sum(p.numel() for p in policy.parameters()) == official - unused
 
 
@@ -391,18 +391,15 @@ def test_attention_drops_weights_and_keeps_the_mean() -> None:
 def test_every_layer_starts_with_xaviers_weights() -> None:
     torch.manual_seed(0)
     config = LSDTConfig(context=5, dim=64, max_timestep=100)
-    policy = LSDTPolicy(config, {"state": 11, "action": 3, "items": 0})
-    seen = 0
-    for name, module in policy.named_modules():
-        if not isinstance(module, nn.Linear | nn.Embedding):
-            continue
+    modules = dict(LSDTPolicy(config, {"state": 11, "action": 3, "items": 0}).named_modules())
+    layers = {n: m for n, m in modules.items() if isinstance(m, nn.Linear | nn.Embedding)}
+    assert len(layers) == 5 + 3 * 10
+    for name, module in layers.items():
         parts = 3 if name.endswith("query_key_value") else 1
         for weight in module.weight.chunk(parts):
             limit = (6 / sum(weight.shape)) ** 0.5
             assert weight.abs().max() <= limit, name
             # The standard deviation of U(−l, l) is l/√3; 64 weights tell it to a fifth.
             assert abs(weight.std().item() / (limit / 3**0.5) - 1) < 0.25, name
-            seen += 1
         if isinstance(module, nn.Linear):
             assert not module.bias.any(), name
-    assert seen == 5 + 3 * (3 + 1 + 3 + 3 + 2)

@@ -153,9 +153,6 @@ def test_knots_rise_and_cover_the_returns(returns: list[float]) -> None:
         torch.testing.assert_close(weights[:, end], (table[[0, 2]] + table[[1, 3]])[:, end])
 
 
-# Windows.
-
-
 def windows(seed: int, padding: tuple[int, ...] = (0, 1, 4, 5)) -> Windows:
     generator = torch.Generator().manual_seed(seed)
     return Windows(

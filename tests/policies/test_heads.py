@@ -35,9 +35,6 @@ def steps(head: ItemHead, m: int) -> tuple[Tensor, Tensor]:
     return features, torch.multinomial(head.counts, m, True, generator=generator)
 
 
-# Vectors.
-
-
 @given(st.floats(0.01, 1e3), st.floats(1e-3, 1e4), st.integers(0, 99))
 def test_vectors_stay_in_range_and_their_error_is_in_shares_of_it(
     scale: float, size: float, seed: int
@@ -50,9 +47,6 @@ def test_vectors_stay_in_range_and_their_error_is_in_shares_of_it(
     assert (predicted.abs() <= head.scale).all()
     expected = np.mean(((predicted - actions) / head.scale).numpy() ** 2)
     assert float(head.loss(features, actions).detach()) == pytest.approx(expected, rel=1e-4)
-
-
-# Items.
 
 
 def test_an_untrained_policy_recommends_what_is_popular() -> None:
@@ -125,8 +119,6 @@ def test_gradients_have_the_rows_that_took_part_only() -> None:
         assert len(rows) <= 96
         assert torch.isin(actions, rows).all()
 
-
-# Items, with what was shown before.
 
 LAGS = 4
 

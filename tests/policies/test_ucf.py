@@ -232,9 +232,6 @@ def test_lsdt_refuses_a_width_that_does_not_split() -> None:
         LSDTConfig(dim=48)
 
 
-# The last step of a few windows, by stacked streams.
-
-
 @both_heads
 @pytest.mark.parametrize("padding", [(0, 0, 0), (0, 2, 5), (5, 4, 3)])
 @pytest.mark.parametrize("cropped", [0, 3])
@@ -321,9 +318,6 @@ def test_mask_loss_equals_a_plain_loop(mask: Tensor, heads: int, seed: int) -> N
         if mask[b, t]
     ]
     assert float(mask_loss(attention, targets, mask)) == pytest.approx(np.mean(rows), rel=1e-5)
-
-
-# Layers that cost less than PyTorch's do the same.
 
 
 @pytest.mark.parametrize("padded", [False, True])

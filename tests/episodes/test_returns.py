@@ -31,8 +31,6 @@ def test_a_long_store_keeps_its_digits() -> None:
     np.testing.assert_allclose(got, suffixes, rtol=2e-7)
 
 
-# The three definitions.
-
 gammas = st.sampled_from([0.25, 0.5, 0.75, 1.0])
 definitions = st.one_of(
     st.just(ReturnToGo()),
@@ -81,9 +79,6 @@ def test_no_episodes_have_no_returns() -> None:
 def test_wrong_definitions_are_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         ReturnToGo(**wrong)  # type: ignore[arg-type]
-
-
-# Acting.
 
 
 @given(episodes_of_eighths)

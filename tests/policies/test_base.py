@@ -12,15 +12,14 @@ from torch import Tensor
 from tests.policies.test_ucf import (
     CATALOG,
     ITEMS,
-    SMALL,
     VECTORS,
     K,
     changed_at,
-    other,
     random_windows,
     sessions_of,
     trained,
 )
+from tests.policies.test_ucf import build as build_plain
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
 from ucfrec.episodes.states import ItemStates
@@ -29,7 +28,6 @@ from ucfrec.errors import InputError
 from ucfrec.fitting.loop import RowAdamW
 from ucfrec.policies.base import BEST, SequencePolicy, ValueHead, advantage_weights
 from ucfrec.policies.heads import ItemHead
-from ucfrec.policies.registry import policy_class
 
 TAGGED = {**CATALOG, "tags": 2}
 POLICIES = ("ucf", "dt", "dc", "lsdt", "dt4rec", "cdt4rec", "edt4rec", "sasrec")
@@ -39,18 +37,11 @@ kinds = pytest.mark.parametrize("sizes", [VECTORS, TAGGED], ids=["vectors", "ite
 
 
 def build(name: str, sizes: dict[str, int], **settings: Any) -> SequencePolicy:
-    torch.manual_seed(0)
-    policy_type = policy_class(name)
-    small = {**SMALL, "dropout": 0.0, **({"kernel_groups": 4} if name == "lsdt" else {})}
-    policy = policy_type(policy_type.Config(**{**small, "exposure": False, **settings}), sizes)
-    if sizes["items"]:
-        generator = torch.Generator().manual_seed(4)
-        embeddings = torch.randn(ITEMS, 4, generator=generator)
-        policy.head.start_from(embeddings, torch.rand(ITEMS, generator=generator))
-        if policy.head.exposure is not None:  # type: ignore[union-attr]
-            tags = torch.randint(-1, 4, (ITEMS, 2), generator=generator)
-            states = ItemStates(embeddings, torch.zeros(0, 0), 0.0, 1.0, tags=tags)
-            policy.head.exposure.start_from(states, torch.rand(99))  # type: ignore[union-attr]
+    policy = build_plain(name, sizes, **{"dropout": 0.0, "exposure": False, **settings})
+    if isinstance(policy.head, ItemHead) and policy.head.exposure is not None:
+        tags = torch.randint(-1, 4, (ITEMS, 2))
+        states = ItemStates(policy.head.embeddings, torch.zeros(0, 0), 0.0, 1.0, tags=tags)
+        policy.head.exposure.start_from(states, torch.rand(99))
     return policy
 
 
@@ -80,11 +71,9 @@ def test_every_learner_trains_and_acts_with_the_additions(name: str, sizes: dict
 def test_every_learner_learns_from_sampled_items(name: str) -> None:
     settings = {"sampled_above": ITEMS - 1, "sampled_items": 4, **ADDITIONS, "exposure": True}
     policy, windows = build(name, TAGGED, **settings), random_windows(TAGGED)
-    everything = build(name, TAGGED, **{**settings, "sampled_above": ITEMS})
     assert isinstance(policy.head, ItemHead)
     with torch.no_grad():
-        expected = everything.eval().action_loss(windows)
-        torch.testing.assert_close(policy.eval().action_loss(windows), expected)
+        expected = policy.eval().action_loss(windows)
     optimizer = RowAdamW(policy.parameters(), lr=1e-2)
     policy.train()
     for step in range(20):
@@ -100,7 +89,6 @@ def test_every_learner_learns_from_sampled_items(name: str) -> None:
 
 @policies
 def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
-    """Prediction t with the term is prediction t without it plus what `Exposed.before` says."""
     windows = random_windows(TAGGED)
     policy = trained(build(name, TAGGED, exposure=True, exposure_window=3), windows, 25)
     head = policy.head
@@ -115,15 +103,6 @@ def test_exposure_moves_predictions_by_what_was_shown_alone(name: str) -> None:
         term = Exposed.before(normalized, 3, last)
         added = head.exposure.added_to(torch.zeros(len(last), ITEMS), term)
         torch.testing.assert_close(policy.act(windows), plain + added)
-        own = windows.actions.clone()
-        own[:, -1] = other(own[:, -1])
-        earned = windows.rewards.clone()
-        earned[:, -1] += 1
-        torch.testing.assert_close(
-            policy.act(replace(windows, actions=own, rewards=earned)), policy.act(windows)
-        )
-        noisy = torch.where(windows.mask, windows.actions, other(windows.actions))
-        torch.testing.assert_close(policy.act(replace(windows, actions=noisy)), policy.act(windows))
 
 
 @kinds
@@ -170,9 +149,6 @@ def test_the_largest_return_is_in_reward_units() -> None:
     assert torch.equal(policy.max_return(asked), policy.max_return(windows))
 
 
-WIDTH = 16
-
-
 def expectile(returns: Tensor, share: float) -> float:
     """By bisection: upward and downward deviations balance as share to 1 − share."""
     low, high = float(returns.min()), float(returns.max())
@@ -203,8 +179,8 @@ def test_the_loss_is_least_at_the_mean_and_the_expectile(sample: list[float]) ->
 @pytest.mark.parametrize("t", [0, 3])
 def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
     torch.manual_seed(0)
-    head, windows = ValueHead(VECTORS["state"], WIDTH), random_windows(VECTORS, padding=(0, 0, 0))
-    actions = torch.randn(len(windows.mask), K, WIDTH, requires_grad=True)
+    head, windows = ValueHead(VECTORS["state"], 16), random_windows(VECTORS, padding=(0, 0, 0))
+    actions = torch.randn(len(windows.mask), K, 16, requires_grad=True)
     before = head(windows, actions)
     assert not torch.autograd.grad(before.sum(), actions, allow_unused=True)[0]
     states, played = windows.states.clone(), actions.detach().clone()
@@ -221,23 +197,7 @@ def test_a_value_reads_its_history_and_nothing_else(t: int) -> None:
     assert not torch.allclose(before[:, t], later[:, t])
 
 
-def test_padding_does_not_move_a_value() -> None:
-    torch.manual_seed(0)
-    head, windows = ValueHead(VECTORS["state"], WIDTH), random_windows(VECTORS)
-    actions = torch.randn(len(windows.mask), K, WIDTH)
-    values = head(windows, actions)
-    steps = windows.mask.unsqueeze(-1)
-    noisy = replace(windows, states=torch.where(steps, windows.states, 9.0))
-    other = head(noisy, torch.where(steps, actions, 9.0))
-    torch.testing.assert_close(values[windows.mask], other[windows.mask])
-    short = windows.at(slice(2, None)).last(K - 5)
-    torch.testing.assert_close(head(short, actions[2:, 5:]), values[2:, 5:])
-
-
-returns_and_values = st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1)
-
-
-@given(returns_and_values)
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1))
 def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float, float]]) -> None:
     returns, means = torch.tensor(pairs, dtype=torch.float64).unbind(1)
     values = torch.stack([means, torch.full_like(means, 99.0)], dim=1).requires_grad_()
@@ -248,14 +208,10 @@ def test_weights_are_clipped_exponentials_with_mean_one(pairs: list[tuple[float,
     assert float(weights.max() / weights.min()) <= torch.e**8 * (1 + 1e-6)
     advantage = returns - means
     spread = float(advantage.std(correction=0))
+    if spread == 0:
+        assert (weights == 1).all()
     if spread > 1e-3:
         expected = (advantage / spread).clamp(-5, 3).exp()
         torch.testing.assert_close(weights, expected / expected.mean())
     order = advantage.argsort()
     assert (weights[order].diff() >= -1e-12).all()
-
-
-def test_steps_without_advantage_count_alike() -> None:
-    values = torch.tensor([[2.0, 3.0]]).repeat(4, 1)
-    assert advantage_weights(values, torch.full((4,), 2.0)).tolist() == [1, 1, 1, 1]
-    assert advantage_weights(values[:1], torch.tensor([5.0])).tolist() == [1]

@@ -122,15 +122,6 @@ def test_a_recurrent_network_that_skips_padding_passes(store: EpisodeStore, size
     check(store, lambda p, w: recurrent(p.gru, p.net(w.states), w.mask), context=size)
 
 
-def test_earlier_actions_and_rewards_may_be_read(store: EpisodeStore) -> None:
-    def earlier(policy: Net, windows: Windows) -> Tensor:
-        read = (embedded(policy, windows) + wide(windows.rewards)).roll(1, dims=1)
-        read[:, 0] = 0
-        return policy.net(windows.states) + read + wide(windows.returns_to_go)
-
-    check(store, earlier)
-
-
 @pytest.mark.parametrize("answer", [torch.ones(()), (1.0, {}), None, (torch.ones(2), {})])
 def test_a_loss_that_gives_no_pair_is_refused(store: EpisodeStore, answer: object) -> None:
     def lose(policy: Net) -> None:

@@ -23,6 +23,8 @@ SETTINGS = [
     *("train.warmup_steps=0", "train.batch_size=64", "policy.context=3", "policy.dim=16"),
     *("augment.copies=0", "rule.choose=false"),
 ]
+DIRECTIONS = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float32) * 0.8
+"""What each kind prefers where actions are vectors."""
 EXTRA = {
     "dt4rec": ["policy.layers=1", "policy.negatives=1"],
     "edt4rec": ["policy.cql_steps=20"],
@@ -46,16 +48,11 @@ def store(folder: Path, seed: int, noise: bool, items: bool) -> tuple[EpisodeSto
     if items:
         columns["item"] = played
     else:
-        columns["action"] = directions()[played] + 0.05 * rng.normal(size=(len(played), 2))
+        columns["action"] = DIRECTIONS[played] + 0.05 * rng.normal(size=(len(played), 2))
     EpisodeStore.write(folder, columns, np.full(SESSIONS, STEPS))
     if items:
         ItemStates(torch.eye(KINDS), torch.zeros(0, 0), 0.0, 1.0).save(folder / ITEM_STATES)
     return EpisodeStore.open(folder), played[STEPS - 1 :: STEPS] if noise else kinds
-
-
-def directions() -> np.ndarray:
-    """What each kind prefers where actions are vectors, (4, 2): the corners of a square."""
-    return np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float32) * 0.8
 
 
 def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
@@ -68,7 +65,7 @@ def chosen(run: Path, given: EpisodeStore, items: bool) -> np.ndarray:
         answer = trained.policy.act(replace(windows, returns_to_go=asked))
     if items:
         return answer.argmax(-1).numpy()
-    apart = np.linalg.norm(answer.numpy()[:, None] - directions(), axis=-1)
+    apart = np.linalg.norm(answer.numpy()[:, None] - DIRECTIONS, axis=-1)
     return np.asarray(apart.argmin(1))
 
 

@@ -127,10 +127,8 @@ class Likeness(nn.Module):
         return gathered.view((*shape, tags.shape[2])).sum(3)
 
     def to_sets(self, profile: Tensor) -> tuple[Tensor, Tensor]:
-        """Likeness (M, D) by tags to the D different sets of tags, and the set of every item.
-
-        What `to_all` gives, faster where there are few profiles and many items of the same tags.
-        """
+        """Likeness (M, D) by tags to the D different sets of tags, and the set of every item: what
+        `to_all` gives, faster where there are few profiles and many items of the same tags."""
         if self._sets is None:
             # Padding reads a place of its own, which is 0.
             tags = self.tags.cpu().numpy()
@@ -159,8 +157,8 @@ class Likeness(nn.Module):
         ones = torch.ones_like(rows, dtype=self.directions.dtype)
         shape = len(tags), self._count()
         # Tags of a file are checked once, with all items.
-        checked = tags is self.tags
-        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=checked).coalesce()
+        check_all = tags is self.tags
+        matrix = torch.sparse_coo_tensor(places, ones, shape, check_invariants=check_all).coalesce()
         return matrix.to_dense() if dense else matrix
 
 
@@ -189,11 +187,8 @@ class ExposureTerm(nn.Module):
         self.by_lag = nn.Parameter(torch.zeros(4, knots, lags))
 
     def start_from(self, states: ItemStates, returns: Tensor) -> None:
-        """Set how alike the items are, the scale of the rewards, and the knots.
-
-        The knots are quantiles of returns-to-go (N,), closer together the higher they are, because
-        targets are high.
-        """
+        """Set how alike the items are, the scale of the rewards, and the knots: quantiles of
+        returns-to-go (N,), closer together the higher they are, because targets are high."""
         self.likeness.start_from(states)
         self.reward_low.fill_(states.reward_low)
         self.reward_high.fill_(states.reward_high)

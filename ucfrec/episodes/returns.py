@@ -46,10 +46,8 @@ class ReturnToGo:
 
     @property
     def per_session(self) -> bool:
-        """Whether a target is set for a session as a whole, so that rewards lower what is left.
-
-        Otherwise, the same target is set again at every step.
-        """
+        """Whether a target is set for a session as a whole, so that rewards lower what is left;
+        otherwise, the same target is set again at every step."""
         return self.definition == "session"
 
     def weights(self, ahead: IntArray) -> Float64Array:
@@ -63,11 +61,8 @@ class ReturnToGo:
     def of_logs(self, rewards: npt.NDArray[np.floating], offsets: IntArray) -> Float32Array:
         """Returns-to-go (N,) of logged episodes; summed in float64, rounded to float32.
 
-        Example: rewards [1, 0, 2, 5] with offsets [0, 3, 4] give [3, 2, 2, 5] for `session`.
-
-        Args:
-            rewards: (N,) rewards of all episodes, concatenated.
-            offsets: (E + 1,) index of the first step of each episode, followed by N.
+        Example: rewards (N,) [1, 0, 2, 5] with offsets (E + 1,) [0, 3, 4], the first step of each
+        episode and N, give [3, 2, 2, 5] for `session`.
         """
         if self.definition == "discounted":
             return _discount(rewards, offsets, self.discount)
@@ -75,9 +70,8 @@ class ReturnToGo:
         lengths, steps = np.diff(offsets), np.arange(len(rewards))
         ends = np.repeat(offsets[1:], lengths)
         if self.definition == "horizon":
-            return np.asarray(
-                sums[np.minimum(steps + self.horizon, ends)] - sums[:-1], dtype=np.float32
-            )
+            reached = np.minimum(steps + self.horizon, ends)
+            return np.asarray(sums[reached] - sums[:-1], dtype=np.float32)
         return _rest(sums, offsets)
 
     def target_returns(self, target: float, collected: "Tensor") -> "Tensor":

@@ -143,8 +143,16 @@ class ItemStates:
 
     def save(self, path: Path) -> None:
         """Write to one safetensors file, atomically; see `write_item_table`."""
-        tables = self.embeddings.numpy(), self.user_features.numpy(), self.tags.numpy()
-        write_item_table(path, *tables, self.reward_low, self.reward_high, self.window, self.decay)
+        write_item_table(
+            path,
+            self.embeddings.numpy(),
+            self.user_features.numpy(),
+            self.tags.numpy(),
+            self.reward_low,
+            self.reward_high,
+            self.window,
+            self.decay,
+        )
 
     @classmethod
     def load(cls, path: Path) -> "ItemStates":

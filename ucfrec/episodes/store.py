@@ -73,8 +73,7 @@ class EpisodeStore(EpisodeView):
             lengths: (E,) number of steps of each episode, at least 1, with sum N.
             episodes: episode columns of `ucfrec.schema`, each (E,); without `split`, all episodes
                 are in the training split.
-            reward: the expression that computed the rewards, for the record.
-            source: what the store was made from, for the record.
+            reward, source: the expression of the rewards, and what the store was made from.
             shard_steps: a shard ends with the first episode that brings it to this many steps.
 
         Raises:
@@ -226,12 +225,9 @@ class EpisodeStore(EpisodeView):
     def with_returns_to_go(
         self, values: Float32Array, definition: ReturnToGo | None = None
     ) -> "EpisodeStore":
-        """A view of the same episodes with other returns-to-go; the files are not changed.
-
-        Args:
-            values: (n_steps,) returns-to-go in reward units, in the order of `all_steps`.
-            definition: what they count; None for what they counted before.
-        """
+        """A view of the same episodes with other returns-to-go (n_steps,), in reward units and the
+        order of `all_steps`, that count what `definition` says, or None for what they counted
+        before. The files are not changed."""
         name, n_steps = schema.RETURN_TO_GO, self.record.n_steps
         returns = self._columns.step_column(name).take(np.arange(n_steps))
         episodes, steps = self.all_steps()
@@ -256,10 +252,8 @@ class EpisodeStore(EpisodeView):
 
     @cached_property
     def state_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation, each (S,) float32, of the states of the view.
-
-        Computed in float64 from at most 100,000 steps, evenly spaced over the view.
-        """
+        """Mean and standard deviation, each (S,) float32, of the states of the view, computed in
+        float64 from at most 100,000 steps, evenly spaced over it."""
         stride = -(-self.n_steps // _STATISTICS_STEPS)
         total = torch.zeros(self.state_size, dtype=torch.float64)
         squares, count = total.clone(), 0
@@ -304,20 +298,23 @@ class UserRows:
         if earlier is not None and later.has_users and earlier.has_users:
             begins = np.full(len(users), np.iinfo(np.int64).max)
             np.minimum.at(begins, owner, times)
-            known = later.episode_values(schema.USER).astype(np.int64)
+            users_later = later.episode_values(schema.USER).astype(np.int64)
+            users_earlier = earlier.episode_values(schema.USER).astype(np.int64)
             # Owner of each user of the earlier store, and −1 for the user −1, the last.
-            owner_of = np.full(max(int(known.max(initial=-1)), 0) + 2, -1)
-            owner_of[known[known >= 0]] = owners[known >= 0]
-            before = earlier.episode_values(schema.USER).astype(np.int64)
-            before = owner_of[np.where(before < len(owner_of) - 1, before, -1)]
+            owner_of = np.full(max(int(users_later.max(initial=-1)), 0) + 2, -1)
+            owner_of[users_later[users_later >= 0]] = owners[users_later >= 0]
+            is_listed = users_earlier < len(owner_of) - 1
+            owners_earlier = owner_of[np.where(is_listed, users_earlier, -1)]
             parts, taken = [(owner, times, source)], 0
             for episodes, steps in earlier.step_batches():
-                rows = np.flatnonzero(before[episodes] >= 0)
-                owner, at = before[episodes[rows]], _times(earlier, episodes[rows], steps[rows])
-                kept = at < begins[owner]
-                parts.append((owner[kept], at[kept], -1 - (taken + rows[kept])))
+                owner = owners_earlier[episodes]
+                rows = np.flatnonzero(owner >= 0)
+                times = _times(earlier, episodes[rows], steps[rows])
+                is_earlier = times < begins[owner[rows]]
+                rows = rows[is_earlier]
+                parts.append((owner[rows], times[is_earlier], -1 - (taken + rows)))
                 taken += len(steps)
-            owner, times, source = (np.concatenate(each) for each in zip(*parts, strict=True))
+            owner, times, source = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         order = np.lexsort((times, owner))
         source = source[order]
         rows = np.flatnonzero(source >= 0)
@@ -363,16 +360,16 @@ class UserRows:
         counts = np.minimum(begin - self._begins(begin, gap_ms), LONGEST_HISTORY)
         if not counts.any():
             return self.later
-        return EpisodeStore(self._continued_columns(begin, counts))
+        return EpisodeStore(self._continue_columns(begin, counts))
 
-    def _continued_columns(self, begin: IntArray, counts: IntArray) -> Columns:
+    def _continue_columns(self, begin: IntArray, counts: IntArray) -> Columns:
         """The columns of the later episodes, with the `counts` (E,) rows before `begin` (E,)."""
         later, lengths = self.later, self.later.lengths + counts
         offsets = _offsets(lengths)
         inside = np.arange(offsets[-1]) - np.repeat(offsets[:-1] + counts, lengths)
         numbers = np.repeat(np.cumsum(later.lengths) - later.lengths, lengths) + inside
-        before = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
-        source = np.where(inside >= 0, numbers, before)
+        earlier_source = self.source[np.repeat(begin, lengths) + inside.clip(max=0)]
+        source = np.where(inside >= 0, numbers, earlier_source)
         names = [name for name in schema.EPISODE_DTYPES if later._columns.has_episode_column(name)]
         arrays = {name: later.episode_values(name) for name in names}
         arrays[schema.OFFSETS] = offsets

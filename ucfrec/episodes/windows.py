@@ -462,10 +462,8 @@ def _require_below(numbers: Array, ends: IntArray | int, what: str) -> None:
 
 
 class TrainingEpisodes:
-    """E logged episodes, then C augmented ones with other states, then N action copies.
-
-    Only the last step of an action copy is drawn: those before it are its source's.
-    """
+    """E logged episodes, then C augmented ones with other states, then N action copies, of which
+    only the last step is drawn: those before it are its source's."""
 
     def __init__(self, logged: "EpisodeStore", augmented: AugmentedEpisodes) -> None:
         self._augmented, self._n_logged = augmented, logged.n_episodes

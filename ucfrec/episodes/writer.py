@@ -176,11 +176,8 @@ def reward_bit(
 
     A reward is high if it exceeds the median of all rewards; if the median equals the largest
     reward (more than half of all steps are clicks), a reward is high if it equals the median. The
-    paper's deterministic distractor has `flip` 0, the stochastic one 0.15.
-
-    Args:
-        early: shift the bit one step ahead, d_t = I{r_{t+1} is high}; the last step of an episode,
-            which has no next reward, uses its own reward.
+    paper's deterministic distractor has `flip` 0, the stochastic one 0.15. An `early` bit is that
+    of the next step, d_t = I{r_{t+1} is high}, but for the last step of an episode.
 
     Raises:
         InputError: `flip` is not a probability, or all rewards are equal.

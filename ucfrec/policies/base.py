@@ -27,8 +27,6 @@ _KNOTS = 6
 """Returns-to-go at which an exposure term has weights of its own."""
 BEST: float = 0.99
 """τ of the expectile that stands for the best return within the logs (Reinformer)."""
-_ADVANTAGES = (-5.0, 3.0)
-"""Range of the standardised advantage in the exponent of a weight."""
 
 Context = Annotated[int, Field(ge=1, le=4096)]
 Layers = Annotated[int, Field(ge=1, le=128)]
@@ -112,12 +110,9 @@ class SequencePolicy(nn.Module, ABC):
     head: Head
 
     def __init__(self, config: PolicyConfig, sizes: Mapping[str, int]) -> None:
-        """Args:
-        config: settings, an instance of the class's `Config`.
-        sizes: `state` S; `action` A, the size of an action vector or of an item's embedding; and
-            `items`, the number of items, 0 if actions are vectors; and `tags`, the most tags of an
-            item, 0 if that is omitted.
-        """
+        """Sizes are `state` S; `action` A, the size of an action vector or of an item's embedding;
+        `items`, the number of items, 0 if actions are vectors; and `tags`, the most tags of an
+        item, 0 if that is omitted."""
         super().__init__()
         if self.items_only and not sizes["items"]:
             raise InputError(
@@ -358,9 +353,9 @@ class ValueHead(nn.Module):
 
 
 def advantage_weights(values: Tensor, returns: Tensor) -> Tensor:
-    """exp(clip((Ĝ_t − V(s_t)) / σ)) of M steps, (M,), σ the advantages' standard deviation, from
-    values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over all processes."""
+    """exp(clip((Ĝ_t − V(s_t)) / σ, −5, 3)) of M steps, (M,), σ the advantages' standard deviation,
+    from values (M, 2) of `ValueHead` and returns-to-go (M,); no gradient, mean 1 over processes."""
     advantage = (returns - values[:, 0]).detach()
-    deviation = joint_moments(advantage)[1]
-    weights = (advantage / deviation.clamp(min=1e-6)).clamp(*_ADVANTAGES).exp()
+    deviation = joint_moments(advantage)[1].clamp(min=1e-6)
+    weights = (advantage / deviation).clamp(-5.0, 3.0).exp()
     return weights / joint_moments(weights)[0]

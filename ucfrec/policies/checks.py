@@ -87,9 +87,23 @@ def _check_answer(policy: SequencePolicy, train: EpisodeStore) -> None:
     back = torch.arange(_WINDOWS) % windows.mask.sum(1)
     back[::2] = 0  # what acting computes is the last row
     cuts = context - 1 - back
+    at = torch.arange(context)
+    late, later = at >= cuts[:, None], at > cuts[:, None]
+    if isinstance(policy.head, ItemHead):
+        n_items = len(policy.head.embeddings)
+        actions = torch.where(late, (windows.actions + 1) % n_items, windows.actions)
+    else:
+        actions = windows.actions + late.unsqueeze(-1)
+    changed = replace(
+        windows,
+        actions=actions,
+        rewards=windows.rewards + late,
+        returns_to_go=windows.returns_to_go + later,
+        states=windows.states + later.unsqueeze(-1),
+    )
     first, acts = _outputs(policy, windows)
-    second, other_acts = _outputs(policy, _change(windows, cuts, policy))
-    unchanged = windows.mask & (torch.arange(context) <= cuts[:, None])
+    second, other_acts = _outputs(policy, changed)
+    unchanged = windows.mask & ~later
     if _alike(first[unchanged], second[unchanged]) and _alike(acts[::2], other_acts[::2]):
         return
     if not _alike(first, _outputs(policy, windows)[0]):
@@ -107,25 +121,6 @@ def _sample(train: EpisodeStore, length: int, most: int | None = None) -> Window
     episodes, _ = train.locate(steps)
     lasts = train.lengths[episodes] - 1
     return train.windows(episodes, lasts if most is None else lasts.clip(max=most - 1), length)
-
-
-def _change(windows: Windows, cuts: Tensor, policy: SequencePolicy) -> Windows:
-    """Windows with other actions and rewards from the steps `cuts` (B,) on, and other states and
-    returns-to-go after them."""
-    at = torch.arange(windows.mask.shape[1])
-    late, later = at >= cuts[:, None], at > cuts[:, None]
-    if isinstance(policy.head, ItemHead):
-        n_items = len(policy.head.embeddings)
-        actions = torch.where(late, (windows.actions + 1) % n_items, windows.actions)
-    else:
-        actions = windows.actions + late.unsqueeze(-1)
-    return replace(
-        windows,
-        actions=actions,
-        rewards=windows.rewards + late,
-        returns_to_go=windows.returns_to_go + later,
-        states=windows.states + later.unsqueeze(-1),
-    )
 
 
 def _outputs(policy: SequencePolicy, windows: Windows) -> tuple[Tensor, Tensor]:

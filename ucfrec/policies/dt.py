@@ -231,10 +231,9 @@ class DT4RecPolicy(DTPolicy):
     """DT whose tokens come from a reward prompt and from recurrent encoders.
 
     The contrastive loss draws the features of a step closer to the embedding of its action with the
-    logged return-to-go than with others. The public code shifts the next return by 0 to 7; here,
-    the others are returns of other windows of the batch, which are on the scale of the data.
-    Actions are one item or one vector, so the shared heads decode them. The recurrent decoder of
-    the public code is not used; it starts from the encoding of the true action.
+    logged return-to-go than with those of other windows of the batch; the public code shifts the
+    next return by 0 to 7. The shared heads decode the one item or vector of a step, not the public
+    code's recurrent decoder, which starts from the encoding of the true action.
     """
 
     Config = DT4RecConfig

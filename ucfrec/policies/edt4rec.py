@@ -32,7 +32,6 @@ _HIDDEN = 128
 """Width of the two hidden layers of CQL's network."""
 _CANDIDATES = 20
 """Actions sampled in place of all actions: half from the logs, half uniformly."""
-_LEARNING_RATE = 3e-4
 _BATCH_SIZE = 128
 _TARGET_RATE = 0.01
 """Rate at which the target network moves to the network at every update."""
@@ -119,8 +118,7 @@ class ConservativeQ(nn.Module):
 def relabel(
     store: EpisodeStore, steps: int, weight: float, folder: Path, seed: int
 ) -> EpisodeStore:
-    """The store, without augmented episodes, with returns-to-go raised by CQL's state values
-    (EDT4Rec).
+    """The store, without augmented episodes, with returns-to-go raised by CQL's state values.
 
     Backwards through each episode, R_{t−1} = r_{t−1} + max(R_t, V̂(s_t)). The folder keeps the Q
     function, trained for `steps` updates with the weight α of the conservative term.
@@ -130,7 +128,7 @@ def relabel(
     loop = LoopConfig(
         steps=steps,
         batch_size=_BATCH_SIZE,
-        learning_rate=_LEARNING_RATE,
+        learning_rate=3e-4,
         clip_norm=1.0,
         warmup_steps=0,
         average=0.0,

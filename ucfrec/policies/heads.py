@@ -18,9 +18,8 @@ class Proposal:
     half evenly.
 
     By counts alone, items that the logs hardly show but the policy likes would be drawn too rarely
-    for their weight; evenly alone, popular items would (`benchmarks/LOG.md` has all three). The
-    unit interval is cut into as many equal parts as there are draws, and every part has one: the
-    draws of an item then deviate from their expectation by less than two.
+    for their weight; evenly alone, popular items would (`benchmarks/LOG.md`). Equal parts of
+    the unit interval have one draw each: an item's are fewer than two off their expectation.
     """
 
     def __init__(self, counts: Tensor) -> None:
@@ -180,7 +179,7 @@ class ItemHead(nn.Module):
                 for part in torch.split(items, max(1, _AT_ONCE // max(1, len(features))))
             ]
             return torch.stack(parts).logsumexp(0) - logit
-        items, logits, _ = self._sampled_logits(features, exposed)
+        items, logits, _ = self._sample_logits(features, exposed)
         # The logged item counts as itself, not as one that was drawn.
         column = columns_of(actions, items)
         rows = torch.nonzero(column >= 0)[:, 0]
@@ -193,7 +192,7 @@ class ItemHead(nn.Module):
             logs = self.predict(features, exposed).log_softmax(-1)
             of_all: Tensor = -(logs.exp() * logs).sum(-1).mean()
             return of_all
-        _, logits, log_weights = self._sampled_logits(features, exposed)
+        _, logits, log_weights = self._sample_logits(features, exposed)
         logs = logits.log_softmax(-1)
         estimate: Tensor = -(logs.exp() * (logs - log_weights)).sum(-1).mean()
         return estimate
@@ -212,7 +211,7 @@ class ItemHead(nn.Module):
             return self.exposure.added_to(logits, exposed, items)
         return logits
 
-    def _sampled_logits(
+    def _sample_logits(
         self, features: Tensor, exposed: Exposed | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Items (L,) as `Proposal.draw`s them, logits (M, L) plus log weights, and these (L,)."""

@@ -73,10 +73,9 @@ class GSASRecPolicy(SASRecPolicy):
     """SASRec whose loss takes the shown item as positive and k uniform items as negatives.
 
     L = −(β log σ(s⁺) + Σ log(1 − σ(s⁻))) / (k + 1), with β = α (t (1 − 1/α) + 1/α) and the sampling
-    rate α = k / (n_items − 1) (Eq. 10 and 15 of the paper). Two deviations: all steps of a batch
-    share their negatives, for speed, and the scores have the head's bias, which begins at the
-    items' popularity. At the minimum softmax(s) is close to the items' probabilities, so the
-    validation loss is that of SASRec.
+    rate α = k / (n_items − 1) (Eq. 10 and 15 of the paper). Here, all steps of a batch share their
+    negatives, for speed, and the scores have the head's bias. At the minimum softmax(s) is close to
+    the items' probabilities, so the validation loss is that of SASRec.
     """
 
     Config = GSASRecConfig

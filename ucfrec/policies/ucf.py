@@ -363,8 +363,7 @@ def visible_tokens(valid: Tensor) -> Tensor:
 
 
 def parent_targets(mask: Tensor, window: int, decay: float, previous_action: float) -> Tensor:
-    """Target attention q (B, K, 3K) of the row that predicts a_t, over tokens (R_0, s_0, a_0, R_1,
-    …).
+    """Target attention q (B, K, 3K) of the row that predicts a_t, over R_0, s_0, a_0, R_1, …
 
     Its parents are Ĝ_t and s_t with weight 1, s_{t−k} with weight decay^k for 1 ≤ k ≤ window, and
     a_{t−1} with weight `previous_action` (Table 7). Padded parents, where the mask (B, K) is false,

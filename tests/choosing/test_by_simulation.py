@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.support.logs import store_of
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
@@ -24,7 +25,6 @@ from ucfrec.choosing.choice import Evidence, Problem, RuleChoice, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.record import RuleRecord, read_candidates, read_record
@@ -82,9 +82,8 @@ def chosen(
     scorer: Scorer, store: EpisodeStore, run: Path, config: RuleConfig, *targets: float
 ) -> RuleChoice:
     users = users_of(run, store)
-    states = store.item_states
-    parts = scorer.returns, users.reward, users.session_end
-    scorer = Scorer(scorer.policy, scorer.rule, states, *parts)
+    parts = store.item_states, scorer.returns, users.reward, users.session_end
+    scorer = Scorer(scorer.policy, scorer.rule, *parts)
     given = dict(zip((0.9, 1.0), targets, strict=True))
     return choose_by_simulation(Problem(scorer, users, given, *training_views(store), config, 0))
 
@@ -149,14 +148,10 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
 ) -> None:
     search, rules = search_of(trained), [DecisionRule(2.0), drawn(0.0)]
     found = search.simulate(rules)
-    luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
-    nothing = np.zeros(0, dtype=np.int64)
-    for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
-        search._sessions[each] = Outcomes(returns, nothing, nothing)
-    low, high = (
-        replace(each, value=luck.mean() + more, error=3.2)
-        for each, more in zip(found, (0.0, 3.0), strict=True)
-    )
+    luck, nothing = np.random.default_rng(0).normal(50.0, 20.0, 40), np.zeros(0, dtype=np.int64)
+    for rule, more in zip(rules, (0.0, 3.0), strict=True):
+        search._sessions[rule] = Outcomes(luck + more, nothing, nothing)
+    low, high = replace(found[0], value=luck.mean()), replace(found[1], value=luck.mean() + 3.0)
     assert search.level([low, high]) == [high]
     search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
@@ -164,9 +159,8 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.best([low, high]) == search.best([high, low]) == high
     # Or the one that the log says most of: the likelihood, then the hits.
     likely = replace(low, evidence=Evidence(0.1, 0.2))
-    unlikely = replace(high, evidence=Evidence(0.3, 0.1))
+    unlikely, hitting = (replace(high, evidence=Evidence(0.3, each)) for each in (0.1, 0.2))
     assert search.most_evident([unlikely, likely]) == likely
-    hitting = replace(high, evidence=Evidence(0.3, 0.2))
     assert search.most_evident([likely, hitting]) == hitting
 
 
@@ -297,24 +291,6 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert (own.value, own.error) == (simulated.value, simulated.error)
 
 
-@pytest.mark.slow
-def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
-    tmp_path: Path, trained: TrainedPolicy
-) -> None:
-    store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
-    config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), tolerance=0.1)
-    found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
-    rule = found.rule
-    assert rule.tag_run > 0
-    same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
-    drawn = {(each.rule.temperature, each.rule.reward_weight) for each in same_run}
-    assert drawn == set(product(config.temperatures, config.reward_weights))
-    top = max(each.value for each in found.candidates)
-    level = [each for each in same_run if each.value >= 0.9 * top and each.items >= 2]
-    assert len({each.rule.temperature for each in level}) > 1
-    assert rule.temperature == max(each.rule.temperature for each in level)
-
-
 def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     folder: Path, trained: TrainedPolicy
 ) -> None:
@@ -372,30 +348,23 @@ def tiring_store(folder: Path) -> EpisodeStore:
             minute = 28_000_000 + 40 * user + step
             rows.append((user, item, 60_000 * minute, float(liked)))
     log = pd.DataFrame(rows, columns=["user_id", "item_id", "timestamp", "reward"])
-    log.to_parquet(folder / "log.parquet")
     items = pd.DataFrame({"item_id": range(24), "tags": [[f"t{item % 4}"] for item in range(24)]})
     items.to_parquet(folder / "items.parquet")
     users = pd.DataFrame({"user_id": range(160), "age": np.arange(160.0)})
     users.to_parquet(folder / "users.parquet")
-    mapping = LogMapping(
-        item_features=(FeatureTable((folder / "items.parquet",), "item_id"),),
-        user_features=(FeatureTable((folder / "users.parquet",), "user_id"),),
-    )
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
-    prepare([folder / "log.parquet"], mapping, folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    tables = [FeatureTable((folder / f"{of}s.parquet",), f"{of}_id") for of in ("item", "user")]
+    mapping = LogMapping(item_features=(tables[0],), user_features=(tables[1],))
+    options = {"reward": "reward", "session_by": "gap", "gap_minutes": 120, "embedding_size": 6}
+    return store_of(log, folder, mapping, **options)
 
 
 def test_a_finished_run_that_is_trained_again_keeps_its_rule(
-    folder: Path, trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
+    trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("the rule is chosen again")
-
-    monkeypatch.setattr("ucfrec.runs.run.choose_by_simulation", never)
-    store = EpisodeStore.open(folder / "store")
-    before = read_json(folder / "run" / "run.json")
-    train_run(store, folder / "run", config_from_dict(before["config"]))
-    after = read_json(folder / "run" / "run.json")
-    assert after["rule"] == before["rule"]
-    assert TrainedPolicy.load(folder / "run").rule == trained.rule
+    monkeypatch.delattr("ucfrec.runs.run.choose_by_simulation")
+    run = trained.folder
+    before = read_json(run / "run.json")
+    store = EpisodeStore.open(run.parent / "store")
+    train_run(store, run, config_from_dict(before["config"]))
+    assert read_json(run / "run.json")["rule"] == before["rule"]
+    assert TrainedPolicy.load(run).rule == trained.rule

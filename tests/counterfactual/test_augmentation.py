@@ -119,10 +119,8 @@ class EvenSteps:
 
     band = (0.2, 0.5)
 
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        return torch.where(states[:, :1] >= 0, states, states + 10.0)
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+        return torch.where(at.states[:, :1] >= 0, at.states, at.states + 10.0)
 
 
 @pytest.mark.parametrize("edits", [1, 3])

@@ -264,7 +264,7 @@ def edit_states(
             factual = read_transitions(view, episodes[rows], steps[rows], item_rewards)
             factual = factual.to(crm.device)
             s, a, r = factual.states, factual.actions, factual.rewards
-            proposed = generator.propose(s, a, crm.abduct(s, a, r), random)
+            proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
             factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
             passed = accept(

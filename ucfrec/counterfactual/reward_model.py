@@ -108,6 +108,11 @@ class Posterior(NamedTuple):
     mean: Tensor
     log_variance: Tensor
 
+    @property
+    def kl(self) -> Tensor:
+        """KL(q ‖ N(0, I)) of each dimension, (..., latent_dim) in nats."""
+        return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance)
+
 
 class EffectsMean(nn.Module):
     """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states.
@@ -178,18 +183,16 @@ class CausalRewardModel(nn.Module):
         """Where the model is, and what it is given has to be."""
         return self.state_mean.device
 
-    def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
-        """The posterior q_ϕ(z | s, a, r)."""
-        return self._encode(self.given(states, actions), self.residual(states, actions, rewards))
-
-    def _encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
+    def encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
+        """The posterior q_ϕ(z | s, a, r), of what `given` and `residual` return."""
         surprise = (residual / self.surprise_std).unsqueeze(-1)
         mean, log_variance = self.encoder(torch.cat([inputs, surprise], dim=-1)).chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
     def abduct(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """z = μ_ϕ(s, a, r), the posterior mean (..., latent_dim) of Algorithms 3 to 5."""
-        return self.encode(states, actions, rewards).mean
+        residual = self.residual(states, actions, rewards)
+        return self.encode(self.given(states, actions), residual).mean
 
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
@@ -200,12 +203,12 @@ class CausalRewardModel(nn.Module):
     def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Log likelihood and KL of Eq. 2, each (...) in nats, at z = μ + σ·noise, with standard
         normal noise (..., latent_dim). Inputs are what `given`, residuals what `residual` gives."""
-        q = self._encode(inputs, residual)
+        q = self.encode(inputs, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
         error = self._disturbance(inputs, z) - residual
         scale = self.config.decoder_std
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
-        return log_likelihood, kl_to_prior(q).sum(-1)
+        return log_likelihood, q.kl.sum(-1)
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
@@ -246,11 +249,6 @@ class CausalRewardModel(nn.Module):
     def normalise_rewards(self, rewards: Tensor) -> Tensor:
         """Rewards (...), standardised."""
         return _normalise(rewards, self.reward_mean, self.reward_std)
-
-
-def kl_to_prior(q: Posterior) -> Tensor:
-    """KL(q ‖ N(0, I)) of each dimension, (..., latent_dim) in nats."""
-    return 0.5 * (q.mean.square() + q.log_variance.exp() - 1 - q.log_variance)
 
 
 def mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
@@ -466,14 +464,14 @@ def _draw_noise(generator: np.random.Generator, target: Tensor, size: int) -> Te
 @torch.no_grad()
 def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CRMReport:
     s, a, r = held_out.states, held_out.actions, held_out.rewards
-    q = model.encode(s, a, r)
+    q = model.encode(model.given(s, a), model.residual(s, a, r))
     with_z = model.predict(s, a, q.mean)
     without_z = model.predict(s, a, torch.zeros_like(q.mean))
     # Rows are in random order, so the z of the next row is a draw from the marginal distribution,
     # as Jansen's estimator of the total effect needs.
     other_z = model.predict(s, a, q.mean.roll(1, dims=0))
     variance = float(r.var(correction=0)) or math.nan
-    kl = kl_to_prior(q).mean(dim=0)
+    kl = q.kl.mean(dim=0)
     active = kl > _ACTIVE_NATS
     columns = torch.cat([without_z.unsqueeze(1), q.mean[:, active]], dim=1)
     leak = torch.corrcoef(columns.T).nan_to_num().abs().reshape(columns.shape[1], -1)[0, 1:]

@@ -137,7 +137,7 @@ class Editing:
         random = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             z = self.crm.abduct(factual.states, factual.actions, factual.rewards)
-            proposed = generator.propose(factual.states, factual.actions, z, random)
+            proposed = generator.propose(factual, z, random)
             passed = accept(self.crm, factual, z, proposed, self.epsilon_r, band[1] + _ROUNDING)
             length = self.crm.moves(factual.states, proposed).norm(dim=1)
         return float((passed & (length >= band[0] - _ROUNDING)).float().mean())

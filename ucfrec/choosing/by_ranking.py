@@ -40,11 +40,8 @@ _PRIOR = 10.0
 
 
 class LoggedScores:
-    """Scores of all items at M logged steps by rules of one policy.
-
-    Policy and reward model are computed once for all rules of one target, and kept for later rules
-    where the policy has factors: the outputs of others are as many as items.
-    """
+    """Scores of all items at M logged steps by rules of one policy: what all rules of a target
+    share is computed once, and kept where the policy has factors, which are few numbers."""
 
     def __init__(
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
@@ -136,10 +133,9 @@ class LoggedEvidence:
 def choose_by_ranking(problem: Problem) -> RuleChoice:
     """Choose the reward weight of the rule; its other parts stay.
 
-    Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
-    cannot be distinguished the one with the most hits; without any, those count whose hits cannot
-    be distinguished from the most. If the next larger of the configured candidates overlaps too
-    little, reward weights between the two are tried. Two halves of the users choose again.
+    Of those with enough overlap, or without any those whose hits cannot be told apart from the
+    most, the one with the highest rate is chosen, and of equal ones the one with the most hits. If
+    the next larger candidate overlaps too little, weights between the two are tried.
     """
     train, validation, scorer = problem.train, problem.validation, problem.scorer
     n_items = len(train.item_states.embeddings)

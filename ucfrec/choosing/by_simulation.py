@@ -81,10 +81,8 @@ class Outcomes:
 
 
 class _ManyRules(PolicyActor):
-    """Acts by the rule of each session: n sessions by each of several scorers of one policy.
-
-    Every rule has a generator of its own, so that it draws what it would draw alone.
-    """
+    """Acts by the rule of each session: n sessions by each of several scorers of one policy, each
+    with a generator of its own, so that it draws what it would draw alone."""
 
     def __init__(self, scorers: Sequence[Scorer], n: int, store: EpisodeStore, seed: int) -> None:
         states, rows = store.item_states, len(scorers) * n

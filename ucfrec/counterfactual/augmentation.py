@@ -325,11 +325,8 @@ def _fill_copies(
     config: AugmentConfig,
     rng: np.random.Generator,
 ) -> Iterator[_Edits]:
-    """Propose at each episode's steps in random order until its copies are full (Algorithm 5).
-
-    In each round every episode proposes as many edits as its copies still need, so no edit is
-    proposed that the algorithm, which proceeds one step at a time, would not propose.
-    """
+    """Propose at each episode's steps in random order until its copies are full (Algorithm 5): in
+    each round as many edits as they still need, which the algorithm would propose one by one."""
     order = np.lexsort((rng.random(len(steps)), episodes))
     unique_episodes, counts = np.unique(episodes, return_counts=True)
     first = np.cumsum(counts) - counts
@@ -455,13 +452,11 @@ def interventions(view: EpisodeStore, dimensions: Sequence[int], seed: int) -> A
 
 @dataclass(frozen=True)
 class ActionGenerator:
-    """Proposes other actions at logged steps, with their counterfactual rewards.
+    """Proposes other actions at logged steps (s, a, r), with their counterfactual rewards.
 
-    For a logged step (s, a, r), the disturbance z is abduced and kept; another action a' is the
-    action of a random training step whose state lies in the same cluster as s; and its reward is
-    r' = f̂_r(s, a', z), within the range of the logged rewards. The model must reproduce the logged
-    reward, |f̂_r(s, a, z) − r| ≤ ε_r, and r' must differ from r by more than δ, the model's error on
-    held-out steps.
+    The disturbance z is abduced and kept; another action a' is that of a random training step whose
+    state lies in the same cluster as s; its reward r' = f̂_r(s, a', z), within the range of the log,
+    must differ from r by more than δ, and |f̂_r(s, a, z) − r| ≤ ε_r must hold.
     """
 
     view: EpisodeStore
@@ -476,10 +471,8 @@ class ActionGenerator:
     def propose(
         self, episodes: IntArray, steps: IntArray, count: int, seed: int
     ) -> tuple[AugmentedEpisodes, ActionReport]:
-        """Propose `count` other actions at each of M steps of episodes (M,), and copy what passes.
-
-        Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
-        """
+        """Draw `count` other actions, with replacement, at each of M steps of episodes (M,), and
+        copy what passes; a draw of the logged action itself is not a proposal."""
         # In float64, so that a later check confirms what passes.
         view, exact = self.view, copy.deepcopy(self.crm).double()
         rng = np.random.default_rng([seed, _ACTION_STREAM])

@@ -129,12 +129,11 @@ class Generator(Protocol):
 
 
 class TangentGenerator:
-    """Random moves along the level set of the predicted reward.
+    """Random moves along the level set of the predicted reward, which are not in the paper.
 
     A move Δ is drawn from a Gaussian with the covariance Σ of the training states in the cluster
     nearest to s, conditioned on an unchanged reward to first order: ∇f̂_r · Δ = 0. It is scaled to a
-    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r. Not in
-    the paper, whose generator is `CounterfactualStateGenerator`.
+    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r.
     """
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
@@ -232,8 +231,7 @@ def make_generator(
     """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
 
     Args:
-        train: M transitions, on the CPU; the generator shares the device of the reward model, whose
-            parameters are frozen if the kind is `faithful`.
+        crm: gives the device; its parameters are frozen if the kind is `faithful`.
         folder: of the checkpoints of `faithful`, which resumes from them.
         clusters: the `state_clusters` of the same arguments, if they are known.
     """

@@ -115,11 +115,8 @@ class Posterior(NamedTuple):
 
 
 class EffectsMean(nn.Module):
-    """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states.
-
-    Actions are those of `read_transitions`: the item's vector, then the part of the linear
-    predictor that does not depend on the state.
-    """
+    """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states and of actions of
+    `read_transitions`: the item's vector, then the part of the predictor that no state changes."""
 
     def __init__(self, model: ItemRewardModel) -> None:
         super().__init__()
@@ -159,11 +156,8 @@ class CausalRewardModel(nn.Module):
         config: CRMConfig,
         mean: EffectsMean | None = None,
     ) -> None:
-        """Args:
-        action_size: A, the size of an action vector or of an item's embedding; with `mean`, of
-            the actions that it reads.
-        mean: E[r | s, a]; None for a network that is yet to be trained.
-        """
+        """`mean` is E[r | s, a], whose actions have the size A = `action_size`; None for a network
+        that is yet to be trained."""
         super().__init__()
         self.config = config
         input_size = state_size + action_size
@@ -271,12 +265,9 @@ def read_transitions(
     item_rewards: ItemRewardModel | None = None,
     actions: Array | None = None,
 ) -> Transitions:
-    """Single steps of a view with the actions (M, A) that the reward model is fitted to.
-
-    Args:
-        item_rewards: what `EffectsMean` is made of, which then reads the actions (M, D + 1).
-        actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
-    """
+    """Single steps of a view with the actions (M, A) that the reward model is fitted to; with
+    `item_rewards`, those that `EffectsMean` reads (M, D + 1). Given `actions`, (M,) items or (M, A)
+    vectors, replace the logged ones."""
     transitions = view.transitions(episodes, steps)
     if item_rewards is None:
         if actions is None:
@@ -329,8 +320,7 @@ def fit_crm(
     the lowest validation loss, in evaluation mode, and its quality.
 
     Args:
-        folder: of the checkpoints, which training resumes from; with the file `INITIAL` in it, of
-            weights and scales that training begins with.
+        folder: of the checkpoints, which training resumes from, and perhaps of `INITIAL`.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
     """

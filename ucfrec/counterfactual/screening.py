@@ -10,10 +10,9 @@ explains of it, the action above all, it explains through the reward. So
 
 A cause fails one of these. If the logging policy did not see it, the action explains none of it
 (1); if the policy did, the action explains it with or without the reward (3). A dimension of a
-process that goes on, such as a position or a user's feature, is explained by other dimensions (3).
+process that goes on, such as a position, is explained by other dimensions (3).
 
-Features of items and users are not screened: a policy reads them from its run's own tables, so
-that they have the same values in the logs and wherever it acts.
+Features of items and users have the same values wherever a policy acts, so they are not screened.
 """
 
 from collections.abc import Collection, Sequence
@@ -107,9 +106,6 @@ class ScreeningReport:
 def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
     """Test every logged observation dimension of a log of items: one that measures the reward
     counts as without effect.
-
-    Args:
-        train: a view of the training episodes.
 
     Raises:
         InputError: no observations are logged, there are too few episodes to hold some out, or

@@ -68,11 +68,8 @@ class UserModel:
         simulated: bool = True,
         first: Path | None = None,
     ) -> "UserModel":
-        """Fit the parts that are not in `folder` yet; read the others.
-
-        Args:
-            simulated: whether sessions are simulated.
-            first: folder of the user model of an earlier state of the store, where searches begin.
+        """Fit the parts that are not in `folder` yet; read the others. Searches begin near the user
+        model of an earlier state of the store, in the folder `first`.
 
         Raises:
             InputError: training rewards are equal, no steps are held out, or a file is damaged.
@@ -145,8 +142,7 @@ class UserModel:
 
 class LoggedRewards:
     """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
-    expected reward. Paying the mean itself would be wrong where what follows, as the end of the
-    session, is not linear in the reward."""
+    expected reward, as what follows, such as the session's end, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
         batches = store.column_batches(schema.REWARD)
@@ -196,12 +192,8 @@ class UserSimulator:
         seed: int,
         times: int = 1,
     ) -> None:
-        """
-        Args:
-            store: view of the sessions that are begun; session i is the i-th modulo their number.
-            longest: steps after which a session ends in any case.
-            times: N / `sessions`; session i draws what session i modulo `sessions` draws.
-        """
+        """Begins session i as the i-th of `store`, modulo their number, to end after `longest`
+        steps; of N = `sessions` · `times`, it draws what session i modulo `sessions` draws."""
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
         self._logged, self._lags = LoggedRewards(store), model.rewarding.lags

@@ -99,10 +99,9 @@ def weigh_by_propensity(
 ) -> Tensor | None:
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
-    Of each user in proportion to 1 / (p · items), cut off at 10 (inverse propensity weighting). So
-    that a few rows of large weight do not pass for much knowledge of a user, those of a user add up
-    to their effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal
-    selection probabilities in multilevel models"). None if the log does not have every p.
+    Of each user in proportion to 1 / (p · items), cut off at 10; those of a user add up to their
+    effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal selection
+    probabilities in multilevel models"). None if the log does not have every p.
     """
     propensities = read_propensities(view, episodes, steps)
     if propensities is None:

@@ -129,9 +129,8 @@ class SessionEnd:
     """
 
     def __init__(self, likeness: Likeness, tensors: Mapping[str, Tensor]) -> None:
-        """Of tensors of `BoostedTrees`; or of the `highest` (F,) inputs that count, so that steps
-        later than logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights`
-        (F,) and `bias` (), all float64."""
+        """Of tensors of `BoostedTrees`; or, float64, of the `highest` (F,) inputs that count, their
+        `mean` and `scale` (F,), `weights` (F,) and `bias` ()."""
         self.tensors, self._likeness = tensors, likeness
         self._trees = BoostedTrees(**tensors) if "thresholds" in tensors else None
         uses = tensors["weights"][_REWARD] if self._trees is None else tensors["inputs"] == _REWARD
@@ -156,12 +155,9 @@ class SessionEnd:
     def fit(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
-        """Fit every kind to logged steps, and keep the best on held-out ones.
-
-        The end of a user's last session may only be that of the user's rows. So everything is
-        fitted without these ends, too, and that is kept if it clearly (by three standard errors)
-        predicts held-out sessions better that another one follows.
-        """
+        """Fit every kind to logged steps, and keep the best on held-out ones: without the ends of
+        users' last sessions, which may only be those of their rows, if that clearly (by three
+        standard errors) predicts held-out sessions better that another one follows."""
         best = cls._fit_best(likeness, logged, held_out, seed)
         certain = held_out.select(held_out.followed)
         if logged.followed.all() or certain.ended.sum() < _FEWEST:
@@ -304,13 +300,9 @@ class BoostedTrees:
     """
 
     def __init__(self, inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
-        """Args:
-        inputs: (T, S) int64 number of the input that a split looks at.
-        thresholds: (T, S) float64.
-        leaves: (T, 2^S) float64 by numbers whose bit s is set where split s finds an input that is
-            at most its threshold.
-        base: () float64, what the trees' sum starts from.
-        """
+        """From int64 numbers of the splits' `inputs` (T, S) and, float64, their `thresholds`
+        (T, S), the `base` () of the sum, and `leaves` (T, 2^S) by numbers whose bit s is set where
+        split s finds an input that is at most its threshold."""
         self._leaves, self._base = leaves, base
         pairs = torch.stack([inputs.double(), thresholds], 2).flatten(0, 1)
         splits, which = torch.unique(pairs, dim=0, return_inverse=True)

@@ -89,6 +89,7 @@ class _ManyRules(PolicyActor):
         users = np.arange(len(states.user_features))
         super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
         self._scorers = scorers
+        self._targets = [(each.rule.target, each.rule.minimum_target) for each in scorers]
         self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
         self._rule = np.repeat(np.arange(len(scorers)), n)
 
@@ -103,10 +104,10 @@ class _ManyRules(PolicyActor):
         for batch in _batch_rules(self._rule[rows.numpy()]):
             begin, windows = batch[0][1].start, list[Windows]()
             # Windows depend on the rule's targets alone.
-            for _, rules in groupby(batch, lambda entry: self._targets(entry[0])):
-                group = list(rules)
-                part = slice(group[0][1].start, group[-1][1].stop)
-                windows.append(self._scorers[group[0][0]].windows(sessions.at(part)))
+            for _, rules in groupby(batch, lambda entry: self._targets[entry[0]]):
+                (number, part), *others = rules
+                end = others[-1][1].stop if others else part.stop
+                windows.append(self._scorers[number].windows(sessions.at(slice(part.start, end))))
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
@@ -118,10 +119,6 @@ class _ManyRules(PolicyActor):
                 decisions.append(scorer.rule.choose(scores, self._generators[number]))
         items, chances = zip(*decisions, strict=True)
         return torch.cat(items), torch.cat(chances)
-
-    def _targets(self, number: int) -> tuple[float | None, float | None]:
-        rule = self._scorers[number].rule
-        return rule.target, rule.minimum_target
 
 
 def _batch_rules(rules: IntArray) -> list[list[tuple[int, slice]]]:
@@ -441,7 +438,8 @@ def _describe_choice(users: UserModel) -> str:
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """Rules of all kinds that the log can tell of, each beside the best of those before."""
     problem, config = search.problem, search.problem.config
-    candidates = search.simulate([*_list_unweighted(problem)])
+    drawn = (DecisionRule(None, temperature=t) for t in sorted(config.temperatures, reverse=True))
+    candidates = search.simulate([rule for of in drawn for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
     candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
     second = search.best(candidates).rule
@@ -490,20 +488,19 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
             "to evaluate it"
         )
     if estimate.value + 2 * estimate.error < mean_return:
-        warnings.append(
-            f"this is less than logged sessions have, {mean_return:.4g}; do not launch it"
-        )
+        less = f"this is less than logged sessions have, {mean_return:.4g}"
+        warnings.append(f"{less}; do not launch it")
     return "".join(f"; WARNING: {warning}" for warning in warnings)
 
 
-def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
-    config, targets, policy = problem.config, problem.targets, problem.scorer.policy
-    for temperature in sorted(config.temperatures, reverse=True):
-        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
-            yield DecisionRule(target, temperature=temperature)
-            yield DecisionRule(target, minimum_target=target, temperature=temperature)
-        if policy.values is not None and policy.config.max_return:
-            yield DecisionRule(None, temperature=temperature)
+def _vary_target(rule: DecisionRule, problem: Problem) -> Iterator[DecisionRule]:
+    """The rule with each target, with and without that minimum, and with the policy's own."""
+    policy = problem.scorer.policy
+    for target in dict.fromkeys(problem.targets.values()):
+        yield replace(rule, target=target, minimum_target=None)
+        yield replace(rule, target=target, minimum_target=target)
+    if policy.values is not None and policy.config.max_return:
+        yield replace(rule, target=None, minimum_target=None)
 
 
 def _vary(rule: DecisionRule, **values: Sequence[Any]) -> list[DecisionRule]:
@@ -523,16 +520,12 @@ def _lookaheads(problem: Problem) -> list[float]:
 def find_neighbours(
     rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
 ) -> Iterator[DecisionRule]:
-    """The rule, rules with another target, and those with another of its numbers one candidate up
-    or down, among those of the configuration and `more`. A rule without lookahead also gets one,
-    with the middle weight of the policy; one with it loses it, with the middle reward weight."""
-    config, policy = problem.config, problem.scorer.policy
+    """The rule, those of `_vary_target`, and those with another of its numbers one candidate up or
+    down, of the configuration and `more`. A rule without lookahead also gets one, with the middle
+    weight of the policy; one with it loses it, with the middle reward weight."""
+    config = problem.config
     yield rule
-    for target in dict.fromkeys(problem.targets.values()):
-        yield replace(rule, target=target, minimum_target=None)
-        yield replace(rule, target=target, minimum_target=target)
-    if policy.values is not None and policy.config.max_return:
-        yield replace(rule, target=None, minimum_target=None)
+    yield from _vary_target(rule, problem)
     grid: dict[str, list[float]] = {
         "temperature": [*config.temperatures],
         "reward_weight": [*config.reward_weights],

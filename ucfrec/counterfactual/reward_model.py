@@ -335,12 +335,23 @@ def fit_crm(
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
-    inputs = _read_inputs(model, train)
+    rows, (inputs, residual) = (_read_inputs(model, steps) for steps in (train, held_out))
     if config.mean_first:
         model.expected.requires_grad_(False)
-        variance = float(inputs[1].double().square().mean())
+        variance = float(rows[1].double().square().mean())
         model.surprise_std.fill_(max(variance, 1e-8) ** 0.5)
-    _fit_elbo(model, inputs, _read_inputs(model, held_out), folder / "cvae", seed)
+
+    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
+        inputs, residual, noise = batch
+        log_likelihood, kl = (term.mean() for term in model.elbo(inputs, residual, noise))
+        parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
+        return config.beta * kl - log_likelihood, parts
+
+    noise = _draw_noise(np.random.default_rng(seed), residual, config.latent_dim)
+    loop = _loop(config, len(train.rewards))
+    _fit(
+        model, loss, rows, (inputs, residual, noise), loop, folder / "cvae", seed, config.latent_dim
+    )
     return model, _report(model, len(train.rewards), held_out)
 
 
@@ -381,22 +392,6 @@ def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> _Rows:
     parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
     inputs = torch.cat([model.given(s[part], a[part]) for part in parts])
     return inputs, torch.cat([model.residual(s[part], a[part], r[part]) for part in parts])
-
-
-def _fit_elbo(
-    model: CausalRewardModel, rows: _Rows, held_out: _Rows, folder: Path, seed: int
-) -> None:
-    config = model.config
-
-    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
-        inputs, residuals, noise = batch
-        log_likelihood, kl = (term.mean() for term in model.elbo(inputs, residuals, noise))
-        parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
-        return config.beta * kl - log_likelihood, parts
-
-    fixed = _draw_noise(np.random.default_rng(seed), held_out[1], config.latent_dim)
-    loop = _loop(config, len(rows[1]))
-    _fit(model, loss, rows, (*held_out, fixed), loop, folder, seed, config.latent_dim)
 
 
 def _fit(

@@ -16,7 +16,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
-from ucfrec.user_model.reward_report import EffectTried, RewardRows
+from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
 EFFECTS: Final = (
     *("item", "user", "content", "affinity", "tastes", "exposure"),
@@ -218,12 +218,8 @@ class Design:
 def fit_effects(
     design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
 ) -> Effects:
-    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`.
-
-    Args:
-        start: effects to start from; missing ones start at 0.
-        fixed: effects that are part of the predictor, and of the result, as they are.
-    """
+    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`, from
+    `start`, or 0; `fixed` effects are part of the predictor, and of the result, as they are."""
     constant, curvature = fixed or {}, 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
     first, inverses = Effects(), dict[str, _Map]()
@@ -418,9 +414,7 @@ class EffectSearch:
             spreads = self._begin.spreads
             near, strides = spreads.get(name, _FIRST), (1,) if name in spreads else ()
         number, effects, losses = self._find_best(name, near, strides)
-        decrease = self.losses - losses
-        gain = float(decrease.mean())
-        error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
+        gain, error = mean_gain(self.losses, losses)
         self._tried.append(EffectTried(name, _SPREADS[number], gain, error, gain > error))
         if name == "item":
             self.item_loss = float(losses.mean())

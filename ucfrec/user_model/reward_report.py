@@ -94,6 +94,14 @@ def draw_numbers(count: int, limit: int, seed: int) -> IntArray:
     return np.sort(np.random.default_rng(seed).choice(count, limit, replace=False))
 
 
+def mean_gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
+    """By how much the mean of `lower` is lower, and the standard error; 0 without rows."""
+    decrease = losses - lower
+    if not len(decrease):
+        return 0.0, 0.0
+    return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
+
+
 def weigh_by_propensity(
     view: EpisodeStore, episodes: IntArray, steps: IntArray, items: int
 ) -> Tensor | None:

@@ -20,7 +20,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
-from ucfrec.user_model.reward_report import SAVED, draw_numbers
+from ucfrec.user_model.reward_report import SAVED, draw_numbers, mean_gain
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
@@ -140,14 +140,19 @@ class SessionEnd:
     @classmethod
     def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
         """From tensors of a file; KeyError or ValueError unless they fit these inputs."""
+        shapes: dict[str, tuple[int, ...]] = {**dict.fromkeys(_LOGISTIC, (_INPUTS,)), "bias": ()}
+        parts = {}
         if "thresholds" in tensors:
-            parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
-            _require_trees(**parts)
-            return cls(likeness, parts)
-        parts = {name: tensors[name] for name in _LOGISTIC}
-        for name, entry in parts.items():
-            shape = () if name == "bias" else (_INPUTS,)
-            if entry.shape != shape or entry.dtype != torch.float64:
+            parts["inputs"] = inputs = tensors["inputs"]
+            if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
+                raise ValueError("inputs are not numbers of inputs")
+            if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
+                raise ValueError("inputs are beyond the last input")
+            trees, splits = inputs.shape
+            shapes = {"thresholds": (trees, splits), "leaves": (trees, 2**splits), "base": ()}
+        for name, shape in shapes.items():
+            parts[name] = tensors[name]
+            if parts[name].shape != shape or parts[name].dtype != torch.float64:
                 raise ValueError(f"{name} does not fit the inputs")
         return cls(likeness, parts)
 
@@ -164,7 +169,7 @@ class SessionEnd:
             return best
         sure, held_out = (rows.select(rows.followed | ~rows.ended) for rows in (logged, held_out))
         without, report = cls._fit_best(likeness, sure, held_out, seed)
-        gain, error = _gain(best[0]._losses(certain), without._losses(certain))
+        gain, error = mean_gain(best[0]._losses(certain), without._losses(certain))
         if gain <= 3 * error:
             return best
         return without, replace(report, last_sessions=False)
@@ -182,7 +187,7 @@ class SessionEnd:
         losses = {kind: model._losses(held_out) for kind, model in models.items()}
         gains, best = dict[str, tuple[float, float]](), "constant"
         for kind in kinds:
-            gain, error = gains[kind] = _gain(losses[best], losses[kind])
+            gain, error = gains[kind] = mean_gain(losses[best], losses[kind])
             if gain > error:
                 best = kind
         means = {kind: float(entry.mean()) if len(entry) else 0.0 for kind, entry in losses.items()}
@@ -259,14 +264,6 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     return {"highest": highest, "mean": mean, "scale": scale, "weights": slopes, "bias": bias}
 
 
-def _gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
-    """By how much the mean of `lower` is lower, and the standard error; 0 without rows."""
-    decrease = losses - lower
-    if not len(decrease):
-        return 0.0, 0.0
-    return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
-
-
 def _pad(items: Tensor) -> Tensor:
     return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
@@ -335,19 +332,6 @@ class BoostedTrees:
     def _sums(self, columns: Tensor) -> Tensor:
         """The trees' sum (M,) from numbers of leaves (T, M), which float32 has exactly."""
         return self._base + self._leaves.gather(1, columns.long()).sum(0)
-
-
-def _require_trees(inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
-    """Check the tensors of `BoostedTrees`, which may come from anywhere."""
-    if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
-        raise ValueError("inputs are not numbers of inputs")
-    if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
-        raise ValueError("inputs are beyond the last input")
-    if any(entry.dtype != torch.float64 for entry in (thresholds, leaves, base)):
-        raise ValueError("thresholds, leaves and base are not float64")
-    shapes = thresholds.shape, leaves.shape, base.shape
-    if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
-        raise ValueError("thresholds, leaves and base do not fit the inputs")
 
 
 def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:

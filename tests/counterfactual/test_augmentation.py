@@ -16,16 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.support.causes import planted_vectors
-from tests.support.planted import (
-    ACTION,
-    CONSTANT,
-    STATE,
-    STEPS,
-    f,
-    fitted,
-    planted,
-    planted_store,
-)
+from tests.support.planted import ACTION, CONSTANT, STATE, STEPS, f, fitted, planted, planted_store
 from ucfrec import schema
 from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.augmentation import (
@@ -47,11 +38,7 @@ from ucfrec.counterfactual.generators import (
     make_generator,
     state_clusters,
 )
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    read_transitions,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions

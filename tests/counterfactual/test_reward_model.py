@@ -9,12 +9,7 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from tests.support.planted import ACTION, CONSTANT, FIT, STATE, affine_correlation, fitted, planted
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    fit_crm,
-    fit_warning,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, fit_crm, fit_warning
 
 QUICK = CRMConfig(epochs=1, hidden=32, latent_dim=3, learning_rate=1e-3)
 

@@ -150,11 +150,7 @@ class CausalRewardModel(nn.Module):
     expected: nn.Sequential | EffectsMean
 
     def __init__(
-        self,
-        state_size: int,
-        action_size: int,
-        config: CRMConfig,
-        mean: EffectsMean | None = None,
+        self, state_size: int, action_size: int, config: CRMConfig, mean: EffectsMean | None = None
     ) -> None:
         """`mean` is E[r | s, a], whose actions have the size A = `action_size`; None for a network
         that is yet to be trained."""

@@ -180,11 +180,7 @@ def refit_item_reward_model(
 
 
 def fit_training_users(
-    train: EpisodeStore,
-    folder: Path,
-    seed: int,
-    weighted: bool = True,
-    first: Path | None = None,
+    train: EpisodeStore, folder: Path, seed: int, weighted: bool = True, first: Path | None = None
 ) -> TrainingUsers:
     """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
     the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""

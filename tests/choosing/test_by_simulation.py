@@ -88,19 +88,16 @@ def chosen(
     return choose_by_simulation(Problem(scorer, users, given, *training_views(store), config, 0))
 
 
-def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    record = read_json(folder / "run" / "run.json")
+def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(trained: TrainedPolicy) -> None:
+    record, found = read_json(trained.folder / "run.json"), read_record(trained.folder)
     rule = record["rule"]
     assert trained.rule == DecisionRule.from_dict(rule["rule"], "the record")
     assert "validation" in rule["chosen_by"]
     assert record["reward_model"]["loss"] < record["reward_model"]["base_loss"]
-    candidates = read_json(folder / "run" / "candidates.json")
+    candidates = read_json(trained.folder / "candidates.json")
     best = max(candidates, key=lambda each: each["value"])
     own = next(each for each in candidates if each["rule"] == rule["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
-    found = read_record(folder / "run")
     assert found.rule is not None
     assert found.rule.simulated == (rule["estimate"]["value"], rule["estimate"]["error"])
     assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
@@ -143,9 +140,7 @@ def test_unsupported_and_narrow_rules_are_not_allowed(trained: TrainedPolicy) ->
     assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
 
 
-def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
-    trained: TrainedPolicy,
-) -> None:
+def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> None:
     search, rules = search_of(trained), [DecisionRule(2.0), drawn(0.0)]
     found = search.simulate(rules)
     luck, nothing = np.random.default_rng(0).normal(50.0, 20.0, 40), np.zeros(0, dtype=np.int64)
@@ -187,9 +182,7 @@ def test_rules_far_behind_are_not_simulated_in_all_sessions(trained: TrainedPoli
     assert {len(each.returns) for each in unsupported._sessions.values()} == {120}
 
 
-def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
-    trained: TrainedPolicy,
-) -> None:
+def test_halves_of_the_users_say_if_they_would_choose_another_rule(trained: TrainedPolicy) -> None:
     search = search_of(trained, replace(FEW, sessions=39))
     plain, weighted = search.simulate([drawn(0.0), drawn(4.0)])
     assert weighted.value > plain.value + 2 * plain.error
@@ -211,17 +204,15 @@ def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPoli
     assert {rule.minimum_target is None for rule in rules} == {True, False}
 
 
-def test_what_the_log_supports_only_without_recent_tags_is_found(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    store = EpisodeStore.open(folder / "store")
+def test_what_the_log_supports_only_without_recent_tags_is_found(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store")
     # The best shows item 0 for ever, drawing shows items that the log hardly has; items 0 to 3
     # share no tag.
     narrow = with_bias(trained, torch.tensor([12.0, 10.0, 8.0, 6.0] + [0.0] * 20))
     least = int(training_views(store)[0].item_counts()[:4].min())
     tried = {"temperatures": (0.0, 4.0), "reward_weights": (0.0,), "tag_windows": (0, 3)}
     config = replace(FEW, least_impressions=least, **tried)
-    found = chosen(narrow, store, folder / "run", config, 2.0, 2.0)
+    found = chosen(narrow, store, trained.folder, config, 2.0, 2.0)
     assert not found.warning
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
 
@@ -291,11 +282,9 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert (own.value, own.error) == (simulated.value, simulated.error)
 
 
-def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    store = EpisodeStore.open(folder / "store")
-    users, views = users_of(folder / "run", store), training_views(store)
+def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store")
+    users, views = users_of(trained.folder, store), training_views(store)
     scorer = Scorer(trained.policy, trained.rule, store.item_states, trained.returns, users.reward)
     config = replace(FEW, reward_weights=(0.0, 1.0, 4.0, 8.0), tag_windows=(3, 5))
     given = Problem(scorer, users, {0.9: 2.0, 1.0: 3.0}, *views, config, 0)
@@ -322,16 +311,13 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     stays = choose_by_simulation(replace(given, start=bad, config=unsupported))
     assert stays.rule == bad
     assert "supports no candidate, so the rule of the earlier run stays" in stays.warning
-    ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
+    train = views[0]
+    mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
+    ahead = replace(bad, lookahead=4.0 * mean, policy_weight=0.5, reward_weight=8.0)
     rules = [*find_neighbours(ahead, given)]
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}
     assert {each.policy_weight for each in rules if each.lookahead} == {0.0, 0.5, 1.0}
     assert sum(not each.lookahead for each in rules) == 1
-
-
-def mean_reward(store: EpisodeStore) -> float:
-    train = training_views(store)[0]
-    return float(train.returns.sum(dtype=np.float64)) / train.n_steps
 
 
 def tiring_store(folder: Path) -> EpisodeStore:

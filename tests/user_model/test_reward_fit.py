@@ -1,10 +1,10 @@
 """Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
-from ucfrec.user_model.reward_effects import Effects, fit_effects
+from ucfrec.user_model.reward_effects import fit_effects
 from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_report import RewardRows, UserCalibration
 
@@ -134,9 +134,7 @@ def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path)
     assert abs(gap(model.item.numpy().astype(np.float64))) < 0.3 * gap(crude)
 
 
-def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_rows(
-    tmp_path: Path,
-) -> None:
+def test_for_new_users_the_session_tells_what_effects_of_users_tell(tmp_path: Path) -> None:
     planted, split = log(3, taste=4.0, users=300), (np.arange(300) >= 200).astype(np.int64)
     embeddings = torch.eye(TAGS)[torch.arange(ITEMS) % TAGS]
     store = written(planted, clicks(planted), np.arange(300), split, embeddings=embeddings)
@@ -167,22 +165,15 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
 def test_a_search_begins_and_ends_near_an_earlier_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planted, counted = log(0, users=200), list[Mapping[str, float]]()
-
-    def counting(*arguments: Any) -> Effects:
-        counted.append(arguments[2])
-        return fit_effects(*arguments)
-
+    planted, few, counting = log(0, users=200), log(0, users=100), Mock(wraps=fit_effects)
     monkeypatch.setattr("ucfrec.user_model.reward_effects.fit_effects", counting)
-    store = store_of(planted, clicks(planted, 1))
-    half = views(store_of(log(0, users=100), clicks(log(0, users=100))))
-    old = fit_item_reward_model(*half, tmp_path / "old", seed=0)[1]
-    counted.clear()
+    store, half = store_of(planted, clicks(planted, 1)), store_of(few, clicks(few))
+    old = fit_item_reward_model(*views(half), tmp_path / "old", seed=0)[1]
+    counting.reset_mock()
     cold = fit_item_reward_model(*views(store), tmp_path / "cold", seed=0)[1]
-    fits = len(counted)
-    counted.clear()
+    fits = counting.call_count
     warm = fit_item_reward_model(*views(store), tmp_path / "warm", 0, first=tmp_path / "old")[1]
-    assert len(counted) < 0.8 * fits
+    assert counting.call_count - fits < 0.8 * fits
     assert warm.loss < 1.01 * cold.loss
     assert {"item", "user"} <= old.kept.keys() & warm.kept.keys()
     none = fit_item_reward_model(*views(store), tmp_path / "none", 0, first=tmp_path / "nowhere")[1]
@@ -207,8 +198,7 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
 
 def test_what_does_not_predict_is_left_out(tmp_path: Path) -> None:
     planted = log(5)
-    rewards = (np.random.default_rng(1).random(len(planted.items)) < 0.3).astype(np.float64)
-    model, report = fit(tmp_path, planted, rewards)
+    model, report = fit(tmp_path, planted, 1.0 * (np.random.default_rng(1).random(3000) < 0.3))
     assert len(report.kept) <= 2
     assert report.loss > report.base_loss - 0.01
     for tried in report.effects:
@@ -221,14 +211,10 @@ def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> No
     planted = log(6, boredom=1.0)
     rewards = clicks(planted)
     model, _ = fit(tmp_path, planted, rewards)
-    step = 7
-    later = np.arange(len(planted.items)) % LENGTH >= step
+    later, scores = np.arange(len(planted.items)) % LENGTH >= 7, []
     changed = planted._replace(items=np.where(later, (planted.items + 11) % ITEMS, planted.items))
-    scores = []
     for given, paid in ((planted, rewards), (changed, np.where(later, 1 - rewards, rewards))):
-        store = store_of(given, paid)
-        episodes = np.arange(store.n_episodes)
-        rows = RewardRows.at(store, episodes, np.full(len(episodes), step), LAGS)
+        rows = RewardRows.at(store_of(given, paid), np.arange(USERS), np.full(USERS, 7), LAGS)
         scores.append(model.scores(rows.states, rows.history, rows.users))
     assert torch.equal(scores[0], scores[1])
 

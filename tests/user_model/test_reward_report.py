@@ -119,9 +119,8 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
 
 
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
-    train, _ = log_of_tastes()
+    train, file = log_of_tastes()[0], tmp_path / "training_users.safetensors"
     users = fit_training_users(train, tmp_path, seed=0)
-    file = tmp_path / "training_users.safetensors"
     report = dataclasses.asdict(users.report)
     for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
         save_tensors(file, users.model.state_dict(), other)
@@ -133,7 +132,7 @@ def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     st.lists(st.sampled_from([0.01, 0.05, 0.2, 0.5, 1.0]), min_size=8, max_size=8),
     st.integers(2, 50),
 )
-def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
+def test_weights_add_up_to_a_users_effective_number_of_steps(
     propensities: list[float], items: int
 ) -> None:
     logged, zeros = np.array(propensities), np.zeros(8)
@@ -158,10 +157,9 @@ def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
 
 def test_sessions_are_drawn_by_the_seed() -> None:
     train, _ = log_of_tastes()
-    users = [draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1)]
-    assert np.array_equal(users[0], users[1])
-    assert not np.array_equal(users[0], users[2])
-    assert sorted(users[0]) == sorted(train.episode_values("user"))
+    first, again, other = (draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1))
+    assert [*first] == [*again] != [*other]
+    assert sorted(first) == sorted(train.episode_values("user"))
 
 
 MANY_USERS, FEW_STEPS = 300, 20

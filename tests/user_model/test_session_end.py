@@ -79,7 +79,6 @@ def test_steps_later_than_logged_ones_are_like_the_last() -> None:
     ended = np.random.default_rng(1).random(len(steps.steps)) < 0.05 * (1 + steps.steps)
     end, report = steps.fit(ended)
     assert report.kept == "logistic"
-
     found = [
         float(end.probabilities(*steps._replace(steps=np.full(len(steps.steps), step))).mean())
         for step in (6, 7, 8, 100)

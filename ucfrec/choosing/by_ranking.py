@@ -1,9 +1,8 @@
 """What rules would have done at logged steps, and the choice of a reward weight by it.
 
-Where the log has no true sessions there is nothing to simulate, but every row shows what a user
-liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
-show, and overlaps with the log enough if it finds liked items better than the ten most liked ones
-do, by a standard error.
+Where the log has no true sessions, a candidate is worth the mean rate, in the validation period, of
+the ten items that it would show, and overlaps with the log enough if it finds liked items better
+than the ten most liked ones do, by a standard error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -164,15 +163,16 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
-        larger = [candidate for candidate in candidates if candidate.weight > best.weight]
-        nearest = min(larger, key=lambda candidate: candidate.weight, default=best)
-        if nearest.overlaps:
+        weight = best.rule.reward_weight
+        ranked = {each.rule.reward_weight: each for each in candidates}
+        nearest = min((each for each in ranked if each > weight), default=weight)
+        if ranked[nearest].overlaps:
             break
-        best = rank([(best.weight + nearest.weight) / 2])
-    halves = [
-        _choose_best([candidate.select(users % 2 == half) for candidate in candidates]).weight
-        for half in (0, 1)
-    ]
+        best = rank([(weight + nearest) / 2])
+    halves = []
+    for half in (0, 1):
+        own = _choose_best([candidate.select(users % 2 == half) for candidate in candidates])
+        halves.append(own.rule.reward_weight)
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
     return RuleChoice(
         rule=best.rule,
@@ -202,10 +202,6 @@ class _Candidate:
     def select(self, rows: BoolArray) -> "_Candidate":
         names = ("users", "rates", "liked", "hits", "ahead")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
-
-    @property
-    def weight(self) -> float:
-        return self.rule.reward_weight
 
     @cached_property
     def summary(self) -> RankedRule:

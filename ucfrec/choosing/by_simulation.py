@@ -1,10 +1,9 @@
 """Choose the decision rule in sessions simulated in the user model.
 
-Simulated users have the fixed tastes of training users, which the policy does not know
-(`ucfrec.user_model.reward_fit`). What a model says of a policy holds only where the log supports
-it, so a candidate must keep to items that the training log shows often enough, and to more than a
-handful of them; where the log has propensities, it must also leave enough effective users to
-evaluate it off-policy.
+Simulated users have the fixed tastes of training users, which the policy does not know. What a
+model says holds only where the log supports it: a candidate must keep to items that the training
+log shows often enough, and to more than a handful of them; where the log has propensities, it must
+also leave enough effective users to evaluate it off-policy.
 """
 
 import math
@@ -51,8 +50,7 @@ _FAR_OFF: Final = 0.1
 _LARGEST_ERROR: Final = _FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
-"""Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
-(Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
+"""Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
 _NEAR_THE_LOG: Final = (
@@ -305,8 +303,8 @@ class RuleSearch:
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """Of level rules, the one that the choice starts from, or the one with the most support in
-        the log: effective users, or without propensities the likelihood; then the most hits, if
-        they differ by a percentage point; then the simplest. A handful of users is no evidence."""
+        the log: effective users, if more than a handful, else the likelihood; then the most hits,
+        in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
         unknown = [candidate for candidate in level if candidate.evidence is None]

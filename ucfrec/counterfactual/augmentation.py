@@ -1,8 +1,6 @@
 """Counterfactual copies of the training episodes: reward model, generator, gates (Algorithm 1).
-
-Rewards, actions, next states and returns-to-go of an edited copy are those of its source (paper
-appendix H); an action copy ends with another action and its counterfactual reward.
-"""
+All of an edited copy but its states is its source's (paper appendix H); an action copy ends with
+another action and its counterfactual reward."""
 
 import copy
 import math
@@ -49,8 +47,7 @@ from ucfrec.user_model.reward_fit import fit_item_reward_model
 CRM: Final = "crm"
 """Folder of the reward model."""
 MODELS: Final = ("item-reward", CRM, "csg")
-"""Folders of the checkpoints of `augment_episodes`; which of them there are depends on the
-settings."""
+"""Folders of the checkpoints of `augment_episodes`, as far as the settings need them."""
 _CPU: Final = torch.device("cpu")
 _CHUNK, _ACTION_CHUNK = 8192, 4096
 _ACTION_STREAM = 1
@@ -267,10 +264,9 @@ def edit_states(
             proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
             factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
-            passed = accept(
-                exact, factual, z, proposed.double(), epsilon_r * _LESS, rho_high * _LESS
-            )
-            moves.add(exact.moves(s[passed], proposed[passed].double()).cpu())
+            proposals = proposed.double()
+            passed = accept(exact, factual, z, proposals, epsilon_r * _LESS, rho_high * _LESS)
+            moves.add(exact.moves(s[passed], proposals[passed]).cpu())
             accepted[rows] = passed.cpu().numpy()
             states.append(proposed[passed].cpu().numpy())
         moves.proposals += len(steps)
@@ -305,13 +301,9 @@ def accept(
     epsilon_r: float,
     rho_high: float,
 ) -> Tensor:
-    """Which proposals (M, S) pass both gates of Eq. 4 (Algorithm 4), (M,) bool.
-
-    Args:
-        factual: M logged steps, from which z (M, latent_dim) is abduced.
-        epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
-        rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
-    """
+    """Which proposals (M, S) for M logged steps with abduced z (M, latent_dim) pass both gates of
+    Eq. 4 (Algorithm 4), (M,) bool: |f̂_r(s_c, a, z) − r| ≤ ε_r, in reward units, and
+    ‖(s_c − s) / σ_s‖₂ ≤ ρ_high; dimensions with σ_s = 0 must not change."""
     change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
     length = crm.moves(factual.states, proposals).norm(dim=1)
     passed: Tensor = (change <= epsilon_r) & (length <= rho_high)
@@ -362,8 +354,7 @@ class MoveStatistics:
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0. The
-        histogram of lengths ends at `rho_high`."""
+        """Summarise the moves; without any, ratio is NaN and rank 0. Lengths end at ρ_high."""
         lengths = torch.cat(self._lengths).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
         levels = _QUANTILES if len(lengths) else ()

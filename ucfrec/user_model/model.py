@@ -32,8 +32,7 @@ _MOST_STEPS: Final = 100_000
 _GROUPS: Final = 32
 """Most rewards to draw from."""
 _BEYOND: Final = 3, 100
-"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
-than so many, …"""
+"""Simulated sessions may have so many times the longest logged one's steps, up to so many, …"""
 _CHANCE: Final = 0.001
 """… unless chance ends all sessions that get there with a lower probability than this."""
 
@@ -128,8 +127,7 @@ class UserModel:
     def expect(
         self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in reward units, in states (M, S) of users
-        (M,), rows of the training store."""
+        """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
         slope, intercept = self.calibration
         scores = self.rewarding.score(states, history, users, items)
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()

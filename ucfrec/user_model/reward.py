@@ -173,8 +173,7 @@ class ItemRewardModel(nn.Module):
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
-        scores: Tensor = self.score_without_state(history, users, items) + x @ self.state + added
-        return scores
+        return self.score_without_state(history, users, items) + x @ self.state + added
 
     def score_without_state(self, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
@@ -184,8 +183,7 @@ class ItemRewardModel(nn.Module):
         exposure = exposure + ((earlier == column) * repeated).sum(1)
         tastes = self.tastes_after(history)
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
-        part: Tensor = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
-        return part
+        return self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
 
     def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
@@ -205,8 +203,8 @@ class ItemRewardModel(nn.Module):
             size = history.items.shape[0], self.vectors.shape[1] + 1
             return torch.zeros(size, device=self.item.device)
         items, rewards = history.latest(MEMORY)
-        tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
-        return tastes
+        part: Tensor = self.tastes(items, self.vectors, self.target(rewards))
+        return part
 
     def expect(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""

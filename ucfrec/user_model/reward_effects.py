@@ -63,8 +63,8 @@ class Design:
     x: Tensor
     """(M, S) standardised states."""
     exposure: Tensor
-    """(M, 4 · lags): whether the item is the one shown n steps before, then their likeness; then
-    both again, times the earlier item's reward on a scale from 0 to 1."""
+    """(M, 4 · lags): whether the item is that of n steps before, then their likeness; then both
+    again, times the earlier reward from 0 to 1."""
     target: Tensor
     """(M,): 1 for the higher of two rewards and 0 for the lower, or standardised rewards."""
     observed: Tensor
@@ -244,8 +244,8 @@ def fit_effects(
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
-    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`; its second
-    derivative should be about 1 in all directions: that is the first step's length."""
+    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`; the first step
+    has the right length if the second derivative is about 1 in all directions."""
 
     def evaluate(at: Tensor) -> tuple[float, Tensor]:
         at = at.detach().requires_grad_(True)
@@ -357,8 +357,7 @@ class EffectSearch:
     """The effects found so far, one after the other, and their loss on held-out rows."""
 
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
-    """Where users are new: the model, whose `tastes` are set, and what sessions showed before
-    training and held-out rows."""
+    """For new users: the model, whose `tastes` are set, and what training and held-out rows saw."""
 
     def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""

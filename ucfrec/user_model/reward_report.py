@@ -168,8 +168,7 @@ class ItemRewardReport:
     train_rows: int
     validation_rows: int
     binary: bool
-    """Whether rewards have two values: the loss is the log loss in nats, otherwise half the squared
-    error of standardised rewards."""
+    """Whether rewards have two values, and losses are nats; else squared errors, standardised."""
     effects: tuple[EffectTried, ...]
     """The effects in the order in which they were tried."""
     base_loss: float
@@ -178,8 +177,8 @@ class ItemRewardReport:
     r2: Undefinable
     calibration: Calibration
     gauc: Undefinable
-    """Probability that a liked step scores higher than another of the same user, by impressions;
-    without what all items share at a step (user and state), which does not rank items."""
+    """Probability that a liked step scores higher than another of the same user, by impressions,
+    without what all items share at a step."""
     gauc_error: Undefinable
     item_rate_gauc: Undefinable
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""

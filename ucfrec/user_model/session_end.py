@@ -37,8 +37,7 @@ _REWARD: Final = 3
 _FEWEST: Final = 20
 """Fewest steps that end a session, and that do not, that tell more than their share."""
 _STEP: Final = 2.0**-10
-"""Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
-on one side of a tree's threshold."""
+"""Likeness is rounded to multiples of this, so that torch and onnxruntime agree on thresholds."""
 _HIGHEST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
 TREES: Final = 100
@@ -63,8 +62,8 @@ class LoggedEnds:
     def of(
         cls, store: EpisodeStore, likeness: Likeness, lags: int, most: int, seed: int
     ) -> "LoggedEnds":
-        """Steps of a view of a store of items, at most `most` of them, drawn at random; without the
-        last one of a session that is not terminated, where the log may simply have ended."""
+        """Steps of a view, at most `most` of them, drawn at random; without the last one of a
+        session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
         ends = np.cumsum(usable)
         numbers = draw_numbers(int(ends[-1]), most, seed)
@@ -93,8 +92,8 @@ def last_sessions(store: EpisodeStore) -> BoolArray:
 def whole_sessions(
     train: EpisodeStore, validation: EpisodeStore
 ) -> tuple[EpisodeStore, EpisodeStore]:
-    """Sessions to fit models of their ends to, and held-out ones: training sessions of a fifth of
-    users where most validation sessions go on from training sessions that the split cut."""
+    """Sessions to fit models of their ends to, and held-out ones: of a fifth of training users
+    where most validation sessions go on from training sessions that the split cut."""
     if not (train.has_users and validation.has_users):
         return train, validation
     users, cut = train.episode_values(schema.USER), ~train.terminated & last_sessions(train)
@@ -210,7 +209,7 @@ class SessionEnd:
         self, history: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
     ) -> list[Tensor]:
         """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
-        each of some rewards (B, C) that the items would be given."""
+        each of some rewards (B, C)."""
         batch, count = items.shape
         lately = _pad(history.items)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
@@ -291,10 +290,8 @@ def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) ->
 
 
 class BoostedTrees:
-    """The sum of T regression trees of at most S splits: data, never a program.
-
-    A tree is a table: which of its splits' inputs are at most their threshold selects the leaf.
-    """
+    """The sum of T regression trees of at most S splits, as tables: which of its splits' inputs are
+    at most their threshold selects a tree's leaf."""
 
     def __init__(self, inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
         """From int64 numbers of the splits' `inputs` (T, S) and, float64, their `thresholds`

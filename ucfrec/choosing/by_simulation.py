@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from operator import attrgetter
+from statistics import median_high
 from typing import Any, Final
 
 import numpy as np
@@ -274,9 +275,9 @@ class RuleSearch:
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates that cannot be told apart from the best: within the standard error
-        of the difference over pairs of sessions, or the tolerance. If the log supports none, the
-        rule that the choice starts from, or the one with the most effective items."""
+        """The allowed candidates within the standard error of the difference from the best, over
+        pairs of sessions, or the tolerance. If the log supports none, the rule that the choice
+        starts from, or the one with the most effective items."""
         allowed = self._select_allowed(candidates)
         if not allowed:
             return self._find_start(candidates) or [max(candidates, key=attrgetter("items"))]
@@ -534,10 +535,10 @@ def find_neighbours(
     if rule.looks_ahead:
         grid |= {"lookahead": _lookaheads(problem), "policy_weight": [*config.policy_weights]}
         grid["reward_weight"] = [*config.lookahead_weights]
-        weight = _middle(config.reward_weights)
+        weight = median_high(config.reward_weights)
         yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
     elif problem.users.session_end_report.kept != "constant":
-        middle = _middle(config.policy_weights)
+        middle = median_high(config.policy_weights)
         for ahead, weight in product(_lookaheads(problem), config.lookahead_weights):
             yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
     if problem.validation.item_states.tags.shape[1]:
@@ -551,10 +552,6 @@ def find_neighbours(
         for neighbour in (*sorted(smaller)[-1:], *sorted(larger)[:1]):
             changed: dict[str, Any] = {name: neighbour}
             yield replace(rule, **changed)
-
-
-def _middle(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2]
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:

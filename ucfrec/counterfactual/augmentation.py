@@ -33,7 +33,6 @@ from ucfrec.counterfactual.reward_model import (
     fit_warning,
     read_transitions,
     sample_steps,
-    sample_transitions,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
@@ -186,7 +185,8 @@ def augment_episodes(
         mean = EffectsMean(item_rewards)
     sampled_episodes, sampled_steps = sample_steps(train, limit, seed)
     training = read_transitions(train, sampled_episodes, sampled_steps, item_rewards)
-    held_out = sample_transitions(validation, limit // 10, seed, item_rewards)
+    held_out_steps = sample_steps(validation, limit // 10, seed)
+    held_out = read_transitions(validation, *held_out_steps, item_rewards)
     crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.

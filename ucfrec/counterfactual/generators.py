@@ -119,9 +119,8 @@ class ActionSupport:
 class Generator(Protocol):
     """Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """(ρ_low, ρ_high), see `CSGConfig`."""
+    band: tuple[float, float]
+    """(ρ_low, ρ_high), see `CSGConfig`."""
 
     def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
         """A state s_c (M, S) for each of M steps with abduced disturbances (M, latent_dim), such

@@ -520,11 +520,3 @@ def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, I
     """(episodes, steps) of a view: all, or `limit` drawn with replacement if there are more."""
     few = view.n_steps <= limit
     return view.all_steps() if few else view.draw_steps(np.random.default_rng(seed), limit)
-
-
-def sample_transitions(
-    view: EpisodeStore, limit: int, seed: int, item_rewards: ItemRewardModel | None = None
-) -> Transitions:
-    """The transitions of `sample_steps`, as `read_transitions` reads them."""
-    episodes, steps = sample_steps(view, limit, seed)
-    return read_transitions(view, episodes, steps, item_rewards)

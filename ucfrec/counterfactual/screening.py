@@ -1,8 +1,7 @@
 """Which observation columns measure the reward, although they are logged with the state.
 
-A dimension d_t that records the reward (r_t, or r_{t+1}) is a leak: where it is fixed, nothing
-changes. It predicts the reward as a cause would, but depends on nothing else: what the rest
-explains of it, the action above all, it explains through the reward. So
+A dimension d_t that records the reward (r_t, or r_{t+1}) predicts it as a cause would, but what the
+rest explains of it, the action above all, it explains through the reward. So
 
 1. the rest (other dimensions, action, next action) helps to predict d_t;
 2. the reward alone predicts d_t at least as well;

@@ -82,9 +82,9 @@ class UserModel:
         if not path.exists():
             fatigue = calibration = None
             if reward.binary:
-                views = train, validation
-                runs = [LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS) for view in views]
-                fatigue = fit_fatigue(runs[0], runs[1])
+                first_runs = LoggedRuns.of(train, tags, reward.lags, _MOST_STEPS)
+                later_runs = LoggedRuns.of(validation, tags, reward.lags, _MOST_STEPS)
+                fatigue = fit_fatigue(first_runs, later_runs)
             logged, held_out = (
                 LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)

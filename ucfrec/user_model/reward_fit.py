@@ -1,10 +1,9 @@
 """Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
 Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
-knows: a model that learns tastes from the session would pay a policy for its own guesses. Policies
-that knew more of their users than the log shows make what they showed look better than it is. Where
-the log has all propensities, and users are new, rows are therefore weighted; known users are
-calibrated on weighted validation rows instead (`UserCalibration`), as weights would cost them data.
+knows: a model that learns tastes from the session would pay a policy for its own guesses. Where the
+log has all propensities, rows of new users are weighted, as policies that knew more than the log
+shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
 from dataclasses import dataclass

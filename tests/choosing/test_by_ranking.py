@@ -85,15 +85,13 @@ def test_all_reward_weights_at_once_are_evaluated_as_each_rule_alone(folder: Pat
 def test_reward_weights_below_the_first_that_overlaps_too_little_are_ranked(folder: Path) -> None:
     found = chosen(folder, 50.0, 0.0, 1000.0)
     ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
-    weights = [each.rule.reward_weight for each in ranked]
-    assert weights[:2] == [0.0, 1000.0]
-    assert ranked[1].gain < ranked[1].gain_error
+    overlaps = {each.rule.reward_weight: each.gain >= each.gain_error for each in ranked}
+    assert [*overlaps.items()][:2] == [(0.0, True), (1000.0, False)]
+    assert overlaps[found.rule.reward_weight]
     assert not found.warning
-    overlapping = [each for each in ranked if each.gain >= each.gain_error]
-    assert found.rule in [each.rule for each in overlapping]
-    too_large = min(each.rule.reward_weight for each in ranked if each.gain < each.gain_error)
-    largest = max(each.rule.reward_weight for each in overlapping)
-    assert too_large - largest == 1000 / 2 ** (len(weights) - 2)
+    too_large = min(weight for weight, enough in overlaps.items() if not enough)
+    largest = max(weight for weight, enough in overlaps.items() if enough)
+    assert too_large - largest == 1000 / 2 ** (len(overlaps) - 2)
 
 
 def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -> None:
@@ -101,8 +99,8 @@ def test_without_overlap_a_rule_hits_as_often_as_any_and_says_so(folder: Path) -
     ranked = [each for each in found.candidates if isinstance(each, RankedRule)]
     assert not any(each.gain >= each.gain_error for each in ranked)
     most = max(ranked, key=lambda each: each.gain)
-    level = [each for each in ranked if each.gain >= most.gain - most.gain_error]
-    assert found.rule in [each.rule for each in level]
+    enough = most.gain - most.gain_error
+    assert found.rule in [each.rule for each in ranked if each.gain >= enough]
     assert "WARNING" in found.warning
 
 

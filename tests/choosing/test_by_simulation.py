@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.support.logs import store_of
 from tests.support.tagged import tagged_store
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.scorer import Scorer
@@ -24,7 +25,6 @@ from ucfrec.choosing.choice import Evidence, Problem, RuleChoice, RuleConfig
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.files.atomic import read_json
 from ucfrec.logs.mapping import FeatureTable, LogMapping
-from ucfrec.logs.prepare import PrepareOptions, prepare
 from ucfrec.policies.heads import ItemHead
 from ucfrec.runs.config import config_from_dict, resolve_config
 from ucfrec.runs.record import read_candidates, read_record
@@ -82,26 +82,22 @@ def chosen(
     scorer: Scorer, store: EpisodeStore, run: Path, config: RuleConfig, *targets: float
 ) -> RuleChoice:
     users = users_of(run, store)
-    states = store.item_states
-    parts = scorer.returns, users.reward, users.session_end
-    scorer = Scorer(scorer.policy, scorer.rule, states, *parts)
+    parts = store.item_states, scorer.returns, users.reward, users.session_end
+    scorer = Scorer(scorer.policy, scorer.rule, *parts)
     given = dict(zip((0.9, 1.0), targets, strict=True))
     return choose_by_simulation(Problem(scorer, users, given, *training_views(store), config, 0))
 
 
-def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    record = read_json(folder / "run" / "run.json")
+def test_a_run_acts_by_the_rule_that_it_chose_and_says_how(trained: TrainedPolicy) -> None:
+    record, found = read_json(trained.folder / "run.json"), read_record(trained.folder)
     rule = record["rule"]
     assert trained.rule == DecisionRule.from_dict(rule["rule"], "the record")
     assert "validation" in rule["chosen_by"]
     assert record["reward_model"]["loss"] < record["reward_model"]["base_loss"]
-    candidates = read_json(folder / "run" / "candidates.json")
+    candidates = read_json(trained.folder / "candidates.json")
     best = max(candidates, key=lambda each: each["value"])
     own = next(each for each in candidates if each["rule"] == rule["rule"])
     assert own["value"] >= best["value"] - best["error"] or best["items"] < rule["least_items"]
-    found = read_record(folder / "run")
     assert found.rule is not None
     assert f"the log supports: {rule['estimate']['value']:.4g} ±" in found.describe()
     estimate = found.rule.estimate
@@ -142,19 +138,13 @@ def test_unsupported_and_narrow_rules_are_not_allowed(trained: TrainedPolicy) ->
     assert search.best([replace(simulated, items=1.0), replace(simulated, items=1.5)]).items == 1.5
 
 
-def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
-    trained: TrainedPolicy,
-) -> None:
+def test_rules_are_told_apart_by_the_same_sessions(trained: TrainedPolicy) -> None:
     search, rules = search_of(trained), [DecisionRule(2.0), drawn(0.0)]
     found = search.simulate(rules)
-    luck = np.random.default_rng(0).normal(50.0, 20.0, 40)
-    nothing = np.zeros(0, dtype=np.int64)
-    for each, returns in zip(rules, (luck, luck + 3.0), strict=True):
-        search._sessions[each] = Outcomes(returns, nothing, nothing)
-    low, high = (
-        replace(each, value=luck.mean() + more, error=3.2)
-        for each, more in zip(found, (0.0, 3.0), strict=True)
-    )
+    luck, nothing = np.random.default_rng(0).normal(50.0, 20.0, 40), np.zeros(0, dtype=np.int64)
+    for rule, more in zip(rules, (0.0, 3.0), strict=True):
+        search._sessions[rule] = Outcomes(luck + more, nothing, nothing)
+    low, high = replace(found[0], value=luck.mean()), replace(found[1], value=luck.mean() + 3.0)
     assert search.level([low, high]) == [high]
     search._sessions[low.rule] = Outcomes(np.roll(luck, 1), nothing, nothing)
     assert search.level([low, high]) == [low, high]
@@ -162,9 +152,8 @@ def test_rules_are_told_apart_by_the_difference_of_the_same_sessions(
     assert search.best([low, high]) == search.best([high, low]) == high
     # Or the one that the log says most of: the likelihood, then the hits.
     likely = replace(low, evidence=Evidence(0.1, 0.2))
-    unlikely = replace(high, evidence=Evidence(0.3, 0.1))
+    unlikely, hitting = (replace(high, evidence=Evidence(0.3, each)) for each in (0.1, 0.2))
     assert search.most_evident([unlikely, likely]) == likely
-    hitting = replace(high, evidence=Evidence(0.3, 0.2))
     assert search.most_evident([likely, hitting]) == hitting
 
 
@@ -191,9 +180,7 @@ def test_rules_far_behind_are_not_simulated_in_all_sessions(trained: TrainedPoli
     assert {len(each.returns) for each in unsupported._sessions.values()} == {120}
 
 
-def test_halves_of_the_users_say_whether_they_would_choose_another_rule(
-    trained: TrainedPolicy,
-) -> None:
+def test_halves_of_the_users_say_if_they_would_choose_another_rule(trained: TrainedPolicy) -> None:
     search = search_of(trained, replace(FEW, sessions=39))
     plain, weighted = search.simulate([drawn(0.0), drawn(4.0)])
     assert weighted.value > plain.value + 2 * plain.error
@@ -215,17 +202,15 @@ def test_every_kind_of_candidate_is_simulated(folder: Path, trained: TrainedPoli
     assert {rule.minimum_target is None for rule in rules} == {True, False}
 
 
-def test_what_the_log_supports_only_without_recent_tags_is_found(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    store = EpisodeStore.open(folder / "store")
+def test_what_the_log_supports_only_without_recent_tags_is_found(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store")
     # The best shows item 0 for ever, drawing shows items that the log hardly has; items 0 to 3
     # share no tag.
     narrow = with_bias(trained, torch.tensor([12.0, 10.0, 8.0, 6.0] + [0.0] * 20))
     least = int(training_views(store)[0].item_counts()[:4].min())
     tried = {"temperatures": (0.0, 4.0), "reward_weights": (0.0,), "tag_windows": (0, 3)}
     config = replace(FEW, least_impressions=least, **tried)
-    found = chosen(narrow, store, folder / "run", config, 2.0, 2.0)
+    found = chosen(narrow, store, trained.folder, config, 2.0, 2.0)
     assert not found.warning
     assert found.rule == DecisionRule(2.0, temperature=0.0, tag_window=3)
 
@@ -295,31 +280,10 @@ def test_for_new_users_a_rule_is_tried_with_the_tastes_of_training_users(tmp_pat
     assert (own.value, own.error) == (simulated.value, simulated.error)
 
 
-@pytest.mark.slow
-def test_of_rules_that_the_model_cannot_tell_apart_the_widest_draws_are_taken(
-    tmp_path: Path, trained: TrainedPolicy
-) -> None:
-    store, scorer = tiring_store(tmp_path), with_bias(trained, ONE_TAG)
-    config = replace(FEW, tag_windows=(0,), lookaheads=(0.0,), tolerance=0.1)
-    found = chosen(scorer, store, tmp_path, config, 2.0, 3.0)
-    rule = found.rule
-    assert rule.tag_run > 0
-    same_run = [each for each in found.candidates if each.rule.tag_run == rule.tag_run]
-    drawn = {(each.rule.temperature, each.rule.reward_weight) for each in same_run}
-    assert drawn == set(product(config.temperatures, config.reward_weights))
-    top = max(each.value for each in found.candidates)
-    level = [each for each in same_run if each.value >= 0.9 * top and each.items >= 2]
-    assert len({each.rule.temperature for each in level}) > 1
-    assert rule.temperature == max(each.rule.temperature for each in level)
-
-
-def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
-    folder: Path, trained: TrainedPolicy
-) -> None:
-    store = EpisodeStore.open(folder / "store")
-    users, views = users_of(folder / "run", store), training_views(store)
-    returns = trained.record.return_to_go
-    scorer = Scorer(trained.policy, trained.rule, store.item_states, returns, users.reward)
+def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(trained: TrainedPolicy) -> None:
+    store = EpisodeStore.open(trained.folder.parent / "store")
+    users, views = users_of(trained.folder, store), training_views(store)
+    scorer = Scorer(trained.policy, trained.rule, store.item_states, trained.returns, users.reward)
     config = replace(FEW, reward_weights=(0.0, 1.0, 4.0, 8.0), tag_windows=(3, 5))
     given = Problem(scorer, users, {0.9: 2.0, 1.0: 3.0}, *views, config, 0)
     bad = DecisionRule(2.0, reward_weight=1.0, temperature=1.0)
@@ -345,16 +309,13 @@ def test_a_choice_that_starts_from_a_rule_tries_its_neighbours_only(
     stays = choose_by_simulation(replace(given, start=bad, config=unsupported))
     assert stays.rule == bad
     assert "supports no candidate, so the rule of the earlier run stays" in stays.warning
-    ahead = replace(bad, lookahead=4.0 * mean_reward(store), policy_weight=0.5, reward_weight=8.0)
+    train = views[0]
+    mean = float(train.returns.sum(dtype=np.float64)) / train.n_steps
+    ahead = replace(bad, lookahead=4.0 * mean, policy_weight=0.5, reward_weight=8.0)
     rules = [*find_neighbours(ahead, given)]
     assert {each.reward_weight for each in rules if each.lookahead} == {8.0, 32.0}
     assert {each.policy_weight for each in rules if each.lookahead} == {0.0, 0.5, 1.0}
     assert sum(not each.lookahead for each in rules) == 1
-
-
-def mean_reward(store: EpisodeStore) -> float:
-    train = training_views(store)[0]
-    return float(train.returns.sum(dtype=np.float64)) / train.n_steps
 
 
 def tiring_store(folder: Path) -> EpisodeStore:
@@ -371,30 +332,23 @@ def tiring_store(folder: Path) -> EpisodeStore:
             minute = 28_000_000 + 40 * user + step
             rows.append((user, item, 60_000 * minute, float(liked)))
     log = pd.DataFrame(rows, columns=["user_id", "item_id", "timestamp", "reward"])
-    log.to_parquet(folder / "log.parquet")
     items = pd.DataFrame({"item_id": range(24), "tags": [[f"t{item % 4}"] for item in range(24)]})
     items.to_parquet(folder / "items.parquet")
     users = pd.DataFrame({"user_id": range(160), "age": np.arange(160.0)})
     users.to_parquet(folder / "users.parquet")
-    mapping = LogMapping(
-        item_features=(FeatureTable((folder / "items.parquet",), "item_id"),),
-        user_features=(FeatureTable((folder / "users.parquet",), "user_id"),),
-    )
-    options = PrepareOptions(reward="reward", session_by="gap", gap_minutes=120, embedding_size=6)
-    prepare([folder / "log.parquet"], mapping, folder / "store", options)
-    return EpisodeStore.open(folder / "store")
+    tables = [FeatureTable((folder / f"{of}s.parquet",), f"{of}_id") for of in ("item", "user")]
+    mapping = LogMapping(item_features=(tables[0],), user_features=(tables[1],))
+    options = {"reward": "reward", "session_by": "gap", "gap_minutes": 120, "embedding_size": 6}
+    return store_of(log, folder, mapping, **options)
 
 
 def test_a_finished_run_that_is_trained_again_keeps_its_rule(
-    folder: Path, trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
+    trained: TrainedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("the rule is chosen again")
-
-    monkeypatch.setattr("ucfrec.runs.run.choose_by_simulation", never)
-    store = EpisodeStore.open(folder / "store")
-    before = read_json(folder / "run" / "run.json")
-    train_run(store, folder / "run", config_from_dict(before["config"]))
-    after = read_json(folder / "run" / "run.json")
-    assert after["rule"] == before["rule"]
-    assert TrainedPolicy.load(folder / "run").rule == trained.rule
+    monkeypatch.delattr("ucfrec.runs.run.choose_by_simulation")
+    run = trained.folder
+    before = read_json(run / "run.json")
+    store = EpisodeStore.open(run.parent / "store")
+    train_run(store, run, config_from_dict(before["config"]))
+    assert read_json(run / "run.json")["rule"] == before["rule"]
+    assert TrainedPolicy.load(run).rule == trained.rule

@@ -16,16 +16,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.support.causes import planted_vectors
-from tests.support.planted import (
-    ACTION,
-    CONSTANT,
-    STATE,
-    STEPS,
-    f,
-    fitted,
-    planted,
-    planted_store,
-)
+from tests.support.planted import ACTION, CONSTANT, STATE, STEPS, f, fitted, planted, planted_store
 from ucfrec import schema
 from ucfrec.arrays import Float32Array
 from ucfrec.counterfactual.augmentation import (
@@ -47,11 +38,7 @@ from ucfrec.counterfactual.generators import (
     make_generator,
     state_clusters,
 )
-from ucfrec.counterfactual.reward_model import (
-    CausalRewardModel,
-    CRMConfig,
-    read_transitions,
-)
+from ucfrec.counterfactual.reward_model import CausalRewardModel, CRMConfig, read_transitions
 from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, TrainingEpisodes, Transitions
@@ -119,10 +106,8 @@ class EvenSteps:
 
     band = (0.2, 0.5)
 
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        return torch.where(states[:, :1] >= 0, states, states + 10.0)
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+        return torch.where(at.states[:, :1] >= 0, at.states, at.states + 10.0)
 
 
 @pytest.mark.parametrize("edits", [1, 3])
@@ -208,20 +193,15 @@ def test_the_gate_is_equation_4(
 
 
 def test_constant_moves_are_collapsed_and_isotropic_ones_are_not() -> None:
-    def report(moves: Tensor) -> tuple[float, float]:
+    varied = torch.randn(4_000, 5, generator=torch.Generator().manual_seed(0))
+    constant = torch.tensor([[0.1, 0.2, 0.0, 0.0, 0.3]]).repeat(500, 1)
+    for moves, ratio, rank in ((constant, 1, 1), (varied, 0, 5), (varied[:0], math.nan, 0)):
         statistics = MoveStatistics(5)
         for chunk in torch.split(moves, 100):
             statistics.add(chunk)
         found = statistics.report(rho_high=10.0, dimensions=5)
-        return found.mean_move_ratio, found.effective_rank
-
-    assert report(torch.tensor([[0.1, 0.2, 0.0, 0.0, 0.3]]).repeat(500, 1)) == pytest.approx((1, 1))
-    ratio, rank = report(torch.randn(4_000, 5, generator=torch.Generator().manual_seed(0)))
-    assert ratio < 0.05
-    assert rank == pytest.approx(5, abs=0.05)
-    nothing = MoveStatistics(5).report(0.5, 5)
-    assert (nothing.edits, nothing.effective_rank) == (0, 0.0)
-    assert math.isnan(nothing.mean_move_ratio)
+        assert found.mean_move_ratio == pytest.approx(ratio, abs=0.05, nan_ok=True)
+        assert (found.edits, found.effective_rank) == (len(moves), pytest.approx(rank, abs=0.05))
 
 
 # Other actions.
@@ -246,17 +226,12 @@ def asked(
     return how.propose(*view().all_steps(), count, seed)
 
 
-def sources(copies: AugmentedEpisodes) -> tuple[Tensor, Tensor, Tensor]:
-    """Logged states, actions and rewards of the steps that were changed, in float64."""
-    logged = planted_store().transitions(copies.action_source, copies.action_step)
-    return logged.states.double(), logged.actions.double(), logged.rewards.double()
-
-
 def test_the_other_reward_is_the_models_with_the_disturbance_kept() -> None:
     exact = deepcopy(fitted()[0]).double()
     copies, report = asked(others())
     assert report.copies == len(copies.action_source) > 1_000
-    s, a, r = sources(copies)
+    logged = planted_store().transitions(copies.action_source, copies.action_step)
+    s, a, r = logged.states.double(), logged.actions.double(), logged.rewards.double()
     rewards = logged_rewards()
     with torch.no_grad():
         z = exact.abduct(s, a, r)
@@ -274,23 +249,12 @@ def test_the_other_reward_is_the_models_with_the_disturbance_kept() -> None:
     assert np.corrcoef(truth, change)[0, 1] > 0.9
 
 
-def test_only_other_actions_of_the_same_cluster_are_asked_about() -> None:
-    copies, _ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
-    crm, clusters = fitted()[0], others().clusters
-    logged = view().transitions(*view().all_steps())
-    near = clusters.nearest(crm.normalise_states(logged.states)).tolist()
-    taken = [action.tobytes() for action in logged.actions.numpy()]
-    cluster_of = dict(zip(taken, near, strict=True))
-    at = planted_store().transitions(copies.action_source, copies.action_step)
-    own = clusters.nearest(crm.normalise_states(at.states)).tolist()
-    assert [cluster_of[action.tobytes()] for action in copies.action] == own
-    assert (copies.action != at.actions.numpy()).any(axis=1).all()
-    assert set(copies.action_source) <= set(view().episode_ids)
-
-
 def test_the_gate_opens_and_shuts() -> None:
     steps = view().n_steps
-    _, open_ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
+    made, open_ = asked(replace(others(), epsilon_r=np.inf, delta=0.0))
+    logged = planted_store().transitions(made.action_source, made.action_step).actions.numpy()
+    assert (made.action != logged).any(axis=1).all()
+    assert set(made.action_source) <= set(view().episode_ids)
     # A draw of the logged action is not a proposal; in large clusters that is rare.
     assert 2.9 * steps < open_.proposals <= 3 * steps
     assert open_.copies == open_.proposals

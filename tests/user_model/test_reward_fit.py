@@ -1,10 +1,10 @@
 """Fitting the reward model of items: what it recovers, what it reads, and what it reports."""
 
 import copy
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,11 +15,8 @@ from ucfrec.episodes.states import ItemStates
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
 from ucfrec.user_model.reward import LAGS, MEMORY, ItemRewardModel
-from ucfrec.user_model.reward_effects import Effects, fit_effects
-from ucfrec.user_model.reward_fit import (
-    fit_item_reward_model,
-    refit_item_reward_model,
-)
+from ucfrec.user_model.reward_effects import fit_effects
+from ucfrec.user_model.reward_fit import fit_item_reward_model, refit_item_reward_model
 from ucfrec.user_model.reward_report import RewardRows, UserCalibration
 
 ITEMS, USERS, LENGTH, DIM, TAGS = 40, 150, 20, 4, 6
@@ -56,12 +53,15 @@ def store_of(log: Log, rewards: Float64Array, validation: float = 0.25) -> Episo
     users = len(log.items) // LENGTH
     split = np.where(np.arange(users) < users * (1 - validation), 0, 1)
     split[-1] = 2
-    return EpisodeStore.from_arrays(
-        {"item": log.items, "reward": rewards},
-        np.full(users, LENGTH),
-        {"user": np.arange(users), "split": split},
-        item_states(users),
-    )
+    return written(log, rewards, np.arange(users), split)
+
+
+def written(
+    log: Log, rewards: Float64Array, users: IntArray, split: IntArray, **changes: Any
+) -> EpisodeStore:
+    columns, lengths = {"item": log.items, "reward": rewards}, np.full(len(users), LENGTH)
+    states = replace(item_states(len(users)), **changes)
+    return EpisodeStore.from_arrays(columns, lengths, {"user": users, "split": split}, states)
 
 
 def item_states(users: int) -> ItemStates:
@@ -110,9 +110,7 @@ def test_boredom_and_state_are_learned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path) -> None:
     """All items are alike, but users who click more see the second half of the catalogue more.
-
-    Held-out sessions are later ones of the same users, or of users who were never seen.
-    """
+    Held-out sessions are later ones of the same users, or of users who were never seen."""
     rng = np.random.default_rng(3)
     sessions = np.arange(400)
     users = sessions // 2 if known else sessions
@@ -123,10 +121,7 @@ def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path)
     confounded = Log(items.ravel(), users, predictor.ravel(), np.zeros(ITEMS))
     rewards = clicks(confounded)
     split = sessions % 2 if known else (sessions >= 300).astype(np.int64)
-    columns = {"item": confounded.items, "reward": rewards}
-    store = EpisodeStore.from_arrays(
-        columns, np.full(400, LENGTH), {"user": users, "split": split}, item_states(400)
-    )
+    store = written(confounded, rewards, users, split)
     model, _ = fit_item_reward_model(*views(store), tmp_path, seed=0)
     shown = np.bincount(confounded.items, minlength=ITEMS)
     rates = np.bincount(confounded.items, rewards, minlength=ITEMS) / shown
@@ -139,21 +134,15 @@ def test_item_effects_are_adjusted_for_who_saw_them(known: bool, tmp_path: Path)
     assert abs(gap(model.item.numpy().astype(np.float64))) < 0.3 * gap(crude)
 
 
-def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_rows(
-    tmp_path: Path,
-) -> None:
-    planted = log(3, taste=4.0, users=300)
-    columns = {"item": planted.items, "reward": clicks(planted)}
-    split, states = (np.arange(300) >= 200).astype(np.int64), item_states(300)
-    states = replace(states, embeddings=torch.eye(TAGS)[states.tags[:, 0]])
-    per_session = {"user": np.arange(300), "split": split}
-    store = EpisodeStore.from_arrays(columns, np.full(300, LENGTH), per_session, states)
+def test_for_new_users_the_session_tells_what_effects_of_users_tell(tmp_path: Path) -> None:
+    planted, split = log(3, taste=4.0, users=300), (np.arange(300) >= 200).astype(np.int64)
+    embeddings = torch.eye(TAGS)[torch.arange(ITEMS) % TAGS]
+    store = written(planted, clicks(planted), np.arange(300), split, embeddings=embeddings)
     model, report = fit_item_reward_model(*views(store), tmp_path / "a", seed=0)
     assert report.new_users
-    assert "affinity" in report.kept
+    assert {"affinity", "tastes"} <= report.kept.keys()
     assert not model.user.any()
     assert not model.affinity.any()
-    assert "tastes" in report.kept
     assert model.reach == MEMORY
     rows = RewardRows.of(store.split("validation"), model.reach, 10**6, 0)
     slope, intercept = UserCalibration.fit(model, store.split("validation"), 10**6, 0).line
@@ -162,12 +151,11 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
     # After ten steps, the session shows what its user likes, which the log never says.
     late = (torch.arange(len(rows)) % LENGTH >= 10).numpy()
     true = planted.predictor[split[planted.users] == 1][late]
-    scores = model.score(rows.states, rows.history, None, rows.items).numpy()[late]
-    alone = copy.deepcopy(model)
+    scores, alone = model.score(rows.states, rows.history, None, rows.items), copy.deepcopy(model)
     alone.tastes.weigh(0.0)
-    without = alone.score(rows.states, rows.history, None, rows.items).numpy()[late]
-    assert np.corrcoef(scores, true)[0, 1] > np.corrcoef(without, true)[0, 1] + 0.1
-    scores = model.score(rows.states, rows.history, None, rows.items)
+    without = alone.score(rows.states, rows.history, None, rows.items)[late].numpy()
+    gain = np.corrcoef(scores[late].numpy(), true) - np.corrcoef(without, true)
+    assert gain[0, 1] > 0.1
     assert torch.equal(scores, model.score(rows.states, rows.history, rows.users, rows.items))
     again = refit_item_reward_model(tmp_path / "a", store.split("train"), tmp_path / "b", seed=0)
     for name, value in model.state_dict().items():
@@ -177,22 +165,15 @@ def test_for_new_users_the_session_tells_what_users_effects_tell_of_training_row
 def test_a_search_begins_and_ends_near_an_earlier_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planted, counted = log(0, users=200), list[Mapping[str, float]]()
-
-    def counting(*arguments: Any) -> Effects:
-        counted.append(arguments[2])
-        return fit_effects(*arguments)
-
+    planted, few, counting = log(0, users=200), log(0, users=100), Mock(wraps=fit_effects)
     monkeypatch.setattr("ucfrec.user_model.reward_effects.fit_effects", counting)
-    store = store_of(planted, clicks(planted, 1))
-    half = views(store_of(log(0, users=100), clicks(log(0, users=100))))
-    old = fit_item_reward_model(*half, tmp_path / "old", seed=0)[1]
-    counted.clear()
+    store, half = store_of(planted, clicks(planted, 1)), store_of(few, clicks(few))
+    old = fit_item_reward_model(*views(half), tmp_path / "old", seed=0)[1]
+    counting.reset_mock()
     cold = fit_item_reward_model(*views(store), tmp_path / "cold", seed=0)[1]
-    fits = len(counted)
-    counted.clear()
+    fits = counting.call_count
     warm = fit_item_reward_model(*views(store), tmp_path / "warm", 0, first=tmp_path / "old")[1]
-    assert len(counted) < 0.8 * fits
+    assert counting.call_count - fits < 0.8 * fits
     assert warm.loss < 1.01 * cold.loss
     assert {"item", "user"} <= old.kept.keys() & warm.kept.keys()
     none = fit_item_reward_model(*views(store), tmp_path / "none", 0, first=tmp_path / "nowhere")[1]
@@ -217,8 +198,7 @@ def test_rewards_of_many_values_are_fitted_in_their_units(tmp_path: Path) -> Non
 
 def test_what_does_not_predict_is_left_out(tmp_path: Path) -> None:
     planted = log(5)
-    rewards = (np.random.default_rng(1).random(len(planted.items)) < 0.3).astype(np.float64)
-    model, report = fit(tmp_path, planted, rewards)
+    model, report = fit(tmp_path, planted, 1.0 * (np.random.default_rng(1).random(3000) < 0.3))
     assert len(report.kept) <= 2
     assert report.loss > report.base_loss - 0.01
     for tried in report.effects:
@@ -231,14 +211,10 @@ def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> No
     planted = log(6, boredom=1.0)
     rewards = clicks(planted)
     model, _ = fit(tmp_path, planted, rewards)
-    step = 7
-    later = np.arange(len(planted.items)) % LENGTH >= step
+    later, scores = np.arange(len(planted.items)) % LENGTH >= 7, []
     changed = planted._replace(items=np.where(later, (planted.items + 11) % ITEMS, planted.items))
-    scores = []
     for given, paid in ((planted, rewards), (changed, np.where(later, 1 - rewards, rewards))):
-        store = store_of(given, paid)
-        episodes = np.arange(store.n_episodes)
-        rows = RewardRows.at(store, episodes, np.full(len(episodes), step), LAGS)
+        rows = RewardRows.at(store_of(given, paid), np.arange(USERS), np.full(USERS, 7), LAGS)
         scores.append(model.scores(rows.states, rows.history, rows.users))
     assert torch.equal(scores[0], scores[1])
 
@@ -246,20 +222,14 @@ def test_scores_do_not_depend_on_the_step_or_on_later_ones(tmp_path: Path) -> No
 def test_test_rows_have_no_effect_and_statistics_come_from_training_rows(tmp_path: Path) -> None:
     planted = log(7)
     rewards = clicks(planted)
-    first, _ = fit(tmp_path / "a", planted, rewards)
-    other = rewards.copy()
-    other[-LENGTH:] = 1 - other[-LENGTH:]
-    items = planted.items.copy()
-    items[-LENGTH:] = 0
-    same, _ = fit(tmp_path / "b", planted._replace(items=items), other)
+    first, row = fit(tmp_path / "a", planted, rewards)[0], np.arange(len(rewards))
+    test, held_out = row >= (USERS - 1) * LENGTH, row >= (int(USERS * 0.75) + 1) * LENGTH
+    changed = planted._replace(items=np.where(test, 0, planted.items))
+    same, _ = fit(tmp_path / "b", changed, np.where(test, 1 - rewards, rewards))
     for name, value in first.state_dict().items():
         assert torch.equal(value, same.state_dict()[name]), name
-    held_out = slice(int(USERS * 0.75) * LENGTH + LENGTH, None)
-    other = rewards.copy()
-    other[held_out] = 1 - other[held_out]
-    chosen, _ = fit(tmp_path / "c", planted, other)
-    statistics = ("state_mean", "state_std", "reward_mean", "reward_std", "vectors")
-    for name in statistics:
+    chosen, _ = fit(tmp_path / "c", planted, np.where(held_out, 1 - rewards, rewards))
+    for name in ("state_mean", "state_std", "reward_mean", "reward_std", "vectors"):
         assert torch.equal(first.get_buffer(name), chosen.get_buffer(name)), name
 
 
@@ -277,18 +247,14 @@ def test_a_fit_repeats_and_is_read_again(tmp_path: Path, monkeypatch: pytest.Mon
         assert torch.equal(value, kept.state_dict()[name]), name
 
 
-@pytest.mark.parametrize(
-    ("rewards", "validation", "message"),
-    [
-        (lambda made: np.full(len(made.items), 2.0), 0.25, "all 900 training rewards equal 2"),
-        (clicks, 0.0, "no held-out steps"),
-    ],
-)
-def test_what_cannot_be_fitted_is_an_input_error(
-    rewards: Callable[[Log], Float64Array], validation: float, message: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_fitted_is_an_input_error(tmp_path: Path) -> None:
     planted = log(9, users=60)
-    store = store_of(planted, rewards(planted), validation)
-    with pytest.raises(InputError, match=message):
-        fit_item_reward_model(*views(store), tmp_path / "run", seed=0)
+    equal = store_of(planted, np.full(len(planted.items), 2.0))
+    cases = {
+        "all 900 training rewards equal 2": equal,
+        "no held-out steps": store_of(planted, clicks(planted), 0.0),
+    }
+    for message, store in cases.items():
+        with pytest.raises(InputError, match=message):
+            fit_item_reward_model(*views(store), tmp_path / "run", seed=0)
     assert not (tmp_path / "run").exists()

@@ -43,13 +43,8 @@ def log_of_tastes() -> tuple[EpisodeStore, IntArray]:
 
 
 def log_of_moods(knowing: float, told: bool = True) -> EpisodeStore:
-    """Sessions whose every second step, by chance, is one where everything is liked.
-
-    Args:
-        knowing: share of the steps in which the log's policy knows this, and shows one of the first
-            ten items then, and one of the others in other steps; it shows any item otherwise.
-        told: whether the log has propensities.
-    """
+    """Sessions in half of whose steps everything is liked. In a share `knowing` of the steps the
+    log's policy knows this, and shows one of the first ten items then, else one of the others."""
     rng = np.random.default_rng(1)
     mood = rng.random((USERS, LENGTH)) < 0.5
     by_mood = rng.integers(HALF, size=mood.shape) + np.where(mood, 0, HALF)
@@ -99,19 +94,13 @@ def test_what_the_logs_policy_knew_makes_no_item_look_better(tmp_path: Path) -> 
     first = rows.items.numpy() < HALF
     users = fit_training_users(log_of_moods(0.7), tmp_path / "weighted", seed=0)
     crude = fit_training_users(log_of_moods(0.7, told=False), tmp_path / "crude", seed=0)
-    assert users.report.weighted
-    assert (
-        users.report.effective_steps
-        < users.report.steps
-        == USERS * LENGTH
-        == crude.report.effective_steps
-    )
-    assert not crude.report.weighted
-    mean = (LIKED + OTHER) / 2
+    assert (users.report.weighted, crude.report.weighted) == (True, False)
+    assert users.report.effective_steps < users.report.steps == USERS * LENGTH
+    assert crude.report.effective_steps == crude.report.steps
     found, without = chances(users, rows), chances(crude, rows)
     assert without[first].mean() - without[~first].mean() > 0.3
     assert abs(found[first].mean() - found[~first].mean()) < 0.1
-    assert found.mean() == pytest.approx(mean, abs=0.05)
+    assert found.mean() == pytest.approx((LIKED + OTHER) / 2, abs=0.05)
 
 
 def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path) -> None:
@@ -123,19 +112,15 @@ def test_of_states_only_observations_and_features_of_users_count(tmp_path: Path)
     found = chances(users, RewardRows.at(train, *train.all_steps(), LAGS))
     assert found[seen.ravel()].mean() == pytest.approx(LIKED, abs=0.03)
     assert found[~seen.ravel()].mean() == pytest.approx(OTHER, abs=0.03)
-    states = torch.randn(3, train.state_size)
-    other = states.clone()
-    other[:, : train.item_states.size] += 1
-    nothing = torch.zeros(3, users.model.vectors.shape[1] + 1)
-    assert torch.equal(
-        users.model.level(states, None, nothing), users.model.level(other, None, nothing)
-    )
+    states, nothing = torch.randn(3, train.state_size), torch.zeros(3, KINDS + 1)
+    level = users.model.level(states, None, nothing)
+    states[:, : train.item_states.size] += 1
+    assert torch.equal(level, users.model.level(states, None, nothing))
 
 
 def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
-    train, _ = log_of_tastes()
+    train, file = log_of_tastes()[0], tmp_path / "training_users.safetensors"
     users = fit_training_users(train, tmp_path, seed=0)
-    file = tmp_path / "training_users.safetensors"
     report = dataclasses.asdict(users.report)
     for other in ({}, {**report, "calibration": 1.0}, {**report, "more": 1}):
         save_tensors(file, users.model.state_dict(), other)
@@ -147,7 +132,7 @@ def test_a_file_with_another_report_is_named(tmp_path: Path) -> None:
     st.lists(st.sampled_from([0.01, 0.05, 0.2, 0.5, 1.0]), min_size=8, max_size=8),
     st.integers(2, 50),
 )
-def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
+def test_weights_add_up_to_a_users_effective_number_of_steps(
     propensities: list[float], items: int
 ) -> None:
     logged, zeros = np.array(propensities), np.zeros(8)
@@ -164,22 +149,17 @@ def test_weights_are_truncated_and_add_up_to_a_users_effective_number_of_steps(
         assert np.allclose(found / found.max(), expected / expected.max(), rtol=1e-5)
         effective = expected.sum() ** 2 / np.square(expected).sum()
         assert found.sum() == pytest.approx(effective, rel=1e-4)
-
-
-@pytest.mark.parametrize("told", [{}, {"propensity": np.array([0.5, np.nan, 0.5])}])
-def test_logs_without_all_propensities_have_no_weights(told: dict[str, Float64Array]) -> None:
-    columns = {"item": np.zeros(3, dtype=np.int64), "reward": np.array([0.0, 1.0, 0.0]), **told}
-    states = ItemStates(torch.ones(1, 2), torch.zeros(1, 0), 0.0, 1.0)
-    view = EpisodeStore.from_arrays(columns, np.array([3]), {"user": np.array([0])}, states)
-    assert weigh_by_propensity(view, *view.all_steps(), 1) is None
+    # Not if one is missing.
+    columns["propensity"] = np.where(np.arange(8) == 3, np.nan, logged)
+    view = EpisodeStore.from_arrays(columns, np.array([3, 4, 1]), {"user": users}, states)
+    assert weigh_by_propensity(view, *view.all_steps(), items) is None
 
 
 def test_sessions_are_drawn_by_the_seed() -> None:
     train, _ = log_of_tastes()
-    users = [draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1)]
-    assert np.array_equal(users[0], users[1])
-    assert not np.array_equal(users[0], users[2])
-    assert sorted(users[0]) == sorted(train.episode_values("user"))
+    first, again, other = (draw_sessions(train, seed).episode_values("user") for seed in (0, 0, 1))
+    assert [*first] == [*again] != [*other]
+    assert sorted(first) == sorted(train.episode_values("user"))
 
 
 MANY_USERS, FEW_STEPS = 300, 20
@@ -198,19 +178,14 @@ def test_calibration_undoes_a_stretched_and_shifted_score(tmp_path: Path) -> Non
 
 
 def log_of(told: bool, off: float = 0.0) -> EpisodeStore:
-    """A log whose policy shows item 0 mostly to users who like it (odds 3 : 1, else 1 : 3).
-
-    Args:
-        told: whether the log has propensities.
-        off: added to the chance of a like by users of odd numbers.
-    """
+    """A log whose policy shows item 0 mostly to users who like it (3 : 1, else 1 : 3); users of
+    odd numbers like anything with a chance that is higher by `off`."""
     rng = np.random.default_rng(0)
     likes = rng.random((MANY_USERS, FEW_STEPS)) < 0.5
     first = np.where(likes, 0.9, 0.1)
     items = (rng.random(likes.shape) >= first).astype(np.int64)
-    chance = np.where(items == 1, 0.5, np.where(likes, 0.75, 0.25)) + off * (
-        np.arange(MANY_USERS)[:, None] % 2
-    )
+    chance = np.where(items == 1, 0.5, np.where(likes, 0.75, 0.25))
+    chance[1::2] += off
     columns = {"item": items.ravel(), "reward": (rng.random(likes.shape) < chance).ravel() * 1.0}
     if told:
         columns["propensity"] = np.where(items == 0, first, 1 - first).ravel()

@@ -73,28 +73,18 @@ def test_that_repetition_ends_sessions_is_found() -> None:
     assert found[~steps.again].mean() == pytest.approx(0.1, abs=0.03)
 
 
-def test_few_held_out_steps_say_nothing_that_is_not_clear() -> None:
-    steps, ended = planted_steps()
-    training, held_out = (steps.logged(ended, rows) for rows in (slice(4000), slice(4000, 4010)))
-    _, report = SessionEnd.fit(LIKENESS, training, held_out, 0)
-    for kind, (gain, error) in report.gain.items():
-        assert (gain > error) or kind != report.kept or kind == "constant"
-
-
 def test_steps_later_than_logged_ones_are_like_the_last() -> None:
     """The log has eight steps; sessions end the likelier, the later."""
     steps, _ = planted_steps()
     ended = np.random.default_rng(1).random(len(steps.steps)) < 0.05 * (1 + steps.steps)
     end, report = steps.fit(ended)
     assert report.kept == "logistic"
-
-    def at(step: int) -> float:
-        numbers = np.full(len(steps.steps), step)
-        return float(end.probabilities(*steps._replace(steps=numbers)).mean())
-
-    assert at(7) == pytest.approx(0.4, abs=0.05)
-    assert at(7) > at(6)
-    assert at(7) == at(8) == at(100)
+    found = [
+        float(end.probabilities(*steps._replace(steps=np.full(len(steps.steps), step))).mean())
+        for step in (6, 7, 8, 100)
+    ]
+    assert found[1] == pytest.approx(0.4, abs=0.05)
+    assert found[0] < found[1] == found[2] == found[3]
 
 
 def test_what_a_regression_cannot_say_is_boosted_saved_and_read() -> None:
@@ -165,22 +155,14 @@ def ends_of(store: EpisodeStore, most: int, seed: int = 0) -> tuple[LoggedEnds, 
     return logged, logged.inputs[:, 3].numpy()
 
 
-def test_only_the_last_step_of_a_cut_session_tells_nothing() -> None:
-    store = store_of([0] * 9, [2, 3, 2, 2], user=[0, 0, 1, 1], terminated=[True, True, False, True])
-    logged, rewards = ends_of(store, 100)
-    # Excluded: step 6, of the session that is not terminated.
-    assert rewards.tolist() == [0, 1, 2, 3, 4, 5, 7, 8]
-    assert logged.ended.tolist() == [False, True, False, False, True, False, False, True]
-
-
 @pytest.mark.parametrize("sessions", [1, 3])
 def test_the_share_of_steps_that_end_sessions_is_the_logged_one(sessions: int) -> None:
     """However few sessions a user has: the last one of each ends like any other."""
     generator = np.random.default_rng(0)
     lengths = generator.geometric(0.4, 6000)
     items = generator.integers(2, size=int(lengths.sum()))
-    users, terminated = np.arange(6000) // sessions, np.ones(6000, dtype=bool)
-    logged, _ = ends_of(store_of(items, lengths, user=users, terminated=terminated), len(items))
+    ends = {"user": np.arange(6000) // sessions, "terminated": np.ones(6000, dtype=bool)}
+    logged, _ = ends_of(store_of(items, lengths, **ends), len(items))
     end, _ = SessionEnd.fit(LIKENESS, logged, logged, 0)
     found = torch.sigmoid(end._log_odds(logged.inputs))
     assert float(found.mean()) == pytest.approx(0.4, abs=0.02)
@@ -193,20 +175,17 @@ def test_training_sessions_are_held_out_where_the_split_cut_those_of_validation(
     terminated = ~((np.arange(30) % 3 == 1) & (users < cut))
     store = store_of([0] * 30, [1] * 30, user=users, split=split, terminated=terminated)
     fitted, held_out = whole_sessions(store.split("train"), store.split("validation"))
+    assert (fitted.n_episodes, held_out.n_episodes) == ((16, 4) if cut else (20, 10))
     if cut:
         assert set(held_out.episode_values("user")) == {4, 9}
         assert set(held_out.episode_values("split")) == {0}
-        assert fitted.n_episodes == 16
-    else:
-        assert (fitted.n_episodes, held_out.n_episodes) == (20, 10)
 
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_ends_of_the_rows_of_users_are_no_ends_of_sessions(cut: bool) -> None:
     """Sessions end with an item that repeats the one before; rows of users `cut` anywhere."""
     generator = np.random.default_rng(0)
-    items, lengths, users = list[int](), list[int](), list[int]()
-    again = list[bool]()
+    items, lengths, users, again = list[int](), list[int](), list[int](), list[bool]()
     for user in range(600):
         rows = int(generator.integers(1, 12)) if cut else 10_000
         for _ in range(3):
@@ -236,12 +215,14 @@ def test_drawn_ends_are_a_sample_of_all(seed: int) -> None:
     users, terminated = np.sort(generator.integers(9, size=60)), generator.random(60) < 0.5
     n = int(lengths.sum())
     store = store_of([0] * n, lengths, user=users, terminated=terminated)
+    cut = np.cumsum(lengths)[~terminated] - 1
     (known, rewards), (drawn, _) = ends_of(store, n, seed), ends_of(store, 20, seed)
     chosen = np.sort(np.random.default_rng(seed).choice(len(rewards), 20, replace=False))
     assert torch.equal(drawn.inputs, known.inputs[torch.from_numpy(chosen)])
     np.testing.assert_array_equal(drawn.ended, known.ended[chosen])
-    last = np.isin(rewards, np.cumsum(lengths) - 1)
-    np.testing.assert_array_equal(known.ended, last)
+    # The last step of a session that is cut tells nothing.
+    assert rewards.tolist() == np.delete(np.arange(n), cut).tolist()
+    np.testing.assert_array_equal(known.ended, np.isin(rewards, np.cumsum(lengths) - 1))
 
 
 def test_another_value_of_one_input_is_as_if_it_were_there() -> None:

@@ -1,9 +1,8 @@
 """What rules would have done at logged steps, and the choice of a reward weight by it.
 
-Where the log has no true sessions there is nothing to simulate, but every row shows what a user
-liked. A candidate is worth the mean rate, in the validation period, of the ten items that it would
-show, and overlaps with the log enough if it finds liked items better than the ten most liked ones
-do, by a standard error.
+Where the log has no true sessions, a candidate is worth the mean rate, in the validation period, of
+the ten items that it would show, and overlaps with the log enough if it finds liked items better
+than the ten most liked ones do, by a standard error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,11 +39,8 @@ _PRIOR = 10.0
 
 
 class LoggedScores:
-    """Scores of all items at M logged steps by rules of one policy.
-
-    Policy and reward model are computed once for all rules of one target, and kept for later rules
-    where the policy has factors: the outputs of others are as many as items.
-    """
+    """Scores of all items at M logged steps by rules of one policy: what all rules of a target
+    share is computed once, and kept where the policy has factors, which are few numbers."""
 
     def __init__(
         self, scorer: Scorer, view: EpisodeStore, episodes: IntArray, steps: IntArray
@@ -136,10 +132,9 @@ class LoggedEvidence:
 def choose_by_ranking(problem: Problem) -> RuleChoice:
     """Choose the reward weight of the rule; its other parts stay.
 
-    Of those with enough overlap, the one with the highest rate is chosen, and of those whose rates
-    cannot be distinguished the one with the most hits; without any, those count whose hits cannot
-    be distinguished from the most. If the next larger of the configured candidates overlaps too
-    little, reward weights between the two are tried. Two halves of the users choose again.
+    Of those with enough overlap, or without any those whose hits cannot be told apart from the
+    most, the one with the highest rate is chosen, and of equal ones the one with the most hits. If
+    the next larger candidate overlaps too little, weights between the two are tried.
     """
     train, validation, scorer = problem.train, problem.validation, problem.scorer
     n_items = len(train.item_states.embeddings)
@@ -168,15 +163,16 @@ def choose_by_ranking(problem: Problem) -> RuleChoice:
 
     best = rank(sorted({0.0, *problem.config.reward_weights}))
     for _ in range(_HALVINGS):
-        larger = [candidate for candidate in candidates if candidate.weight > best.weight]
-        nearest = min(larger, key=lambda candidate: candidate.weight, default=best)
-        if nearest.overlaps:
+        weight = best.rule.reward_weight
+        ranked = {each.rule.reward_weight: each for each in candidates}
+        nearest = min((each for each in ranked if each > weight), default=weight)
+        if ranked[nearest].overlaps:
             break
-        best = rank([(best.weight + nearest.weight) / 2])
-    halves = [
-        _choose_best([candidate.select(users % 2 == half) for candidate in candidates]).weight
-        for half in (0, 1)
-    ]
+        best = rank([(weight + nearest) / 2])
+    halves = []
+    for half in (0, 1):
+        own = _choose_best([candidate.select(users % 2 == half) for candidate in candidates])
+        halves.append(own.rule.reward_weight)
     warning = "; WARNING: no candidate does, this one is among those with the most hits"
     return RuleChoice(
         rule=best.rule,
@@ -206,10 +202,6 @@ class _Candidate:
     def select(self, rows: BoolArray) -> "_Candidate":
         names = ("users", "rates", "liked", "hits", "ahead")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
-
-    @property
-    def weight(self) -> float:
-        return self.rule.reward_weight
 
     @cached_property
     def summary(self) -> RankedRule:

@@ -1,10 +1,9 @@
 """Choose the decision rule in sessions simulated in the user model.
 
-Simulated users have the fixed tastes of training users, which the policy does not know
-(`ucfrec.user_model.reward_fit`). What a model says of a policy holds only where the log supports
-it, so a candidate must keep to items that the training log shows often enough, and to more than a
-handful of them; where the log has propensities, it must also leave enough effective users to
-evaluate it off-policy.
+Simulated users have the fixed tastes of training users, which the policy does not know. What a
+model says holds only where the log supports it: a candidate must keep to items that the training
+log shows often enough, and to more than a handful of them; where the log has propensities, it must
+also leave enough effective users to evaluate it off-policy.
 """
 
 import math
@@ -12,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from operator import attrgetter
+from statistics import median_high
 from typing import Any, Final
 
 import numpy as np
@@ -51,8 +51,7 @@ _FAR_OFF: Final = 0.1
 _LARGEST_ERROR: Final = _FAR_OFF / 4
 """Standard error, as a share of the estimated value, above which more sessions are simulated."""
 _WIDEST: Final = 0.4
-"""Largest variance of log weights: above it, `ope` often finds the tail of the weights too heavy
-(Pareto k above 0.5 in 30% to 40% of logs at 0.6 to 0.8)."""
+"""Largest variance of log weights: above it, `ope` often finds the weights' tail too heavy."""
 _ROWS_AT_ONCE: Final = 256
 """Rows of a forward pass, whose logits then stay in the processor's cache."""
 _NEAR_THE_LOG: Final = (
@@ -81,16 +80,15 @@ class Outcomes:
 
 
 class _ManyRules(PolicyActor):
-    """Acts by the rule of each session: n sessions by each of several scorers of one policy.
-
-    Every rule has a generator of its own, so that it draws what it would draw alone.
-    """
+    """Acts by the rule of each session: n sessions by each of several scorers of one policy, each
+    with a generator of its own, so that it draws what it would draw alone."""
 
     def __init__(self, scorers: Sequence[Scorer], n: int, store: EpisodeStore, seed: int) -> None:
         states, rows = store.item_states, len(scorers) * n
         users = np.arange(len(states.user_features))
         super().__init__(scorers[0], rows, store.observation_size, states, None, users, seed)
         self._scorers = scorers
+        self._targets = [(each.rule.target, each.rule.minimum_target) for each in scorers]
         self._generators = [torch.Generator().manual_seed(seed) for _ in scorers]
         self._rule = np.repeat(np.arange(len(scorers)), n)
 
@@ -105,10 +103,10 @@ class _ManyRules(PolicyActor):
         for batch in _batch_rules(self._rule[rows.numpy()]):
             begin, windows = batch[0][1].start, list[Windows]()
             # Windows depend on the rule's targets alone.
-            for _, rules in groupby(batch, lambda entry: self._targets(entry[0])):
-                group = list(rules)
-                part = slice(group[0][1].start, group[-1][1].stop)
-                windows.append(self._scorers[group[0][0]].windows(sessions.at(part)))
+            for _, rules in groupby(batch, lambda entry: self._targets[entry[0]]):
+                (number, part), *others = rules
+                end = others[-1][1].stop if others else part.stop
+                windows.append(self._scorers[number].windows(sessions.at(slice(part.start, end))))
             weighted = any(self._scorers[number].rule.reward_weight for number, _ in batch)
             together = sessions.at(slice(begin, batch[-1][1].stop))
             query = self._scorer.query(together, Windows.joined(windows), weighted)
@@ -120,10 +118,6 @@ class _ManyRules(PolicyActor):
                 decisions.append(scorer.rule.choose(scores, self._generators[number]))
         items, chances = zip(*decisions, strict=True)
         return torch.cat(items), torch.cat(chances)
-
-    def _targets(self, number: int) -> tuple[float | None, float | None]:
-        rule = self._scorers[number].rule
-        return rule.target, rule.minimum_target
 
 
 def _batch_rules(rules: IntArray) -> list[list[tuple[int, slice]]]:
@@ -281,9 +275,9 @@ class RuleSearch:
         return self.simulate([*rules][:_FINALISTS], _TIMES)
 
     def level(self, candidates: Sequence[SimulatedRule]) -> list[SimulatedRule]:
-        """The allowed candidates that cannot be told apart from the best: within the standard error
-        of the difference over pairs of sessions, or the tolerance. If the log supports none, the
-        rule that the choice starts from, or the one with the most effective items."""
+        """The allowed candidates within the standard error of the difference from the best, over
+        pairs of sessions, or the tolerance. If the log supports none, the rule that the choice
+        starts from, or the one with the most effective items."""
         allowed = self._select_allowed(candidates)
         if not allowed:
             return self._find_start(candidates) or [max(candidates, key=attrgetter("items"))]
@@ -310,8 +304,8 @@ class RuleSearch:
 
     def most_evident(self, candidates: Sequence[SimulatedRule]) -> SimulatedRule:
         """Of level rules, the one that the choice starts from, or the one with the most support in
-        the log: effective users, or without propensities the likelihood; then the most hits, if
-        they differ by a percentage point; then the simplest. A handful of users is no evidence."""
+        the log: effective users, if more than a handful, else the likelihood; then the most hits,
+        in whole percents; then the simplest."""
         level = self.level(candidates)
         level = self._find_start(level) or level
         unknown = [candidate for candidate in level if candidate.evidence is None]
@@ -443,7 +437,8 @@ def _describe_choice(users: UserModel) -> str:
 def _search_all(search: RuleSearch) -> list[SimulatedRule]:
     """Rules of all kinds that the log can tell of, each beside the best of those before."""
     problem, config = search.problem, search.problem.config
-    candidates = search.simulate([*_list_unweighted(problem)])
+    drawn = (DecisionRule(None, temperature=t) for t in sorted(config.temperatures, reverse=True))
+    candidates = search.simulate([rule for of in drawn for rule in _vary_target(of, problem)])
     first = search.best(candidates).rule
     candidates += search.simulate(_vary(first, reward_weight=config.reward_weights))
     second = search.best(candidates).rule
@@ -492,20 +487,19 @@ def _warning(search: RuleSearch, best: SimulatedRule, estimate: ValueEstimate) -
             "to evaluate it"
         )
     if estimate.value + 2 * estimate.error < mean_return:
-        warnings.append(
-            f"this is less than logged sessions have, {mean_return:.4g}; do not launch it"
-        )
+        less = f"this is less than logged sessions have, {mean_return:.4g}"
+        warnings.append(f"{less}; do not launch it")
     return "".join(f"; WARNING: {warning}" for warning in warnings)
 
 
-def _list_unweighted(problem: Problem) -> Iterator[DecisionRule]:
-    config, targets, policy = problem.config, problem.targets, problem.scorer.policy
-    for temperature in sorted(config.temperatures, reverse=True):
-        for target in dict.fromkeys(targets[quantile] for quantile in config.quantiles):
-            yield DecisionRule(target, temperature=temperature)
-            yield DecisionRule(target, minimum_target=target, temperature=temperature)
-        if policy.values is not None and policy.config.max_return:
-            yield DecisionRule(None, temperature=temperature)
+def _vary_target(rule: DecisionRule, problem: Problem) -> Iterator[DecisionRule]:
+    """The rule with each target, with and without that minimum, and with the policy's own."""
+    policy = problem.scorer.policy
+    for target in dict.fromkeys(problem.targets.values()):
+        yield replace(rule, target=target, minimum_target=None)
+        yield replace(rule, target=target, minimum_target=target)
+    if policy.values is not None and policy.config.max_return:
+        yield replace(rule, target=None, minimum_target=None)
 
 
 def _vary(rule: DecisionRule, **values: Sequence[Any]) -> list[DecisionRule]:
@@ -525,16 +519,12 @@ def _lookaheads(problem: Problem) -> list[float]:
 def find_neighbours(
     rule: DecisionRule, problem: Problem, more: Sequence[Mapping[str, Sequence[float]]] = ()
 ) -> Iterator[DecisionRule]:
-    """The rule, rules with another target, and those with another of its numbers one candidate up
-    or down, among those of the configuration and `more`. A rule without lookahead also gets one,
-    with the middle weight of the policy; one with it loses it, with the middle reward weight."""
-    config, policy = problem.config, problem.scorer.policy
+    """The rule, those of `_vary_target`, and those with another of its numbers one candidate up or
+    down, of the configuration and `more`. A rule without lookahead also gets one, with the middle
+    weight of the policy; one with it loses it, with the middle reward weight."""
+    config = problem.config
     yield rule
-    for target in dict.fromkeys(problem.targets.values()):
-        yield replace(rule, target=target, minimum_target=None)
-        yield replace(rule, target=target, minimum_target=target)
-    if policy.values is not None and policy.config.max_return:
-        yield replace(rule, target=None, minimum_target=None)
+    yield from _vary_target(rule, problem)
     grid: dict[str, list[float]] = {
         "temperature": [*config.temperatures],
         "reward_weight": [*config.reward_weights],
@@ -545,10 +535,10 @@ def find_neighbours(
     if rule.looks_ahead:
         grid |= {"lookahead": _lookaheads(problem), "policy_weight": [*config.policy_weights]}
         grid["reward_weight"] = [*config.lookahead_weights]
-        weight = _middle(config.reward_weights)
+        weight = median_high(config.reward_weights)
         yield replace(rule, reward_weight=weight, lookahead=0.0, policy_weight=1.0)
     elif problem.users.session_end_report.kept != "constant":
-        middle = _middle(config.policy_weights)
+        middle = median_high(config.policy_weights)
         for ahead, weight in product(_lookaheads(problem), config.lookahead_weights):
             yield replace(rule, lookahead=ahead, reward_weight=weight, policy_weight=middle)
     if problem.validation.item_states.tags.shape[1]:
@@ -562,10 +552,6 @@ def find_neighbours(
         for neighbour in (*sorted(smaller)[-1:], *sorted(larger)[:1]):
             changed: dict[str, Any] = {name: neighbour}
             yield replace(rule, **changed)
-
-
-def _middle(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2]
 
 
 def _simplicity(candidate: SimulatedRule) -> tuple[float, ...]:

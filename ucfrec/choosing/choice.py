@@ -97,8 +97,7 @@ class Evidence:
     """Users of equal weight that say as much of the rule as the logged ones, weighted by its over
     the logged probabilities; of the half with fewer, twice the number; None without any."""
     spread: float = 0.0
-    """Variance of the logarithms of the sessions' weights that are not 0. It says more reliably
-    than the weights how heavy their tail is: few sessions may lack the heavy ones."""
+    """Variance of the logarithms of the sessions' weights that are not 0, i.e. their tail."""
     value: float | None = None
     """Off-policy estimate of the return of a session (SNIPS); None where nothing has weight."""
     error: float | None = None
@@ -141,8 +140,7 @@ class ValueEstimate:
     """Its standard error, over the sessions or between the halves, whichever is larger."""
     halves: tuple[float, float]
     optimism: tuple[float, float] | None
-    """By what share the user model expects too much on validation rows of users that it is not
-    calibrated on, and the standard error; None where validation users are new."""
+    """`UserCalibration.optimism`, and its standard error; None where validation users are new."""
     doubts: tuple[str, ...]
     """Why it cannot be trusted; empty if it can."""
 

@@ -1,8 +1,6 @@
 """Counterfactual copies of the training episodes: reward model, generator, gates (Algorithm 1).
-
-Rewards, actions, next states and returns-to-go of an edited copy are those of its source (paper
-appendix H); an action copy ends with another action and its counterfactual reward.
-"""
+All of an edited copy but its states is its source's (paper appendix H); an action copy ends with
+another action and its counterfactual reward."""
 
 import copy
 import math
@@ -35,7 +33,6 @@ from ucfrec.counterfactual.reward_model import (
     fit_warning,
     read_transitions,
     sample_steps,
-    sample_transitions,
 )
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AugmentedEpisodes, Transitions
@@ -49,8 +46,7 @@ from ucfrec.user_model.reward_fit import fit_item_reward_model
 CRM: Final = "crm"
 """Folder of the reward model."""
 MODELS: Final = ("item-reward", CRM, "csg")
-"""Folders of the checkpoints of `augment_episodes`; which of them there are depends on the
-settings."""
+"""Folders of the checkpoints of `augment_episodes`, as far as the settings need them."""
 _CPU: Final = torch.device("cpu")
 _CHUNK, _ACTION_CHUNK = 8192, 4096
 _ACTION_STREAM = 1
@@ -189,7 +185,8 @@ def augment_episodes(
         mean = EffectsMean(item_rewards)
     sampled_episodes, sampled_steps = sample_steps(train, limit, seed)
     training = read_transitions(train, sampled_episodes, sampled_steps, item_rewards)
-    held_out = sample_transitions(validation, limit // 10, seed, item_rewards)
+    held_out_steps = sample_steps(validation, limit // 10, seed)
+    held_out = read_transitions(validation, *held_out_steps, item_rewards)
     crm, crm_report = fit_crm(training, held_out, crm_config, folder / CRM, seed, mean, device)
     if not config.copies:
         # Nothing proposes states, so no generator is trained.
@@ -264,13 +261,12 @@ def edit_states(
             factual = read_transitions(view, episodes[rows], steps[rows], item_rewards)
             factual = factual.to(crm.device)
             s, a, r = factual.states, factual.actions, factual.rewards
-            proposed = generator.propose(s, a, crm.abduct(s, a, r), random)
+            proposed = generator.propose(factual, crm.abduct(s, a, r), random)
             s, a, r = s.double(), a.double(), r.double()
             factual, z = replace(factual, states=s, actions=a, rewards=r), exact.abduct(s, a, r)
-            passed = accept(
-                exact, factual, z, proposed.double(), epsilon_r * _LESS, rho_high * _LESS
-            )
-            moves.add(exact.moves(s[passed], proposed[passed].double()).cpu())
+            proposals = proposed.double()
+            passed = accept(exact, factual, z, proposals, epsilon_r * _LESS, rho_high * _LESS)
+            moves.add(exact.moves(s[passed], proposals[passed]).cpu())
             accepted[rows] = passed.cpu().numpy()
             states.append(proposed[passed].cpu().numpy())
         moves.proposals += len(steps)
@@ -305,13 +301,9 @@ def accept(
     epsilon_r: float,
     rho_high: float,
 ) -> Tensor:
-    """Which proposals (M, S) pass both gates of Eq. 4 (Algorithm 4), (M,) bool.
-
-    Args:
-        factual: M logged steps, from which z (M, latent_dim) is abduced.
-        epsilon_r: largest allowed |f̂_r(s_c, a, z) − r|, in reward units.
-        rho_high: largest allowed ‖(s_c − s) / σ_s‖₂; dimensions with σ_s = 0 must not change.
-    """
+    """Which proposals (M, S) for M logged steps with abduced z (M, latent_dim) pass both gates of
+    Eq. 4 (Algorithm 4), (M,) bool: |f̂_r(s_c, a, z) − r| ≤ ε_r, in reward units, and
+    ‖(s_c − s) / σ_s‖₂ ≤ ρ_high; dimensions with σ_s = 0 must not change."""
     change = (crm.predict(proposals, factual.actions, z) - factual.rewards).abs()
     length = crm.moves(factual.states, proposals).norm(dim=1)
     passed: Tensor = (change <= epsilon_r) & (length <= rho_high)
@@ -325,11 +317,8 @@ def _fill_copies(
     config: AugmentConfig,
     rng: np.random.Generator,
 ) -> Iterator[_Edits]:
-    """Propose at each episode's steps in random order until its copies are full (Algorithm 5).
-
-    In each round every episode proposes as many edits as its copies still need, so no edit is
-    proposed that the algorithm, which proceeds one step at a time, would not propose.
-    """
+    """Propose at each episode's steps in random order until its copies are full (Algorithm 5): in
+    each round as many edits as they still need, which the algorithm would propose one by one."""
     order = np.lexsort((rng.random(len(steps)), episodes))
     unique_episodes, counts = np.unique(episodes, return_counts=True)
     first = np.cumsum(counts) - counts
@@ -365,8 +354,7 @@ class MoveStatistics:
         self._lengths.append(moves.norm(dim=1))
 
     def report(self, rho_high: float, dimensions: int) -> MoveReport:
-        """Summarise the moves added so far; if none has a length, ratio is NaN and rank 0. The
-        histogram of lengths ends at `rho_high`."""
+        """Summarise the moves; without any, ratio is NaN and rank 0. Lengths end at ρ_high."""
         lengths = torch.cat(self._lengths).numpy()
         counts, edges = np.histogram(lengths, bins=_BINS, range=(0.0, rho_high))
         levels = _QUANTILES if len(lengths) else ()
@@ -455,13 +443,11 @@ def interventions(view: EpisodeStore, dimensions: Sequence[int], seed: int) -> A
 
 @dataclass(frozen=True)
 class ActionGenerator:
-    """Proposes other actions at logged steps, with their counterfactual rewards.
+    """Proposes other actions at logged steps (s, a, r), with their counterfactual rewards.
 
-    For a logged step (s, a, r), the disturbance z is abduced and kept; another action a' is the
-    action of a random training step whose state lies in the same cluster as s; and its reward is
-    r' = f̂_r(s, a', z), within the range of the logged rewards. The model must reproduce the logged
-    reward, |f̂_r(s, a, z) − r| ≤ ε_r, and r' must differ from r by more than δ, the model's error on
-    held-out steps.
+    The disturbance z is abduced and kept; another action a' is that of a random training step whose
+    state lies in the same cluster as s; its reward r' = f̂_r(s, a', z), within the range of the log,
+    must differ from r by more than δ, and |f̂_r(s, a, z) − r| ≤ ε_r must hold.
     """
 
     view: EpisodeStore
@@ -476,10 +462,8 @@ class ActionGenerator:
     def propose(
         self, episodes: IntArray, steps: IntArray, count: int, seed: int
     ) -> tuple[AugmentedEpisodes, ActionReport]:
-        """Propose `count` other actions at each of M steps of episodes (M,), and copy what passes.
-
-        Actions are drawn with replacement; a draw of the logged action itself is not a proposal.
-        """
+        """Draw `count` other actions, with replacement, at each of M steps of episodes (M,), and
+        copy what passes; a draw of the logged action itself is not a proposal."""
         # In float64, so that a later check confirms what passes.
         view, exact = self.view, copy.deepcopy(self.crm).double()
         rng = np.random.default_rng([seed, _ACTION_STREAM])

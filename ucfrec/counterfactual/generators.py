@@ -119,28 +119,20 @@ class ActionSupport:
 class Generator(Protocol):
     """Proposes counterfactual states, which the acceptance gate then accepts or rejects."""
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """(ρ_low, ρ_high), see `CSGConfig`."""
+    band: tuple[float, float]
+    """(ρ_low, ρ_high), see `CSGConfig`."""
 
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        """A state s_c (M, S) for each step, such that f̂_r(s_c, a, z) is close to f̂_r(s, a, z).
-
-        Args:
-            states: (M, S) states s, with actions (M, A) and abduced disturbances (M, latent_dim).
-            generator: source of all random numbers, on the CPU.
-        """
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
+        """A state s_c (M, S) for each of M steps with abduced disturbances (M, latent_dim), such
+        that f̂_r(s_c, a, z) is close to f̂_r(s, a, z). Draws by a `generator` on the CPU."""
 
 
 class TangentGenerator:
-    """Random moves along the level set of the predicted reward.
+    """Random moves along the level set of the predicted reward, which are not in the paper.
 
     A move Δ is drawn from a Gaussian with the covariance Σ of the training states in the cluster
     nearest to s, conditioned on an unchanged reward to first order: ∇f̂_r · Δ = 0. It is scaled to a
-    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r. Not in
-    the paper, whose generator is `CounterfactualStateGenerator`.
+    length drawn from the band, and returned to the level set by Newton steps along Σ∇f̂_r.
     """
 
     def __init__(self, crm: CausalRewardModel, clusters: StateClusters, config: CSGConfig) -> None:
@@ -151,52 +143,34 @@ class TangentGenerator:
         self._roots = (vectors * values.clamp(min=0).sqrt().unsqueeze(-2)).to(crm.device)
 
     @torch.no_grad()
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
         """See `Generator.propose`."""
-        near = self._clusters.nearest(self._crm.normalise_states(states))
+        crm, states = self._crm, at.states
+        near = self._clusters.nearest(crm.normalise_states(states))
         noise = torch.randn(states.shape, generator=generator).to(states.device)
         length = _lengths(self.band, states, generator)
         # In order of clusters, so that no step needs a copy of its cluster's matrix.
         order = near.argsort(stable=True)
         rows = torch.bincount(near, minlength=len(self._clusters.centres)).tolist()
-        moves = self._moves(
-            rows, states[order], actions[order], z[order], noise[order], length[order]
-        )
-        return states + self._crm.state_std * torch.empty_like(moves).index_copy_(0, order, moves)
+        s, a, z, length = states[order], at.actions[order], z[order], length[order]
 
-    def _moves(
-        self,
-        rows: list[int],
-        states: Tensor,
-        actions: Tensor,
-        z: Tensor,
-        noise: Tensor,
-        length: Tensor,
-    ) -> Tensor:
-        """Moves Δ (M, S) of steps in order of their clusters, which have so many `rows` each."""
-        reward, gradient = self._reward(states, actions, z, torch.zeros_like(states))
-        steepest = _products(self._clusters.covariances, gradient, rows)
-        move = _products(self._roots, noise, rows)
+        def predict(move: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """f̂_r(s + σ_s Δ, a, z) (M,), its gradient in Δ (M, S), and Σ times the gradient."""
+            with torch.enable_grad():
+                move = move.detach().requires_grad_()
+                reward = crm.predict(s + crm.state_std * move, a, z)
+                (gradient,) = torch.autograd.grad(reward.sum(), move)
+            return reward.detach(), gradient, _products(self._clusters.covariances, gradient, rows)
+
+        reward, gradient, steepest = predict(torch.zeros_like(s))
+        move = _products(self._roots, noise[order], rows)
         move = move - steepest * _ratio((gradient * move).sum(1), gradient, steepest)
         move = _scale(move, length, math.inf)
         for _ in range(self._config.corrections):
-            current, gradient = self._reward(states, actions, z, move)
-            steepest = _products(self._clusters.covariances, gradient, rows)
+            current, gradient, steepest = predict(move)
             step = steepest * _ratio(current - reward, gradient, steepest)
             move = _scale(move - _scale(step, length), length)
-        return move
-
-    def _reward(
-        self, states: Tensor, actions: Tensor, z: Tensor, move: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """f̂_r(s + σ_s Δ, a, z) (M,) and its gradient with respect to Δ (M, S)."""
-        with torch.enable_grad():
-            move = move.detach().requires_grad_()
-            reward = self._crm.predict(states + self._crm.state_std * move, actions, z)
-            (gradient,) = torch.autograd.grad(reward.sum(), move)
-        return reward.detach(), gradient
+        return states + crm.state_std * torch.empty_like(move).index_copy_(0, order, move)
 
 
 class CounterfactualStateGenerator(nn.Module):
@@ -217,11 +191,9 @@ class CounterfactualStateGenerator(nn.Module):
         return move * (crm.state_std > 0)
 
     @torch.no_grad()
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
         """See `Generator.propose`; deterministic."""
-        return states + self._crm[0].state_std * self.move(states, actions, z)
+        return at.states + self._crm[0].state_std * self.move(at.states, at.actions, z)
 
 
 class NoiseGenerator:
@@ -230,14 +202,12 @@ class NoiseGenerator:
     def __init__(self, crm: CausalRewardModel, config: CSGConfig) -> None:
         self._std, self.band = crm.state_std, config.band
 
-    def propose(
-        self, states: Tensor, actions: Tensor, z: Tensor, generator: torch.Generator
-    ) -> Tensor:
+    def propose(self, at: Transitions, z: Tensor, generator: torch.Generator) -> Tensor:
         """See `Generator.propose`."""
-        noise = torch.randn(states.shape, generator=generator).to(states.device)
+        noise = torch.randn(at.states.shape, generator=generator).to(at.states.device)
         noise = noise * (self._std > 0)
-        length = _lengths(self.band, states, generator)
-        return states + self._std * _scale(noise, length, math.inf)
+        length = _lengths(self.band, at.states, generator)
+        return at.states + self._std * _scale(noise, length, math.inf)
 
 
 def state_clusters(
@@ -260,8 +230,7 @@ def make_generator(
     """Make the generator of kind `config.kind`, fitted to the steps of `train` with high rewards.
 
     Args:
-        train: M transitions, on the CPU; the generator shares the device of the reward model, whose
-            parameters are frozen if the kind is `faithful`.
+        crm: gives the device; its parameters are frozen if the kind is `faithful`.
         folder: of the checkpoints of `faithful`, which resumes from them.
         clusters: the `state_clusters` of the same arguments, if they are known.
     """

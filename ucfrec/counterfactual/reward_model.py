@@ -108,13 +108,15 @@ class Posterior(NamedTuple):
     mean: Tensor
     log_variance: Tensor
 
+    @property
+    def kl(self) -> Tensor:
+        """KL(q ‖ N(0, I)) of each dimension, (..., latent_dim) in nats."""
+        return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance)
+
 
 class EffectsMean(nn.Module):
-    """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states.
-
-    Actions are those of `read_transitions`: the item's vector, then the part of the linear
-    predictor that does not depend on the state.
-    """
+    """E[r | s, a] of an `ItemRewardModel`, as a differentiable function of states and of actions of
+    `read_transitions`: the item's vector, then the part of the predictor that no state changes."""
 
     def __init__(self, model: ItemRewardModel) -> None:
         super().__init__()
@@ -148,17 +150,10 @@ class CausalRewardModel(nn.Module):
     expected: nn.Sequential | EffectsMean
 
     def __init__(
-        self,
-        state_size: int,
-        action_size: int,
-        config: CRMConfig,
-        mean: EffectsMean | None = None,
+        self, state_size: int, action_size: int, config: CRMConfig, mean: EffectsMean | None = None
     ) -> None:
-        """Args:
-        action_size: A, the size of an action vector or of an item's embedding; with `mean`, of
-            the actions that it reads.
-        mean: E[r | s, a]; None for a network that is yet to be trained.
-        """
+        """`mean` is E[r | s, a], whose actions have the size A = `action_size`; None for a network
+        that is yet to be trained."""
         super().__init__()
         self.config = config
         input_size = state_size + action_size
@@ -178,18 +173,16 @@ class CausalRewardModel(nn.Module):
         """Where the model is, and what it is given has to be."""
         return self.state_mean.device
 
-    def encode(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Posterior:
-        """The posterior q_ϕ(z | s, a, r)."""
-        return self._encode(self.given(states, actions), self.residual(states, actions, rewards))
-
-    def _encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
+    def encode(self, inputs: Tensor, residual: Tensor) -> Posterior:
+        """The posterior q_ϕ(z | s, a, r), of what `given` and `residual` return."""
         surprise = (residual / self.surprise_std).unsqueeze(-1)
         mean, log_variance = self.encoder(torch.cat([inputs, surprise], dim=-1)).chunk(2, dim=-1)
         return Posterior(mean, log_variance.clamp(-12.0, 6.0))
 
     def abduct(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """z = μ_ϕ(s, a, r), the posterior mean (..., latent_dim) of Algorithms 3 to 5."""
-        return self.encode(states, actions, rewards).mean
+        residual = self.residual(states, actions, rewards)
+        return self.encode(self.given(states, actions), residual).mean
 
     def predict(self, states: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         """f̂_r(s, a, z), the predicted rewards (...) in reward units."""
@@ -200,12 +193,12 @@ class CausalRewardModel(nn.Module):
     def elbo(self, inputs: Tensor, residual: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Log likelihood and KL of Eq. 2, each (...) in nats, at z = μ + σ·noise, with standard
         normal noise (..., latent_dim). Inputs are what `given`, residuals what `residual` gives."""
-        q = self._encode(inputs, residual)
+        q = self.encode(inputs, residual)
         z = q.mean + (0.5 * q.log_variance).exp() * noise
         error = self._disturbance(inputs, z) - residual
         scale = self.config.decoder_std
         log_likelihood = -0.5 * ((error / scale).square() + _LOG_2PI) - math.log(scale)
-        return log_likelihood, kl_to_prior(q).sum(-1)
+        return log_likelihood, q.kl.sum(-1)
 
     def residual(self, states: Tensor, actions: Tensor, rewards: Tensor) -> Tensor:
         """The residual r − E[r | s, a], in standard deviations of the reward, (...)."""
@@ -248,11 +241,6 @@ class CausalRewardModel(nn.Module):
         return _normalise(rewards, self.reward_mean, self.reward_std)
 
 
-def kl_to_prior(q: Posterior) -> Tensor:
-    """KL(q ‖ N(0, I)) of each dimension, (..., latent_dim) in nats."""
-    return 0.5 * (q.mean.square() + q.log_variance.exp() - 1 - q.log_variance)
-
-
 def mlp(inputs: int, hidden: int, layers: int, outputs: int) -> nn.Sequential:
     """A network of `layers` hidden layers of width `hidden` with ReLU, and a linear output."""
     blocks: list[nn.Module] = []
@@ -273,12 +261,9 @@ def read_transitions(
     item_rewards: ItemRewardModel | None = None,
     actions: Array | None = None,
 ) -> Transitions:
-    """Single steps of a view with the actions (M, A) that the reward model is fitted to.
-
-    Args:
-        item_rewards: what `EffectsMean` is made of, which then reads the actions (M, D + 1).
-        actions: (M,) items or (M, A) vectors instead of the logged actions; None for these.
-    """
+    """Single steps of a view with the actions (M, A) that the reward model is fitted to; with
+    `item_rewards`, those that `EffectsMean` reads (M, D + 1). Given `actions`, (M,) items or (M, A)
+    vectors, replace the logged ones."""
     transitions = view.transitions(episodes, steps)
     if item_rewards is None:
         if actions is None:
@@ -331,8 +316,7 @@ def fit_crm(
     the lowest validation loss, in evaluation mode, and its quality.
 
     Args:
-        folder: of the checkpoints, which training resumes from; with the file `INITIAL` in it, of
-            weights and scales that training begins with.
+        folder: of the checkpoints, which training resumes from, and perhaps of `INITIAL`.
         mean: E[r | s, a], if it was fitted before; transitions then have the actions that it reads.
         device: where the model is fitted, and stays. What is drawn is the same on all.
     """
@@ -347,12 +331,23 @@ def fit_crm(
         load_weights(folder / INITIAL, model, load_trained(folder / INITIAL))
     if config.mean_first and mean is None:
         _fit_mean(model, train, held_out, folder / "mean", seed)
-    inputs = _read_inputs(model, train)
+    rows, (inputs, residual) = (_read_inputs(model, steps) for steps in (train, held_out))
     if config.mean_first:
         model.expected.requires_grad_(False)
-        variance = float(inputs[1].double().square().mean())
+        variance = float(rows[1].double().square().mean())
         model.surprise_std.fill_(max(variance, 1e-8) ** 0.5)
-    _fit_elbo(model, inputs, _read_inputs(model, held_out), folder / "cvae", seed)
+
+    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
+        inputs, residual, noise = batch
+        log_likelihood, kl = (term.mean() for term in model.elbo(inputs, residual, noise))
+        parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
+        return config.beta * kl - log_likelihood, parts
+
+    noise = _draw_noise(np.random.default_rng(seed), residual, config.latent_dim)
+    loop = _loop(config, len(train.rewards))
+    _fit(
+        model, loss, rows, (inputs, residual, noise), loop, folder / "cvae", seed, config.latent_dim
+    )
     return model, _report(model, len(train.rewards), held_out)
 
 
@@ -393,22 +388,6 @@ def _read_inputs(model: CausalRewardModel, transitions: Transitions) -> _Rows:
     parts = [slice(start, start + _CHUNK) for start in range(0, len(r), _CHUNK)]
     inputs = torch.cat([model.given(s[part], a[part]) for part in parts])
     return inputs, torch.cat([model.residual(s[part], a[part], r[part]) for part in parts])
-
-
-def _fit_elbo(
-    model: CausalRewardModel, rows: _Rows, held_out: _Rows, folder: Path, seed: int
-) -> None:
-    config = model.config
-
-    def loss(batch: _Rows) -> tuple[Tensor, Mapping[str, Tensor]]:
-        inputs, residuals, noise = batch
-        log_likelihood, kl = (term.mean() for term in model.elbo(inputs, residuals, noise))
-        parts = {"log_likelihood": log_likelihood.detach(), "kl": kl.detach()}
-        return config.beta * kl - log_likelihood, parts
-
-    fixed = _draw_noise(np.random.default_rng(seed), held_out[1], config.latent_dim)
-    loop = _loop(config, len(rows[1]))
-    _fit(model, loss, rows, (*held_out, fixed), loop, folder, seed, config.latent_dim)
 
 
 def _fit(
@@ -466,14 +445,14 @@ def _draw_noise(generator: np.random.Generator, target: Tensor, size: int) -> Te
 @torch.no_grad()
 def _report(model: CausalRewardModel, n_train: int, held_out: Transitions) -> CRMReport:
     s, a, r = held_out.states, held_out.actions, held_out.rewards
-    q = model.encode(s, a, r)
+    q = model.encode(model.given(s, a), model.residual(s, a, r))
     with_z = model.predict(s, a, q.mean)
     without_z = model.predict(s, a, torch.zeros_like(q.mean))
     # Rows are in random order, so the z of the next row is a draw from the marginal distribution,
     # as Jansen's estimator of the total effect needs.
     other_z = model.predict(s, a, q.mean.roll(1, dims=0))
     variance = float(r.var(correction=0)) or math.nan
-    kl = kl_to_prior(q).mean(dim=0)
+    kl = q.kl.mean(dim=0)
     active = kl > _ACTIVE_NATS
     columns = torch.cat([without_z.unsqueeze(1), q.mean[:, active]], dim=1)
     leak = torch.corrcoef(columns.T).nan_to_num().abs().reshape(columns.shape[1], -1)[0, 1:]
@@ -541,11 +520,3 @@ def sample_steps(view: EpisodeStore, limit: int, seed: int) -> tuple[IntArray, I
     """(episodes, steps) of a view: all, or `limit` drawn with replacement if there are more."""
     few = view.n_steps <= limit
     return view.all_steps() if few else view.draw_steps(np.random.default_rng(seed), limit)
-
-
-def sample_transitions(
-    view: EpisodeStore, limit: int, seed: int, item_rewards: ItemRewardModel | None = None
-) -> Transitions:
-    """The transitions of `sample_steps`, as `read_transitions` reads them."""
-    episodes, steps = sample_steps(view, limit, seed)
-    return read_transitions(view, episodes, steps, item_rewards)

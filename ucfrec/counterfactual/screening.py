@@ -1,8 +1,7 @@
 """Which observation columns measure the reward, although they are logged with the state.
 
-A dimension d_t that records the reward (r_t, or r_{t+1}) is a leak: where it is fixed, nothing
-changes. It predicts the reward as a cause would, but depends on nothing else: what the rest
-explains of it, the action above all, it explains through the reward. So
+A dimension d_t that records the reward (r_t, or r_{t+1}) predicts it as a cause would, but what the
+rest explains of it, the action above all, it explains through the reward. So
 
 1. the rest (other dimensions, action, next action) helps to predict d_t;
 2. the reward alone predicts d_t at least as well;
@@ -10,10 +9,9 @@ explains of it, the action above all, it explains through the reward. So
 
 A cause fails one of these. If the logging policy did not see it, the action explains none of it
 (1); if the policy did, the action explains it with or without the reward (3). A dimension of a
-process that goes on, such as a position or a user's feature, is explained by other dimensions (3).
+process that goes on, such as a position, is explained by other dimensions (3).
 
-Features of items and users are not screened: a policy reads them from its run's own tables, so
-that they have the same values in the logs and wherever it acts.
+Features of items and users have the same values wherever a policy acts, so they are not screened.
 """
 
 from collections.abc import Collection, Sequence
@@ -107,9 +105,6 @@ class ScreeningReport:
 def screen(train: EpisodeStore, seed: int) -> ScreeningReport:
     """Test every logged observation dimension of a log of items: one that measures the reward
     counts as without effect.
-
-    Args:
-        train: a view of the training episodes.
 
     Raises:
         InputError: no observations are logged, there are too few episodes to hold some out, or

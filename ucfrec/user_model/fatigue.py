@@ -119,9 +119,8 @@ class LoggedRuns:
 def fit_fatigue(training: LoggedRuns, held_out: LoggedRuns) -> Fatigue | None:
     """The fatigue that training rows show most clearly; None if there is none.
 
-    The factor is the share of likes at which the log's policies arrived with fatigued users,
-    relative to the share in the rest of the same sessions: of policies that knew of the fatigue,
-    too little. Likes must at least halve, in held-out rows too.
+    The factor is the share of likes with fatigued users relative to that in the rest of the same
+    sessions: of policies that knew of the fatigue, too little. It is at most a half, held out too.
     """
     best, clearest, remembered = None, 0.0, training.runs.shape[1]
     for length in range(2, min(LONGEST, remembered) + 1):

@@ -32,8 +32,7 @@ _MOST_STEPS: Final = 100_000
 _GROUPS: Final = 32
 """Most rewards to draw from."""
 _BEYOND: Final = 3, 100
-"""Simulated sessions may have so many times the steps of the longest logged one, but then no more
-than so many, …"""
+"""Simulated sessions may have so many times the longest logged one's steps, up to so many, …"""
 _CHANCE: Final = 0.001
 """… unless chance ends all sessions that get there with a lower probability than this."""
 
@@ -68,11 +67,8 @@ class UserModel:
         simulated: bool = True,
         first: Path | None = None,
     ) -> "UserModel":
-        """Fit the parts that are not in `folder` yet; read the others.
-
-        Args:
-            simulated: whether sessions are simulated.
-            first: folder of the user model of an earlier state of the store, where searches begin.
+        """Fit the parts that are not in `folder` yet; read the others. Searches begin near the user
+        model of an earlier state of the store, in the folder `first`.
 
         Raises:
             InputError: training rewards are equal, no steps are held out, or a file is damaged.
@@ -86,9 +82,9 @@ class UserModel:
         if not path.exists():
             fatigue = calibration = None
             if reward.binary:
-                views = train, validation
-                runs = [LoggedRuns.of(view, tags, reward.lags, _MOST_STEPS) for view in views]
-                fatigue = fit_fatigue(runs[0], runs[1])
+                first_runs = LoggedRuns.of(train, tags, reward.lags, _MOST_STEPS)
+                later_runs = LoggedRuns.of(validation, tags, reward.lags, _MOST_STEPS)
+                fatigue = fit_fatigue(first_runs, later_runs)
             logged, held_out = (
                 LoggedEnds.of(view, reward.likeness, reward.lags, _MOST_STEPS, seed)
                 for view in whole_sessions(train, validation)
@@ -131,8 +127,7 @@ class UserModel:
     def expect(
         self, states: Tensor, history: Shown, users: Tensor | None, items: Tensor
     ) -> Float64Array:
-        """Expected rewards (M,) of one item (M,) each, in reward units, in states (M, S) of users
-        (M,), rows of the training store."""
+        """Expected rewards (M,) of one item (M,) each, in states (M, S) of training users (M,)."""
         slope, intercept = self.calibration
         scores = self.rewarding.score(states, history, users, items)
         rewards = self.rewarding.expect(slope * scores + intercept).double().numpy()
@@ -145,8 +140,7 @@ class UserModel:
 
 class LoggedRewards:
     """Rewards to draw: those of a log, weighted by exp(slope · reward) so that their mean is the
-    expected reward. Paying the mean itself would be wrong where what follows, as the end of the
-    session, is not linear in the reward."""
+    expected reward, as what follows, such as the session's end, is not linear in the reward."""
 
     def __init__(self, store: EpisodeStore) -> None:
         batches = store.column_batches(schema.REWARD)
@@ -197,12 +191,8 @@ class UserSimulator:
         seed: int,
         times: int = 1,
     ) -> None:
-        """
-        Args:
-            store: view of the sessions that are begun; session i is the i-th modulo their number.
-            longest: steps after which a session ends in any case.
-            times: N / `sessions`; session i draws what session i modulo `sessions` draws.
-        """
+        """Begins session i as the i-th of `store`, modulo their number, to end after `longest`
+        steps; of N = `sessions` · `times`, it draws what session i modulo `sessions` draws."""
         self._model, self._store, self._longest = model, store, longest
         self._different, self._rng = sessions, np.random.default_rng(seed)
         self._logged, self._lags = LoggedRewards(store), model.rewarding.lags

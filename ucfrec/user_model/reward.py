@@ -27,11 +27,10 @@ CLIP: Final = 5.0
 class UserPosterior(nn.Module):
     """Tastes of the users of B sessions, from what was shown to them, and its rewards.
 
-    Tastes are a level and an affinity, v = (level, affinity), and add v · (1, e_i) to the score of
-    an item with the vector e_i. Before a session they are drawn from N(0, C), where C is how
-    training users differ. What a step showed is its reward less what the item usually gets, v · (1,
-    e_i) plus noise. Tastes are their posterior mean, a ridge regression within the session
-    (Rasmussen and Williams, 2006, Gaussian Processes for Machine Learning, section 2.1).
+    Tastes v = (level, affinity) add v · (1, e_i) to the score of an item with the vector e_i, and
+    are drawn from N(0, C), where C is how training users differ. A step shows v · (1, e_i) plus
+    noise: its reward less what the item usually gets. Tastes are their posterior mean, a ridge
+    regression within the session (Rasmussen and Williams, 2006, Gaussian Processes, section 2.1).
     """
 
     def __init__(self, items: int, embedding_size: int) -> None:
@@ -121,18 +120,12 @@ class ItemRewardModel(nn.Module):
     repeating an item, or showing one like it, n steps after the last time adds (`Likeness`). For
     new users, user_u and affinity_u are what the session shows of them (`UserPosterior`).
     Item effects include those of tags and embeddings, which items without training rows have too.
-    For rewards of two values the model is logistic: η is the log-odds of the higher one. Otherwise
-    η is the standardised reward.
-
-    `ucfrec.user_model.reward_fit` fits the model; effects that it excludes are 0.
+    η is the log-odds of the higher of two rewards, otherwise the standardised reward.
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
-        """Args:
-        sizes: `state` S; `action` D, the size of an item's embedding; `items`; `users` (0 or
-            missing: no effects of users); and `tags`, most tags of one item (0 or missing: items
-            are alike by their embeddings).
-        """
+        """Of `state` size S, `action` size D, that of an item's embedding, and numbers of `items`,
+        of `users` whose effects it has, and of `tags` that one item has at most."""
         super().__init__()
         state, dim, items = sizes["state"], sizes["action"], sizes["items"]
         users = sizes.get("users", 0) + 1  # the last row is that of unknown users
@@ -180,8 +173,7 @@ class ItemRewardModel(nn.Module):
         """Linear predictors (B,) of one item each, int64 (B,); see `scores`."""
         x = self.standardise(states)
         added = ((x @ self.interaction) * self.vectors[items]).sum(1)
-        scores: Tensor = self.score_without_state(history, users, items) + x @ self.state + added
-        return scores
+        return self.score_without_state(history, users, items) + x @ self.state + added
 
     def score_without_state(self, history: Shown, users: Tensor | None, items: Tensor) -> Tensor:
         """The part of `score` that does not depend on the state, (B,)."""
@@ -191,8 +183,7 @@ class ItemRewardModel(nn.Module):
         exposure = exposure + ((earlier == column) * repeated).sum(1)
         tastes = self.tastes_after(history)
         affinity = ((self.affinity[user_rows] + tastes[:, 1:]) * self.vectors[items]).sum(1)
-        part: Tensor = self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
-        return part
+        return self.item[items] + self.user[user_rows] + tastes[:, 0] + affinity + exposure
 
     def level(self, states: Tensor, users: Tensor | None, tastes: Tensor) -> Tensor:
         """The part (B,) of the scores that all items share, in states (B, S) of users (B,) with
@@ -212,8 +203,8 @@ class ItemRewardModel(nn.Module):
             size = history.items.shape[0], self.vectors.shape[1] + 1
             return torch.zeros(size, device=self.item.device)
         items, rewards = history.latest(MEMORY)
-        tastes: Tensor = self.tastes(items, self.vectors, self.target(rewards))
-        return tastes
+        part: Tensor = self.tastes(items, self.vectors, self.target(rewards))
+        return part
 
     def expect(self, scores: Tensor) -> Tensor:
         """Expected rewards, in reward units, of linear predictors of any shape."""

@@ -16,7 +16,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors, save_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history, root_of_tastes
-from ucfrec.user_model.reward_report import EffectTried, RewardRows
+from ucfrec.user_model.reward_report import EffectTried, RewardRows, mean_gain
 
 EFFECTS: Final = (
     *("item", "user", "content", "affinity", "tastes", "exposure"),
@@ -63,8 +63,8 @@ class Design:
     x: Tensor
     """(M, S) standardised states."""
     exposure: Tensor
-    """(M, 4 · lags): whether the item is the one shown n steps before, then their likeness; then
-    both again, times the earlier item's reward on a scale from 0 to 1."""
+    """(M, 4 · lags): whether the item is that of n steps before, then their likeness; then both
+    again, times the earlier reward from 0 to 1."""
     target: Tensor
     """(M,): 1 for the higher of two rewards and 0 for the lower, or standardised rewards."""
     observed: Tensor
@@ -218,12 +218,8 @@ class Design:
 def fit_effects(
     design: Design, start: Effects, spreads: Mapping[str, float], fixed: Effects | None = None
 ) -> Effects:
-    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`.
-
-    Args:
-        start: effects to start from; missing ones start at 0.
-        fixed: effects that are part of the predictor, and of the result, as they are.
-    """
+    """Minimise the summed loss of `design` plus penalties on the effects of given `spreads`, from
+    `start`, or 0; `fixed` effects are part of the predictor, and of the result, as they are."""
     constant, curvature = fixed or {}, 0.25 if design.binary else 1.0
     penalty = {name: design.penalty(name, spreads[name]) for name in spreads}
     first, inverses = Effects(), dict[str, _Map]()
@@ -248,8 +244,8 @@ def fit_effects(
 
 
 def minimum(objective: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
-    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`; its second
-    derivative should be about 1 in all directions: that is the first step's length."""
+    """The numbers (P,) at which a convex function is lowest, by L-BFGS from `start`; the first step
+    has the right length if the second derivative is about 1 in all directions."""
 
     def evaluate(at: Tensor) -> tuple[float, Tensor]:
         at = at.detach().requires_grad_(True)
@@ -361,8 +357,7 @@ class EffectSearch:
     """The effects found so far, one after the other, and their loss on held-out rows."""
 
     sessions: tuple[ItemRewardModel, Shown, Shown] | None = None
-    """Where users are new: the model, whose `tastes` are set, and what sessions showed before
-    training and held-out rows."""
+    """For new users: the model, whose `tastes` are set, and what training and held-out rows saw."""
 
     def __init__(self, design: Design, held_out: Design | None, begin: Beginning) -> None:
         """Held-out rows choose; None for a fifth of the training rows."""
@@ -418,9 +413,7 @@ class EffectSearch:
             spreads = self._begin.spreads
             near, strides = spreads.get(name, _FIRST), (1,) if name in spreads else ()
         number, effects, losses = self._find_best(name, near, strides)
-        decrease = self.losses - losses
-        gain = float(decrease.mean())
-        error = float(decrease.std(correction=0)) / len(decrease) ** 0.5
+        gain, error = mean_gain(self.losses, losses)
         self._tried.append(EffectTried(name, _SPREADS[number], gain, error, gain > error))
         if name == "item":
             self.item_loss = float(losses.mean())

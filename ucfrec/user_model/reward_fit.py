@@ -1,10 +1,9 @@
 """Fitting reward models of items, effect by effect: for whoever acts, and of training users.
 
 Decision rules are tried in sessions of training users, who have fixed tastes that nothing that acts
-knows: a model that learns tastes from the session would pay a policy for its own guesses. Policies
-that knew more of their users than the log shows make what they showed look better than it is. Where
-the log has all propensities, and users are new, rows are therefore weighted; known users are
-calibrated on weighted validation rows instead (`UserCalibration`), as weights would cost them data.
+knows: a model that learns tastes from the session would pay a policy for its own guesses. Where the
+log has all propensities, rows of new users are weighted, as policies that knew more than the log
+shows make what they showed look better; known users are calibrated on weighted rows instead.
 """
 
 from dataclasses import dataclass
@@ -98,11 +97,9 @@ def fit_item_reward_model(
     Where hardly any validation row is of a user with training rows, the model is for new users. A
     fifth of the training rows then chooses for the effects in `LASTING`: with unknown users,
     effects of items that contain those of the users who saw them predict best. The effects of users
-    are dropped once those of items are known, but for how much users differ, which is what
-    `UserPosterior` start from, and the other effects are fitted without them.
+    are dropped once those of items are known, but for how much users differ (`UserPosterior`).
 
     Args:
-        train: view of a store of items; `validation` is another one.
         seed: of the rows drawn from a view with too many.
         first: folder of the model of an earlier state of the store, near whose spreads the search
             begins and ends; where users are known, on fewer rows.
@@ -182,17 +179,10 @@ def refit_item_reward_model(
 
 
 def fit_training_users(
-    train: EpisodeStore,
-    folder: Path,
-    seed: int,
-    weighted: bool = True,
-    first: Path | None = None,
+    train: EpisodeStore, folder: Path, seed: int, weighted: bool = True, first: Path | None = None
 ) -> TrainingUsers:
-    """Fit the effects of training users, or read them from `folder` if they were fitted before.
-
-    A fifth of the rows of the sessions of `draw_sessions` chooses the effects. Rows are `weighted`
-    by propensities, if there are any; the rest is as in `fit_item_reward_model`.
-    """
+    """Fit the effects of training users, or read them, as `fit_item_reward_model` does. A fifth of
+    the rows of `draw_sessions` chooses; they are `weighted` by propensities, if there are any."""
     model, file = ItemRewardModel(reward_model_sizes(train)), folder / _USERS_FITTED
     if (metadata := _read_fit(file, model)) is not None:
         with damage_explained(file, REMEDY):

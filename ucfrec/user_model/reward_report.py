@@ -94,15 +94,22 @@ def draw_numbers(count: int, limit: int, seed: int) -> IntArray:
     return np.sort(np.random.default_rng(seed).choice(count, limit, replace=False))
 
 
+def mean_gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
+    """By how much the mean of `lower` is lower, and the standard error; 0 without rows."""
+    decrease = losses - lower
+    if not len(decrease):
+        return 0.0, 0.0
+    return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
+
+
 def weigh_by_propensity(
     view: EpisodeStore, episodes: IntArray, steps: IntArray, items: int
 ) -> Tensor | None:
     """What logged steps (M,) count for, as if all of `items` had been shown alike.
 
-    Of each user in proportion to 1 / (p · items), cut off at 10 (inverse propensity weighting). So
-    that a few rows of large weight do not pass for much knowledge of a user, those of a user add up
-    to their effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal
-    selection probabilities in multilevel models"). None if the log does not have every p.
+    Of each user in proportion to 1 / (p · items), cut off at 10; those of a user add up to their
+    effective number, (Σ w)² / Σ w² (Pfeffermann et al., 1998, "Weighting for unequal selection
+    probabilities in multilevel models"). None if the log does not have every p.
     """
     propensities = read_propensities(view, episodes, steps)
     if propensities is None:
@@ -161,8 +168,7 @@ class ItemRewardReport:
     train_rows: int
     validation_rows: int
     binary: bool
-    """Whether rewards have two values: the loss is the log loss in nats, otherwise half the squared
-    error of standardised rewards."""
+    """Whether rewards have two values, and losses are nats; else squared errors, standardised."""
     effects: tuple[EffectTried, ...]
     """The effects in the order in which they were tried."""
     base_loss: float
@@ -171,8 +177,8 @@ class ItemRewardReport:
     r2: Undefinable
     calibration: Calibration
     gauc: Undefinable
-    """Probability that a liked step scores higher than another of the same user, by impressions;
-    without what all items share at a step (user and state), which does not rank items."""
+    """Probability that a liked step scores higher than another of the same user, by impressions,
+    without what all items share at a step."""
     gauc_error: Undefinable
     item_rate_gauc: Undefinable
     """`gauc` of the items' training rates of liked steps, 10 impressions at the mean added."""

@@ -20,7 +20,7 @@ from ucfrec.episodes.windows import Shown
 from ucfrec.errors import damage_explained
 from ucfrec.fitting.checkpoint import REMEDY, load_tensors
 from ucfrec.user_model.reward import ItemRewardModel, compare_to_history
-from ucfrec.user_model.reward_report import SAVED, draw_numbers
+from ucfrec.user_model.reward_report import SAVED, draw_numbers, mean_gain
 
 SESSIONS: Final = "sessions.safetensors"
 """File of session ends, fatigue and calibration in the model's folder."""
@@ -37,8 +37,7 @@ _REWARD: Final = 3
 _FEWEST: Final = 20
 """Fewest steps that end a session, and that do not, that tell more than their share."""
 _STEP: Final = 2.0**-10
-"""Likeness is rounded to multiples of this: what torch and onnxruntime round differently then lies
-on one side of a tree's threshold."""
+"""Likeness is rounded to multiples of this, so that torch and onnxruntime agree on thresholds."""
 _HIGHEST: Final = 20.0
 """Largest log-odds against what happened that count, so that no single step decides."""
 TREES: Final = 100
@@ -63,8 +62,8 @@ class LoggedEnds:
     def of(
         cls, store: EpisodeStore, likeness: Likeness, lags: int, most: int, seed: int
     ) -> "LoggedEnds":
-        """Steps of a view of a store of items, at most `most` of them, drawn at random; without the
-        last one of a session that is not terminated, where the log may simply have ended."""
+        """Steps of a view, at most `most` of them, drawn at random; without the last one of a
+        session that is not terminated, where the log may simply have ended."""
         usable = store.lengths - ~store.terminated
         ends = np.cumsum(usable)
         numbers = draw_numbers(int(ends[-1]), most, seed)
@@ -93,8 +92,8 @@ def last_sessions(store: EpisodeStore) -> BoolArray:
 def whole_sessions(
     train: EpisodeStore, validation: EpisodeStore
 ) -> tuple[EpisodeStore, EpisodeStore]:
-    """Sessions to fit models of their ends to, and held-out ones: training sessions of a fifth of
-    users where most validation sessions go on from training sessions that the split cut."""
+    """Sessions to fit models of their ends to, and held-out ones: of a fifth of training users
+    where most validation sessions go on from training sessions that the split cut."""
     if not (train.has_users and validation.has_users):
         return train, validation
     users, cut = train.episode_values(schema.USER), ~train.terminated & last_sessions(train)
@@ -129,9 +128,8 @@ class SessionEnd:
     """
 
     def __init__(self, likeness: Likeness, tensors: Mapping[str, Tensor]) -> None:
-        """Of tensors of `BoostedTrees`; or of the `highest` (F,) inputs that count, so that steps
-        later than logged ones are like the last, `mean` and `scale` (F,) of the inputs, `weights`
-        (F,) and `bias` (), all float64."""
+        """Of tensors of `BoostedTrees`; or, float64, of the `highest` (F,) inputs that count, their
+        `mean` and `scale` (F,), `weights` (F,) and `bias` ()."""
         self.tensors, self._likeness = tensors, likeness
         self._trees = BoostedTrees(**tensors) if "thresholds" in tensors else None
         uses = tensors["weights"][_REWARD] if self._trees is None else tensors["inputs"] == _REWARD
@@ -141,14 +139,19 @@ class SessionEnd:
     @classmethod
     def of(cls, likeness: Likeness, tensors: Mapping[str, Tensor]) -> "SessionEnd":
         """From tensors of a file; KeyError or ValueError unless they fit these inputs."""
+        shapes: dict[str, tuple[int, ...]] = {**dict.fromkeys(_LOGISTIC, (_INPUTS,)), "bias": ()}
+        parts = {}
         if "thresholds" in tensors:
-            parts = {name: tensors[name] for name in ("inputs", "thresholds", "leaves", "base")}
-            _require_trees(**parts)
-            return cls(likeness, parts)
-        parts = {name: tensors[name] for name in _LOGISTIC}
-        for name, entry in parts.items():
-            shape = () if name == "bias" else (_INPUTS,)
-            if entry.shape != shape or entry.dtype != torch.float64:
+            parts["inputs"] = inputs = tensors["inputs"]
+            if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
+                raise ValueError("inputs are not numbers of inputs")
+            if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
+                raise ValueError("inputs are beyond the last input")
+            trees, splits = inputs.shape
+            shapes = {"thresholds": (trees, splits), "leaves": (trees, 2**splits), "base": ()}
+        for name, shape in shapes.items():
+            parts[name] = tensors[name]
+            if parts[name].shape != shape or parts[name].dtype != torch.float64:
                 raise ValueError(f"{name} does not fit the inputs")
         return cls(likeness, parts)
 
@@ -156,19 +159,16 @@ class SessionEnd:
     def fit(
         cls, likeness: Likeness, logged: LoggedEnds, held_out: LoggedEnds, seed: int
     ) -> tuple["SessionEnd", SessionEndReport]:
-        """Fit every kind to logged steps, and keep the best on held-out ones.
-
-        The end of a user's last session may only be that of the user's rows. So everything is
-        fitted without these ends, too, and that is kept if it clearly (by three standard errors)
-        predicts held-out sessions better that another one follows.
-        """
+        """Fit every kind to logged steps, and keep the best on held-out ones: without the ends of
+        users' last sessions, which may only be those of their rows, if that clearly (by three
+        standard errors) predicts held-out sessions better that another one follows."""
         best = cls._fit_best(likeness, logged, held_out, seed)
         certain = held_out.select(held_out.followed)
         if logged.followed.all() or certain.ended.sum() < _FEWEST:
             return best
         sure, held_out = (rows.select(rows.followed | ~rows.ended) for rows in (logged, held_out))
         without, report = cls._fit_best(likeness, sure, held_out, seed)
-        gain, error = _gain(best[0]._losses(certain), without._losses(certain))
+        gain, error = mean_gain(best[0]._losses(certain), without._losses(certain))
         if gain <= 3 * error:
             return best
         return without, replace(report, last_sessions=False)
@@ -186,7 +186,7 @@ class SessionEnd:
         losses = {kind: model._losses(held_out) for kind, model in models.items()}
         gains, best = dict[str, tuple[float, float]](), "constant"
         for kind in kinds:
-            gain, error = gains[kind] = _gain(losses[best], losses[kind])
+            gain, error = gains[kind] = mean_gain(losses[best], losses[kind])
             if gain > error:
                 best = kind
         means = {kind: float(entry.mean()) if len(entry) else 0.0 for kind, entry in losses.items()}
@@ -209,7 +209,7 @@ class SessionEnd:
         self, history: Shown, items: Tensor, rewards: Sequence[Tensor], steps: Tensor
     ) -> list[Tensor]:
         """Probabilities (B, C) that sessions end if they show items (B, C) at the steps (B,), for
-        each of some rewards (B, C) that the items would be given."""
+        each of some rewards (B, C)."""
         batch, count = items.shape
         lately = _pad(history.items)
         profiles = self._likeness.profile(lately.reshape(-1, 1), torch.ones(batch * _LAGS, 1))
@@ -263,14 +263,6 @@ def _logistic(inputs: Tensor, ended: BoolArray, weights: bool = True) -> dict[st
     return {"highest": highest, "mean": mean, "scale": scale, "weights": slopes, "bias": bias}
 
 
-def _gain(losses: Tensor, lower: Tensor) -> tuple[float, float]:
-    """By how much the mean of `lower` is lower, and the standard error; 0 without rows."""
-    decrease = losses - lower
-    if not len(decrease):
-        return 0.0, 0.0
-    return float(decrease.mean()), float(decrease.std(correction=0)) / len(decrease) ** 0.5
-
-
 def _pad(items: Tensor) -> Tensor:
     return F.pad(items[:, :_LAGS], (0, max(0, _LAGS - items.shape[1])), value=-1)
 
@@ -298,19 +290,13 @@ def _columns(alike: Tensor, repeated: Tensor, rewards: Tensor, steps: Tensor) ->
 
 
 class BoostedTrees:
-    """The sum of T regression trees of at most S splits: data, never a program.
-
-    A tree is a table: which of its splits' inputs are at most their threshold selects the leaf.
-    """
+    """The sum of T regression trees of at most S splits, as tables: which of its splits' inputs are
+    at most their threshold selects a tree's leaf."""
 
     def __init__(self, inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
-        """Args:
-        inputs: (T, S) int64 number of the input that a split looks at.
-        thresholds: (T, S) float64.
-        leaves: (T, 2^S) float64 by numbers whose bit s is set where split s finds an input that is
-            at most its threshold.
-        base: () float64, what the trees' sum starts from.
-        """
+        """From int64 numbers of the splits' `inputs` (T, S) and, float64, their `thresholds`
+        (T, S), the `base` () of the sum, and `leaves` (T, 2^S) by numbers whose bit s is set where
+        split s finds an input that is at most its threshold."""
         self._leaves, self._base = leaves, base
         pairs = torch.stack([inputs.double(), thresholds], 2).flatten(0, 1)
         splits, which = torch.unique(pairs, dim=0, return_inverse=True)
@@ -343,19 +329,6 @@ class BoostedTrees:
     def _sums(self, columns: Tensor) -> Tensor:
         """The trees' sum (M,) from numbers of leaves (T, M), which float32 has exactly."""
         return self._base + self._leaves.gather(1, columns.long()).sum(0)
-
-
-def _require_trees(inputs: Tensor, thresholds: Tensor, leaves: Tensor, base: Tensor) -> None:
-    """Check the tensors of `BoostedTrees`, which may come from anywhere."""
-    if inputs.dim() != 2 or inputs.shape[1] > _SPLITS or inputs.dtype != torch.int64:
-        raise ValueError("inputs are not numbers of inputs")
-    if bool(((inputs < 0) | (inputs >= _INPUTS)).any()):
-        raise ValueError("inputs are beyond the last input")
-    if any(entry.dtype != torch.float64 for entry in (thresholds, leaves, base)):
-        raise ValueError("thresholds, leaves and base are not float64")
-    shapes = thresholds.shape, leaves.shape, base.shape
-    if shapes != (inputs.shape, (len(inputs), 2 ** inputs.shape[1]), ()):
-        raise ValueError("thresholds, leaves and base do not fit the inputs")
 
 
 def fit_trees(inputs: Array, target: Array, seed: int) -> dict[str, Tensor]:

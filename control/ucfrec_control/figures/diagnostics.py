@@ -15,7 +15,7 @@ from ucfrec.counterfactual.generators import (
     TangentGenerator,
     make_generator,
 )
-from ucfrec.counterfactual.reward_model import CausalRewardModel, sample_transitions
+from ucfrec.counterfactual.reward_model import CausalRewardModel, read_transitions, sample_steps
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.episodes.windows import AUGMENTED, AugmentedEpisodes, Transitions
 from ucfrec.errors import InputError
@@ -104,9 +104,8 @@ class Editing:
         weights = run / "crm" / "cvae" / "best.safetensors"
         load_weights(weights, crm, load_tensors(weights)[0])
         crm.eval().requires_grad_(False)
-        fitted = sample_transitions(
-            train, max(config.crm.max_transitions, config.csg.max_transitions), config.seed
-        )
+        limit = max(config.crm.max_transitions, config.csg.max_transitions)
+        fitted = read_transitions(train, *sample_steps(train, limit, config.seed))
         high = fitted.rewards >= fitted.rewards.quantile(config.augment.reward_quantile)
         rng = np.random.default_rng(seed)
         rows = torch.from_numpy(rng.permutation(np.flatnonzero(high.numpy()))[:_PROPOSALS])
@@ -137,7 +136,7 @@ class Editing:
         random = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             z = self.crm.abduct(factual.states, factual.actions, factual.rewards)
-            proposed = generator.propose(factual.states, factual.actions, z, random)
+            proposed = generator.propose(factual, z, random)
             passed = accept(self.crm, factual, z, proposed, self.epsilon_r, band[1] + _ROUNDING)
             length = self.crm.moves(factual.states, proposed).norm(dim=1)
         return float((passed & (length >= band[0] - _ROUNDING)).float().mean())

@@ -106,7 +106,7 @@ def test_a_cell_of_the_heatmap_is_the_share_that_passes_both_gates(runs: Path, k
     crm, steps = editing.crm, editing.factual
     z = crm.abduct(steps.states, steps.actions, steps.rewards)
     random = torch.Generator().manual_seed(0)
-    proposed = editing.generator.propose(steps.states, steps.actions, z, random)
+    proposed = editing.generator.propose(steps, z, random)
     lengths = ((proposed - steps.states) / crm.state_std).square().sum(1).sqrt().numpy()
     off = (crm.predict(proposed, steps.actions, z) - steps.rewards).abs().numpy()
     within = (lengths >= 0.2 - 1e-5) & (lengths <= 0.5 + 1e-5)

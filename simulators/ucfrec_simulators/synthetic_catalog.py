@@ -111,13 +111,9 @@ class SyntheticCatalog(SessionsEnv):
     def favourites(self, probabilities: Float64Array) -> IntArray:
         """The best items (M, boredom_window) of different tags, the best first, by click
         probabilities (M, n_items)."""
-        by_tag = np.stack(
-            [
-                np.flatnonzero(self.tags == tag)[probabilities[:, self.tags == tag].argmax(1)]
-                for tag in range(self.tags.max() + 1)
-            ],
-            axis=1,
-        )
+        of_tags = (np.flatnonzero(self.tags == tag) for tag in range(self.tags.max() + 1))
+        best = [items[probabilities[:, items].argmax(1)] for items in of_tags]
+        by_tag = np.stack(best, axis=1)
         order = np.argsort(-np.take_along_axis(probabilities, by_tag, 1), axis=1, kind="stable")
         return np.take_along_axis(by_tag, order[:, : self.boredom_window], axis=1)
 
@@ -256,11 +252,11 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
 
     A fifth of the sessions get uniform items, the others one of the policies of `QUALITIES`.
     """
-    environment = _catalog(env)
-    guesses: list[Actor] = [SoftmaxGuess(environment, seed, *knobs) for *knobs, _ in QUALITIES]
-    return SessionMixture(
-        [Uniform(env, seed), *guesses], [0.2, *(share for *_, share in QUALITIES)], seed
-    )
+    actors, shares = list[Actor]([Uniform(env, seed)]), [0.2]
+    for error, temperature, epsilon, variety, share in QUALITIES:
+        actors.append(SoftmaxGuess(_catalog(env), seed, error, temperature, epsilon, variety))
+        shares.append(share)
+    return SessionMixture(actors, shares, seed)
 
 
 def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
@@ -276,11 +272,8 @@ def simulator(mood: float = 0.0) -> Simulator:
         "clicks",
         make=lambda num_envs, folder: SyntheticCatalog(num_envs, mood=mood),
         behaviors={
-            "random": Uniform,
-            "popular": popular,
-            "mixture": mixture,
-            "softmax": softmax,
-            "optimal": optimal,
+            **{"random": Uniform, "popular": popular, "mixture": mixture},
+            **{"softmax": softmax, "optimal": optimal},
         },
         feedback="is_click",
     )

@@ -96,11 +96,6 @@ def test_logs_hold_propensities_and_tags(tmp_path: Path) -> None:
         assert np.flatnonzero(topics).tolist() == tags.tolist()
 
 
-def test_oracles_serve_sardine_only() -> None:
-    with pytest.raises(InputError, match="serves SARDINE, not SyntheticCatalog"):
-        GreedyOracle(SyntheticCatalog(2), 0)
-
-
 def test_users_of_a_seed_are_always_the_same() -> None:
     def shown(seed: int) -> list[int]:
         env = SardineEnvironment("Static", 5)
@@ -110,7 +105,11 @@ def test_users_of_a_seed_are_always_the_same() -> None:
     assert shown(2) == shown(2) != shown(3)
 
 
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_environments_and_a_missing_package_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(InputError, match="serves SARDINE, not SyntheticCatalog"):
+        GreedyOracle(SyntheticCatalog(2), 0)
     monkeypatch.setattr(sardine, "PACKAGE", "sardine_that_is_not_installed")
     with pytest.raises(InputError, match=r"pip install 'ucfrec\[sardine\]'"):
         Environment("sardine-static").simulator().make(1, None)

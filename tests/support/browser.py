@@ -70,9 +70,8 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """The value of a JavaScript expression, awaited."""
-        found = self.send(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
+        waiting = {"returnByValue": True, "awaitPromise": True}
+        found = self.send("Runtime.evaluate", expression=script, **waiting)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
@@ -90,13 +89,8 @@ class Browser:
 
     def view(self, width: int, height: int, dark: bool = False) -> None:
         """Set the size and the colour scheme that the visitor prefers."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **screen)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
 

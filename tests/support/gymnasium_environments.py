@@ -73,13 +73,15 @@ ACTIONS: dict[str, spaces.Space[Any]] = {
     "Slate": spaces.MultiDiscrete([ITEMS, ITEMS]),
     "Matrix": spaces.Box(-1, 1, (2, 2)),
 }
-for _name, _space in ACTIONS.items():
-    gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs={"actions": _space})
-_items = ACTIONS["Discrete"]
-gymnasium.register("ucfrec-test/Whole-v0", Echo, kwargs={"actions": _items, "whole": True})
-gymnasium.register("ucfrec-test/Users-v0", Echo, kwargs={"actions": _items, "users": 77})
-for _name, _visitors in {"Visitors": range(1000, 1009), "Some-visitors": (1000, None)}.items():
-    _arguments = {"actions": _items, "visitors": _visitors}
+_OF_ITEMS: dict[str, dict[str, Any]] = {
+    "Whole": {"whole": True},
+    "Users": {"users": 77},
+    "Visitors": {"visitors": range(1000, 1009)},
+    "Some-visitors": {"visitors": (1000, None)},
+    "Names": {"users": "Ann"},
+    "Notes": {"notes": True},
+}
+_ARGUMENTS = {name: {"actions": space} for name, space in ACTIONS.items()}
+_ARGUMENTS |= {name: {"actions": ACTIONS["Discrete"], **own} for name, own in _OF_ITEMS.items()}
+for _name, _arguments in _ARGUMENTS.items():
     gymnasium.register(f"ucfrec-test/{_name}-v0", Echo, kwargs=_arguments)
-gymnasium.register("ucfrec-test/Names-v0", Echo, kwargs={"actions": _items, "users": "Ann"})
-gymnasium.register("ucfrec-test/Notes-v0", Echo, kwargs={"actions": _items, "notes": True})

@@ -49,14 +49,8 @@ def train(folder: Path) -> Fit:
     def validate() -> float:
         return float(F.mse_loss(net(held_out[0]), held_out[1]))
 
-    config = LoopConfig(
-        steps=STEPS,
-        batch_size=8,
-        learning_rate=0.05,
-        warmup_steps=50,
-        clip_norm=1.0,
-        validate_every=EVERY,
-    )
+    own = {"learning_rate": 0.05, "warmup_steps": 50, "clip_norm": 1.0}
+    config = LoopConfig(steps=STEPS, batch_size=8, validate_every=EVERY, **own)
 
     def draw(generator: np.random.Generator) -> tuple[Tensor, Tensor]:
         time.sleep(0.001)  # so that no machine is done before it is killed a few times

@@ -61,14 +61,8 @@ def parse(command: str) -> argparse.Namespace:
 
 def run_python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run code in a process and folder of its own, on one thread."""
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    env, command = {**os.environ, "OMP_NUM_THREADS": "1"}, [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=env)
 
 
 def anchors(text: str) -> set[str]:

@@ -34,12 +34,8 @@ def together(count: int, work: Callable[[], None], folder: Path) -> None:
 
 def _child(rank: int, count: int, port: int, work: Callable[[], None], folder: Path) -> None:
     torch.set_num_threads(1)  # a fork has none of its parent's threads
-    os.environ |= {
-        "RANK": str(rank),
-        "WORLD_SIZE": str(count),
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(count)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     try:
         with joined():
             work()

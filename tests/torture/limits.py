@@ -32,9 +32,7 @@ def limits(inputs: Inputs, folder: Path) -> Counter[str]:
         ):
             _expect(counts, job, name, Running(command(*job.arguments(out))))
         out = place / f"small-{job.name}{job.suffix}"
-        _expect(
-            counts, job, "file too large", Running(_limited(job, out, resource.RLIMIT_FSIZE, 1))
-        )
+        _expect(counts, job, "file too large", Running(_limited(job, out)))
         for megabytes in (60, 200, 1000):
             out = place / f"memory-{job.name}-{megabytes}{job.suffix}"
             memory = megabytes * 2**20
@@ -67,17 +65,20 @@ def _expect(
     counts["ended by a library"] += end.status in _BY_A_LIBRARY
 
 
-def _limited(job: Job, out: Path, limit: int, value: int) -> Callable[[], int]:
+def _limited(job: Job, out: Path) -> Callable[[], int]:
+    """The command where no file may have more than one byte."""
+
     def work() -> int:
-        log = os.dup(2)
+        log, limit = os.dup(2), resource.RLIMIT_FSIZE
         # The log of stderr would be too large as well.
         reader, writer = os.pipe()
         os.dup2(writer, 2)
-        resource.setrlimit(limit, (value, resource.getrlimit(limit)[1]))
+        most = resource.getrlimit(limit)[1]
+        resource.setrlimit(limit, (1, most))
         try:
             return command(*job.arguments(out))()
         finally:
-            resource.setrlimit(limit, (resource.getrlimit(limit)[1],) * 2)
+            resource.setrlimit(limit, (most, most))
             os.dup2(log, 2)
             os.close(writer)
             os.write(2, os.read(reader, 60_000))
@@ -103,11 +104,8 @@ def _mounted(job: Job, disk: Path, options: str) -> Callable[[], int]:
 
     def work() -> int:
         disk.mkdir(exist_ok=True)
-        try:
-            os.unshare(os.CLONE_NEWNS)  # type: ignore[attr-defined, unused-ignore]
-        except (AttributeError, OSError):
-            if not _unshare():
-                return 75
+        if ctypes.CDLL(None).unshare(0x00020000):  # CLONE_NEWNS; Python has it from 3.12 on
+            return 75
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         for arguments in (
             ["mount", "--make-rprivate", "/"],
@@ -120,14 +118,6 @@ def _mounted(job: Job, disk: Path, options: str) -> Callable[[], int]:
     return work
 
 
-def _unshare() -> bool:
-    """`unshare(CLONE_NEWNS)` of the C library, for Python before 3.12."""
-    try:
-        return ctypes.CDLL(None, use_errno=True).unshare(0x00020000) == 0
-    except (OSError, AttributeError):
-        return False
-
-
 def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
     """Inputs that are removed before or while a command reads them."""
     for job in inputs.jobs():
@@ -137,11 +127,10 @@ def _vanishing(counts: Counter[str], inputs: Inputs, place: Path) -> None:
             copy = place / "copy"
             shutil.rmtree(copy, ignore_errors=True)
             copy.mkdir()
-            moved = [
-                str(part).replace(f"{inputs.folder}/{name}", f"{copy}/{name}")
-                for part in job.arguments(place / f"vanished-{job.name}{job.suffix}")
-            ]
-            if moved == [str(p) for p in job.arguments(place / f"vanished-{job.name}{job.suffix}")]:
+            own = [str(part) for part in job.arguments(place / f"vanished-{job.name}{job.suffix}")]
+            source = f"{inputs.folder}/{name}"
+            moved = [part.replace(source, f"{copy}/{name}") for part in own]
+            if moved == own:
                 continue
             shutil.copytree(inputs.folder / name, copy / name)
             started = Running(command(*moved))
@@ -177,12 +166,8 @@ def _write_hostile(place: Path) -> int:
 
     rows = 200
     count = np.arange(rows)
-    plain = {
-        "user_id": pa.array(count % 7),
-        "item_id": pa.array(count % 5),
-        "timestamp": pa.array(1_700_000_000_000 + count),
-        "reward": pa.array(count % 2),
-    }
+    plain = {"user_id": pa.array(count % 7), "item_id": pa.array(count % 5)}
+    plain |= {"timestamp": pa.array(1_700_000_000_000 + count), "reward": pa.array(count % 2)}
 
     def table(**changes: Any) -> pa.Table:
         return pa.table({**plain, **changes})
@@ -196,9 +181,7 @@ def _write_hostile(place: Path) -> int:
         "no columns": pa.table({}),
         "no rows": table().slice(0, 0),
         "many columns": table(**{f"c{i}": plain["reward"] for i in range(5000)}),
-        "names": table(
-            **{"a\nb": plain["reward"], "\x1b[31m": plain["reward"], "": plain["user_id"]}
-        ),
+        "names": table(**dict.fromkeys(("a\nb", "\x1b[31m", ""), plain["reward"])),
         "nulls": table(user_id=pa.nulls(rows)),
         "long text": table(item_id=pa.array(["x" * 1_000_000 + str(i % 5) for i in count])),
         "wide": table(observation=pa.array([[0.5] * 20_000] * rows)),

@@ -137,8 +137,8 @@ def read_agent(file: Path, observations: int, space: Box, noise: float, seed: in
             raise _refusal(file, f"its clip_mean is {bound!r}, not a number above 0")
         parts.append(nn.Hardtanh(-float(bound), float(bound)))
     squashed = kind.squashed or kwargs.get("squash_output") is True
-    return Agent(nn.Sequential(*parts, *([nn.Tanh()] if squashed else [])), squashed, space, noise,
-                 seed)  # fmt: skip
+    parts += [nn.Tanh()] if squashed else []
+    return Agent(nn.Sequential(*parts), squashed, space, noise, seed)
 
 
 def _contents(file: Path) -> tuple[dict[str, Tensor], Mapping[str, Any]]:

@@ -77,7 +77,7 @@ class SacTraining(Memoryless):
 
         Before `learning_starts`, actions are uniformly random and there are no updates.
         """
-        reset_seed = seed_all(self._seed, 1, self.episode)
+        reset_seed = seed_all((self._seed, 1, self.episode))
         generator = np.random.default_rng(reset_seed)
         observations, _ = self._env.reset(seed=reset_seed)
         ended = False
@@ -124,13 +124,11 @@ class SacTraining(Memoryless):
 
     def save(self, path: Path, evaluations: list[dict[str, Any]]) -> None:
         """Write a checkpoint from which training can resume, atomically, and `evaluations`."""
+        columns = {name: getattr(self._buffer, name)[: self.steps] for name in _COLUMNS}
         state = {
             "parameters": self._model.get_parameters(),
             "log_ent_coef": self._model.log_ent_coef.detach(),
-            "replay": {
-                name: torch.from_numpy(getattr(self._buffer, name)[: self.steps])
-                for name in _COLUMNS
-            },
+            "replay": {name: torch.from_numpy(rows) for name, rows in columns.items()},
             "episode": self.episode,
             "evaluations": evaluations,
         }
@@ -154,7 +152,7 @@ class SacTraining(Memoryless):
         return self._model.predict(observations.astype(np.float32), deterministic=False)[0], None
 
 
-def seed_all(*key: int) -> int:
+def seed_all(key: tuple[int, ...]) -> int:
     """Seed the global random generators of numpy and torch, which Stable-Baselines3 uses, by a seed
     derived from `key`; returns it for components with their own generator."""
     seed = int(np.random.SeedSequence(key).generate_state(1)[0])

@@ -101,8 +101,8 @@ def acceptance_heatmap(
     Args:
         acceptance: (lows, highs) from 0 to 1, NaN where there is no such band.
     """
-    names = [rf"$\rho_\mathrm{{{side}}}$ (standard deviations)" for side in ("high", "low")]
-    figure, axes = _figure(COLUMN, 2.6, title, *names)
+    high, low = (rf"$\rho_\mathrm{{{side}}}$ (standard deviations)" for side in ("high", "low"))
+    figure, axes = _figure(COLUMN, 2.6, title, high, low)
     image = axes.imshow(100 * acceptance, vmin=0, vmax=100, origin="lower", aspect="auto")
     axes.spines[["left", "bottom"]].set_visible(False)
     dark = colormaps[image.get_cmap().name]
@@ -281,8 +281,9 @@ def training_curves(
     """
     figure, axes = _figure(COLUMN, 2.5, title, "training step", ylabel)
     for method, color in colors(curves).items():
-        steps = sorted(set.intersection(*(set(seed) for seed in curves[method])))
-        values = np.array([[seed[step] for step in steps] for seed in curves[method]])
+        first, *others = seeds = curves[method]
+        steps = sorted(step for step in first if all(step in seed for seed in others))
+        values = np.array([[seed[step] for step in steps] for seed in seeds])
         axes.plot(steps, values.mean(axis=0), color=color, label=label(method))
         axes.fill_between(
             steps, values.min(axis=0), values.max(axis=0), color=color, alpha=0.2, linewidth=0
@@ -329,10 +330,9 @@ def _figure(
 
 
 def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    figure.legend(
-        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns,
-        handlelength=1.4, columnspacing=1.2,
-    )  # fmt: skip
+    handles, labels = axes.get_legend_handles_labels()
+    spacing = {"ncols": columns, "handlelength": 1.4, "columnspacing": 1.2}
+    figure.legend(handles, labels, loc="outside lower center", **spacing)
 
 
 def _group_seeds(rows: Sequence[Row], names: Sequence[str], value: str) -> dict[Any, list[float]]:

@@ -81,11 +81,9 @@ def evaluate_run(
             rows += [replace(row, checkpoint=checkpoint) for row in rows]
             continue
         environment = environment_of(trained, env_id)
-        played = [
-            _row(trained, environment, rule, episodes, seed, distractor)
-            for rule in rules_of(trained, environment, targets)
-        ]
-        rows += [replace(row, checkpoint=checkpoint) for row in played]
+        for rule in rules_of(trained, environment, targets):
+            row = _row(trained, environment, rule, episodes, seed, distractor)
+            rows.append(replace(row, checkpoint=checkpoint))
     return rows
 
 
@@ -261,8 +259,8 @@ def held_out_losses(trained: TrainedPolicy, store: EpisodeStore) -> dict[str, fl
     dimensions = [d - sum(lower < d for lower in dropped) for d in distractors if d not in dropped]
     losses = []
     for _ in range(_BATCHES):
-        steps = validation.draw_steps(generator, _BATCH)
-        windows = validation.windows(*steps, trained.policy.config.context)
+        episodes, steps = validation.draw_steps(generator, _BATCH)
+        windows = validation.windows(episodes, steps, trained.policy.config.context)
         fixed = windows.states.clone()
         fixed[..., dimensions] = 0.0
         both = (windows, replace(windows, states=fixed))

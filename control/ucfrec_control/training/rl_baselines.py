@@ -246,16 +246,14 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
 
 
 def _begin(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> None:
+    (action_size,) = store.record.columns[schema.ACTION]
     entries = {
         "files": {},
         "library": "d3rlpy",
         "command": command_line(),
         "config": plain_config(config, seed),
         "seed": seed,
-        "sizes": {
-            **{"state": store.state_size, "items": 0},
-            "action": store.record.columns[schema.ACTION][0],
-        },
+        "sizes": {"state": store.state_size, "items": 0, "action": action_size},
         "fingerprint": store.record.fingerprint,
         "data": store.record.source,
         "versions": versions((*PACKAGES, "d3rlpy")),
@@ -337,9 +335,7 @@ def _iql(d3rlpy: Any, config: RLConfig) -> Any:
         max_weight=100.0,
         reward_scaler=scaler,
         actor_optim_factory=d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=cosine),
-        actor_encoder_factory=layers,
-        critic_encoder_factory=layers,
-        value_encoder_factory=layers,
+        **{f"{part}_encoder_factory": layers for part in ("actor", "critic", "value")},
         actor_learning_rate=config.learning_rate,
         critic_learning_rate=config.learning_rate,
         **settings,

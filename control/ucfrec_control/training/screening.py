@@ -186,19 +186,11 @@ class _Perceptrons(nn.Module):
 class _Predictors(nn.Module):
     """M predictors of the next state, the reward given, and of the reward, dimensions missing."""
 
-    def __init__(self, size: int, action_size: int, width: int, count: int = 1) -> None:
+    def __init__(self, data: _Data, count: int = 1) -> None:
         super().__init__()
-        self.sizes, inputs = (size, action_size, width), 2 * size + action_size
-        self.next_state = _Perceptrons((inputs + 1, width, width, size), count)
+        width, inputs = data.config.hidden, 2 * data.size + data.actions.shape[1]
+        self.next_state = _Perceptrons((inputs + 1, width, width, data.size), count)
         self.reward = _Perceptrons((inputs, width, width, 1), count)
-
-    def repeat(self, count: int) -> "_Predictors":
-        """`count` copies of a single pair."""
-        copies = _Predictors(*self.sizes, count)
-        with torch.no_grad():
-            for copy, original in zip(copies.parameters(), self.parameters(), strict=True):
-                copy.copy_(original.expand_as(copy))
-        return copies
 
     def errors(self, data: _Data, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
         """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
@@ -242,7 +234,7 @@ class _Predictors(nn.Module):
 def _fit_shared(data: _Data) -> _Predictors:
     """A pair of predictors that serves every missing dimension."""
     config, size = data.config, data.size
-    predictors = _Predictors(size, data.actions.shape[1], config.hidden)
+    predictors = _Predictors(data)
     absences = data.absences([*((dimension,) for dimension in range(size)), ()])[:, 0]
 
     def draw() -> Tensor:
@@ -311,10 +303,14 @@ class _Errors(NamedTuple):
 def _fit_own(shared: _Predictors, data: _Data, missing: Sequence[Collection[int]]) -> _Errors:
     """Fit a copy of the shared pair for each of `missing` further, and measure its errors."""
     config, absences = data.config, data.absences(missing)
-    pair = shared.repeat(len(missing))
+    pair = _Predictors(data, len(missing))
+    with torch.no_grad():
+        for copy, original in zip(pair.parameters(), shared.parameters(), strict=True):
+            copy.copy_(original.expand_as(copy))
     rate, about = config.learning_rate / 3, f"{len(missing)} cases"
     pair.fit(data, lambda: absences, config.own_steps, rate, about)
     rng, count = np.random.default_rng(data.seed), min(len(data.seen), 4 * _CHUNK)
     sample = np.sort(rng.choice(data.seen, count, replace=False))
     fitted = pair.all_errors(data, sample, absences)[0].mean(1)
-    return _Errors(data, absences, fitted, *pair.all_errors(data, data.held_out, absences))
+    next_state, reward = pair.all_errors(data, data.held_out, absences)
+    return _Errors(data, absences, fitted, next_state, reward)

@@ -111,14 +111,11 @@ def kuairand(folder: Path, log: Log) -> Task:
     if not filled.exists():
         played = folder / "environment-store"
         if not played.exists():
-            rows = window(logs, "time_ms", later)
-            _prepare(
-                "kuairand", rows, folder / "log_standard_environment.parquet", features, played
-            )
+            rows, log_file = window(logs, "time_ms", later), "log_standard_environment.parquet"
+            _prepare("kuairand", rows, folder / log_file, features, played)
         complete(EpisodeStore.open(played), tags, filled)
-    return Task(
-        "kuairand", store, tuple(Environment(name, filled) for name in KUAIRAND), REFERENCES
-    )
+    environments = tuple(Environment(name, filled) for name in KUAIRAND)
+    return Task("kuairand", store, environments, REFERENCES)
 
 
 def kuairec(folder: Path, log: Log) -> Task:

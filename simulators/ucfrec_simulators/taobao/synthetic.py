@@ -59,15 +59,11 @@ class SyntheticTaobao(TaobaoEnv):
     ) -> tuple[Float32Array, IntArray]:
         """Draw M = `count` users: one-hot bits (M, 88), and pages they turn (M,), at least 1."""
         uniforms = generator.random((count, len(ATTRIBUTES)))
-        users = np.concatenate(
-            [
-                np.eye(len(shares), dtype=np.float32)[
-                    draw_categories(np.tile(shares, (count, 1)), uniform)
-                ]
-                for shares, uniform in zip(self._popularity, uniforms.T, strict=True)
-            ],
-            axis=1,
-        )
+        bits = []
+        for shares, uniform in zip(self._popularity, uniforms.T, strict=True):
+            values = draw_categories(np.tile(shares, (count, 1)), uniform)
+            bits.append(np.eye(len(shares), dtype=np.float32)[values])
+        users = np.concatenate(bits, axis=1)
         logarithm = 1.5 + users @ self._patience + generator.normal(0, 1.0, count)
         return users, np.clip(np.ceil(np.exp(logarithm)), 1, LONGEST_SESSION).astype(np.int64)
 
@@ -79,7 +75,8 @@ class SyntheticTaobao(TaobaoEnv):
 
     def optimal_actions(self, observations: Float32Array) -> Float32Array:
         """Best actions a* (M, 27) for observations (M, 91)."""
-        return self.best_actions(*split_observations(observations))
+        users, pages = split_observations(observations)
+        return self.best_actions(users, pages)
 
     def expected_clicks(
         self, users: Float32Array, pages: Array, actions: Float32Array

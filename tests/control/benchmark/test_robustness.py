@@ -42,13 +42,12 @@ def test_an_early_distractor_tells_of_the_next_reward(folder: Path, tmp_path: Pa
     store = EpisodeStore.open(folder / "store")
     seen = add_distractor(store, tmp_path / "early", early=True)
     assert seen.record.source.others["distractors"][0]["early"]
-    every = store.step_values(schema.REWARD, *store.all_steps())
-    for episode, length in enumerate(store.lengths):
-        steps = np.arange(length)
-        rewards = store.step_values(schema.REWARD, np.full(length, episode), steps)
-        high = np.append(rewards[1:], rewards[-1]) > np.median(every)
-        bit = seen.step_values(schema.OBSERVATION, np.full(length, episode), steps)[:, -1]
-        np.testing.assert_array_equal(bit, high)
+    episodes, steps = store.all_steps()
+    following = np.minimum(steps + 1, store.lengths[episodes] - 1)
+    rewards = store.step_values(schema.REWARD, episodes, following)
+    high = rewards > np.median(store.step_values(schema.REWARD, episodes, steps))
+    bit = seen.step_values(schema.OBSERVATION, episodes, steps)[:, -1]
+    np.testing.assert_array_equal(bit, high)
 
 
 def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> None:
@@ -97,8 +96,7 @@ def screenable() -> Columns:
 def begin(
     tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> dict[tuple[str, str], Path]:
-    """A small table of one file and one distractor, its screened runs begun in `out`; returns the
-    run of each distractor and method."""
+    """Screened runs of one file and one distractor begun in `out`, by distractor and method."""
     budget = Budget("small", (MADE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
     monkeypatch.setitem(BUDGETS, "small", budget)
     monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
@@ -113,9 +111,8 @@ def begin(
         assert cell.run is not None
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
-            train_control(
-                open_store(cell), cell.run, cell.config, screening=cell.screening, shared=stages
-            )
+            own = {"screening": cell.screening, "shared": stages}
+            train_control(open_store(cell), cell.run, cell.config, **own)
     return runs
 
 
@@ -136,12 +133,8 @@ def test_cells_are_measured_once_and_screening_is_reported(
         kind = str(r.conditions["distractor"])
         for value, name in ((0.0, "score"), (1.0, "score_at_one")):
             fixed = value if kind != "none" else 0.0
-            assert r.target_return is not None
-            (again,) = evaluate_run(
-                runs[kind, r.method],
-                episodes=2, seed=1000, targets=[r.target_return], checkpoints=("last",),
-                distractor=fixed,
-            )  # fmt: skip
+            own = {"targets": [r.target_return], "checkpoints": ("last",), "distractor": fixed}
+            (again,) = evaluate_run(runs[kind, r.method], episodes=2, seed=1000, **own)
             assert again["score"] == r.metrics[name]
             assert again["distractor_fixed_to"] == fixed
         blind = kind == "none" or r.method == "ucf-dropped"

@@ -54,14 +54,10 @@ def simulated(env: gymnasium.vector.SyncVectorEnv) -> Float64Array:
 def ant_columns(lengths: tuple[int, ...]) -> dict[str, Float32Array]:
     """A D4RL AntMaze file's: floats throughout, no successors."""
     rng, n, hopper = np.random.default_rng(0), sum(lengths), hopper_like(lengths)
-    terminals, timeouts = (hopper[name].astype(np.float32) for name in ("terminals", "timeouts"))
-    return {
-        "observations": rng.normal(size=(n, 29)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, size=(n, 8)).astype(np.float32),
-        "rewards": terminals,
-        "terminals": terminals,
-        "timeouts": timeouts,
-    }
+    columns = {name: hopper[name] for name in ("terminals", "timeouts")}
+    columns |= {"rewards": columns["terminals"], "observations": rng.normal(size=(n, 29))}
+    columns["actions"] = rng.uniform(-1, 1, size=(n, 8))
+    return {name: values.astype(np.float32) for name, values in columns.items()}
 
 
 @needs_robotics
@@ -76,14 +72,10 @@ def test_observations_are_laid_out_as_the_adapter_stores_them(env_id: str, tmp_p
         shown.append(env.step(actions[-1])[0])
         d4rl.append(simulated(env))
     env.close()
-    ends = np.arange(12) % 6 == 5
-    columns = {
-        "observations": np.concatenate(np.array(d4rl)[:-1].swapaxes(0, 1)),
-        "actions": np.concatenate(np.array(actions).swapaxes(0, 1)),
-        "rewards": np.zeros(12),
-        "terminals": np.zeros(12),
-        "timeouts": ends.astype(float),
-    }
+    columns = dict.fromkeys(("rewards", "terminals"), np.zeros(12))
+    columns["timeouts"] = (np.arange(12) % 6 == 5).astype(float)
+    for name, values in (("observations", d4rl[:-1]), ("actions", actions)):
+        columns[name] = np.concatenate(np.array(values).swapaxes(0, 1))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", columns, env_id=None)
     store = read_d4rl(file).write_store(tmp_path / "store")
     stored = store.windows(np.arange(2), np.full(2, 5), 6).states.numpy()
@@ -119,8 +111,7 @@ def test_the_rebuilt_maze_is_where_d4rl_has_it(maze: str, limit: int) -> None:
     env.close()
     (goal,) = (at for at, cell in cells.items() if cell == "G")
     off = np.array(goals) - goal
-    assert off.min() >= 0
-    assert off.max() <= 1.5
+    assert 0 <= off.min() <= off.max() <= 1.5
     assert np.ptp(off, axis=0).min() > 1
     assert 0.05 < np.abs(starts).max() <= 0.1
 

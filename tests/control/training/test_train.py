@@ -19,8 +19,7 @@ from tests.support.control_files import (
 )
 from tests.support.real_data import data_folder
 from ucfrec import schema
-from ucfrec.acting.rollout import Memoryless, rollout
-from ucfrec.arrays import Float32Array
+from ucfrec.acting.rollout import Step, Uniform, rollout
 from ucfrec.benchmark.cells import Budget, Evaluation
 from ucfrec.episodes.store import EpisodeStore
 from ucfrec.errors import InputError
@@ -114,8 +113,7 @@ def test_a_distractor_is_the_reward_bit_and_nothing_else_changes(
     store: EpisodeStore, tmp_path: Path
 ) -> None:
     steps = store.all_steps()
-    rewards = store.step_values(schema.REWARD, *steps)
-    before = store.step_values(schema.OBSERVATION, *steps)
+    rewards, before = (store.step_values(n, *steps) for n in (schema.REWARD, schema.OBSERVATION))
     bit = (rewards > np.median(rewards)).astype(np.float32)
     # Every twentieth trajectory is for validation.
     assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
@@ -141,16 +139,10 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
         {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
     ]
     env = make_env("Hopper-v5", 2, [0.0])
-    seen = []
-
-    class Still(Memoryless):
-        def act(self, observations: object, live: object) -> tuple[Float32Array, None]:
-            seen.append(np.array(observations))
-            return np.zeros((2, 3), dtype=np.float32), None
-
-    rollout(env, Still(), 4, seed=0)
-    assert {observation.shape for observation in seen} == {(2, 12)}
-    assert all((observation[:, 11] == 0).all() for observation in seen)
+    steps: list[Step] = []
+    rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)
+    assert {step.observations.shape[1] for step in steps} == {12}
+    assert not any(step.observations[:, 11].any() for step in steps)
 
 
 def test_policies_that_know_their_largest_return_are_asked_for_it(
@@ -201,13 +193,15 @@ def test_presets_are_configurations_with_targets() -> None:
     assert find_preset("walker2d", "mixed", "lsdt").targets == (10000,)
 
 
+LIGHT = """import sys
+from ucfrec.commands.cli import build_parser
+from ucfrec_control.cli import CONTROL
+build_parser(CONTROL, [])
+assert not {"torch", "mujoco", "minari", "h5py"} & sys.modules.keys()"""
+
+
 def test_help_needs_none_of_the_extras() -> None:
-    code = (
-        "import sys; from ucfrec.commands.cli import build_parser;"
-        "from ucfrec_control.cli import CONTROL; build_parser(CONTROL, []);"
-        "assert not {'torch', 'mujoco', 'minari', 'h5py'} & sys.modules.keys()"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", LIGHT], check=True)
 
 
 @pytest.mark.realdata
@@ -283,34 +277,28 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
     assert {r.evaluation_seed for r in more} == {1000}
 
 
-@pytest.mark.parametrize(
-    ("entry", "value"),
-    [
-        (("policy",), None),
-        (("config",), "text"),
-        (("config",), None),
-        (("data",), "text"),
-        (("data",), {}),
-        (("data", "dataset"), 5),
-        (("data", "env_id"), 5),
-        (("data", "versions"), "text"),
-        (("data", "versions"), {"mujoco": 3}),
-        (("data", "distractors"), 5),
-        (("data", "distractors"), [1]),
-        (("data", "env_settings"), [1]),
-        (("data", "env_settings"), {"xml_file": "/etc/passwd"}),
-        (("data", "env_settings"), {"frame_skip": 10**9}),
-        (("data", "env_settings"), {"frame_skip": 0}),
-        (("policy",), {}),
+STRANGE: dict[str, list[object]] = {
+    "policy": [None, {}],
+    "config": ["text", None],
+    "data": ["text", {}],
+    "data dataset": [5],
+    "data env_id": [5],
+    "data versions": ["text", {"mujoco": 3}],
+    "data distractors": [5, [1]],
+    "data env_settings": [
+        *([1], {"xml_file": "/etc/passwd"}, {"frame_skip": 10**9}, {"frame_skip": 0})
     ],
-)
+}
+
+
+@pytest.mark.parametrize(("entry", "value"), [(e, v) for e, vs in STRANGE.items() for v in vs])
 def test_a_strangers_run_is_refused_on_one_line(
-    folder: Path, tmp_path: Path, entry: tuple[str, ...], value: object
+    folder: Path, tmp_path: Path, entry: str, value: object
 ) -> None:
-    run = changed(folder / "store-run", tmp_path / "run", entry, value)
+    run = changed(folder / "store-run", tmp_path / "run", tuple(entry.split()), value)
     said = refused("evaluate", run, "--episodes", 1)
     assert said.startswith("ucfrec-control evaluate: ")
-    if entry == ("policy",):
+    if entry == "policy":
         assert value is not None or f"the training in {run} has not ended" in said
     # A run that says nothing of its data is not one of control, and has no figure.
     elif value != {} and not any(w in str(value) for w in ("xml_file", "frame_skip")):

@@ -88,9 +88,8 @@ def test_what_it_learns_from_is_what_is_logged() -> None:
     np.testing.assert_array_equal(held["actions"], logged["actions"])
     np.testing.assert_allclose(buffer.rewards[:learned, 0] * 10, logged["rewards"], atol=1e-5)
     np.testing.assert_array_equal(buffer.dones[:learned, 0] > 0, logged["terminated"])
-    goes_on = ~logged["terminated"]
-    after = buffer.next_observations[:learned, 0][goes_on] * high
-    np.testing.assert_allclose(after, logged["next_observations"][goes_on], atol=1e-5)
+    after, goes_on = buffer.next_observations[:learned, 0] * high, ~logged["terminated"]
+    np.testing.assert_allclose(after[goes_on], logged["next_observations"][goes_on], atol=1e-5)
 
 
 class Slope(SyntheticTaobao):

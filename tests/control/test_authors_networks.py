@@ -95,15 +95,9 @@ def long_and_short(left: dict[str, Tensor], theirs: str, ours: str) -> dict[str,
 
 
 def windows_of(inputs: dict[str, Tensor]) -> Windows:
-    mask = inputs["mask"].bool()
-    return Windows(
-        states=inputs["states"],
-        actions=inputs["actions"],
-        rewards=torch.zeros(mask.shape),
-        returns_to_go=inputs["returns_to_go"].squeeze(-1),
-        timesteps=inputs["timesteps"],
-        mask=mask,
-    )
+    mask = inputs.pop("mask").bool()
+    inputs["returns_to_go"] = inputs["returns_to_go"].squeeze(-1)
+    return Windows(**inputs, rewards=torch.zeros(mask.shape), mask=mask)
 
 
 @pytest.mark.parametrize("policy_name", POLICIES)
@@ -123,6 +117,5 @@ def test_outputs_equal_those_of_the_authors_code(policy_name: str) -> None:
     assert bool(windows.mask.all()) == (policy_name != "dt")
     with torch.no_grad():
         actions = policy.head.predict(policy.features(windows))
-    torch.testing.assert_close(
-        actions[windows.mask], fixture["actions"][windows.mask], atol=2e-6, rtol=0
-    )
+    ours, expected = actions[windows.mask], fixture["actions"][windows.mask]
+    torch.testing.assert_close(ours, expected, atol=2e-6, rtol=0)

@@ -38,16 +38,22 @@ from ucfrec_control.training.screening import ScreeningConfig, screen_states
 from ucfrec_control.training.train import train_control
 
 
-def test_an_early_distractor_tells_of_the_next_reward(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("early", [False, True])
+def test_a_distractor_tells_of_the_reward(folder: Path, tmp_path: Path, early: bool) -> None:
     store = EpisodeStore.open(folder / "store")
-    seen = add_distractor(store, tmp_path / "early", early=True)
-    assert seen.record.source.others["distractors"][0]["early"]
+    # Every twentieth trajectory is for validation.
+    assert np.flatnonzero(store.episode_values(schema.SPLIT)).tolist() == [10]
+    seen = add_distractor(store, tmp_path / "distracted", early=early)
+    assert seen.record.source.others["distractors"][0]["early"] == early
     episodes, steps = store.all_steps()
-    following = np.minimum(steps + 1, store.lengths[episodes] - 1)
-    rewards = store.step_values(schema.REWARD, episodes, following)
-    high = rewards > np.median(store.step_values(schema.REWARD, episodes, steps))
-    bit = seen.step_values(schema.OBSERVATION, episodes, steps)[:, -1]
-    np.testing.assert_array_equal(bit, high)
+    told = np.minimum(steps + early, store.lengths[episodes] - 1)
+    high = store.step_values(schema.REWARD, episodes, told) > np.median(
+        store.step_values(schema.REWARD, episodes, steps)
+    )
+    shown = seen.step_values(schema.OBSERVATION, episodes, steps)
+    np.testing.assert_array_equal(shown[:, -1], high)
+    before = store.step_values(schema.OBSERVATION, episodes, steps)
+    np.testing.assert_array_equal(shown[:, :-1], before)
 
 
 def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> None:

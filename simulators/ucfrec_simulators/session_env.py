@@ -16,6 +16,9 @@ from gymnasium.vector.utils import batch_space
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 
+AnyEnv = VectorEnv[Any, Any, Any]
+"""A vector environment of any observations and actions."""
+
 
 def data_folder(name: str) -> Path:
     """The folder `name` in `UCFREC_DATA`, by default in `data`."""

@@ -1,18 +1,17 @@
 """A synthetic catalogue of tagged items with an exit rule and an exactly known optimal policy."""
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.rollout import Actor, Memoryless, Uniform
 from ucfrec.arrays import Array, BoolArray, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.session_env import SessionsEnv, draw_categories
+from ucfrec_simulators.session_env import AnyEnv, SessionsEnv, draw_categories
 
 CLUSTERS: Final = 8
 FACTORS: Final = 4
@@ -219,20 +218,20 @@ class SoftmaxGuess(Memoryless):
         return chosen, probabilities[np.arange(len(chosen)), chosen].astype(np.float32)
 
 
-def _catalog(env: VectorEnv[Any, Any, Any]) -> SyntheticCatalog:
+def _catalog(env: AnyEnv) -> SyntheticCatalog:
     """The catalogue within `env`, whose policies refuse any other environment."""
     if not isinstance(env.unwrapped, SyntheticCatalog):
         raise InputError(f"this behavior policy serves SyntheticCatalog, not {type(env).__name__}")
     return env.unwrapped
 
 
-def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+def optimal(env: AnyEnv, seed: int) -> Rotation:
     """The optimal policy: `Rotation` with the true probabilities; `seed` is unused."""
     environment = _catalog(env)
     return Rotation(environment, environment.favourites(environment.click_probabilities))
 
 
-def popular(env: VectorEnv[Any, Any, Any], seed: int) -> Rotation:
+def popular(env: AnyEnv, seed: int) -> Rotation:
     """`Rotation` by mean probabilities over users: a non-personalised policy; `seed` is unused."""
     environment = _catalog(env)
     favourites = environment.favourites(environment.click_probabilities.mean(axis=0, keepdims=True))
@@ -247,7 +246,7 @@ QUALITIES: Final = (
 """Error, temperature, epsilon, variety and share of sessions of each policy of the mixture."""
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform items, the others one of the policies of `QUALITIES`.
@@ -259,7 +258,7 @@ def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
     return SessionMixture(actors, shares, seed)
 
 
-def softmax(env: VectorEnv[Any, Any, Any], seed: int) -> SoftmaxGuess:
+def softmax(env: AnyEnv, seed: int) -> SoftmaxGuess:
     """A logging policy that tries much: other policies can be evaluated on its logs."""
     knobs = {"error": 0.5, "temperature": 5.0, "epsilon": 0.1, "variety": 0.0}
     return SoftmaxGuess(_catalog(env), seed, **knobs)

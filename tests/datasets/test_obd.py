@@ -1,5 +1,4 @@
-"""Open Bandit Dataset: official file names, and two real policies evaluated on each other's
-logs."""
+"""Open Bandit Dataset: official files, and two real policies evaluated on each other's logs."""
 
 import shutil
 from pathlib import Path
@@ -73,7 +72,6 @@ def test_official_files(tmp_path: Path, name: str) -> None:
 
 
 def test_a_run_of_one_campaign_reads_no_other(tmp_path: Path) -> None:
-    """Both number their items from 0, and mean other items."""
     for campaign in ("men", "women"):
         official(tmp_path / "random" / campaign, campaign)
     men, women = (tmp_path / "random" / name for name in ("men", "women"))

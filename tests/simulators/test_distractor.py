@@ -44,10 +44,8 @@ def stores(kuairand_folder: Path) -> dict[str, EpisodeStore]:
     assert main(["collect", *played, "--out", logs]) == 0
     rewards = ["--reward", "clicks", "--session-by", "session_id"]
     assert main(["prepare", f"{logs}/sessions.parquet", *rewards, "--out", taobao]) == 0
-    return {
-        "synthetic-taobao": EpisodeStore.open(taobao),
-        "kuairand": EpisodeStore.open(kuairand_folder / "log" / "store"),
-    }
+    paths = {"synthetic-taobao": taobao, "kuairand": kuairand_folder / "log" / "store"}
+    return {name: EpisodeStore.open(path) for name, path in paths.items()}
 
 
 @pytest.mark.parametrize("name", ["synthetic-taobao", "kuairand"])
@@ -120,14 +118,10 @@ def test_the_distractor_causes_nothing(kuairand_folder: Path, name: str) -> None
         DistractorEnv(plain, 2.0)
 
 
-@pytest.mark.parametrize("name", ["synthetic-taobao-distractor", "kuairand-distractor-on"])
-def test_gymnasium_accepts_it(kuairand_folder: Path, name: str) -> None:
+def test_gymnasium_accepts_it_and_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
     folder = kuairand_folder / "environment"
-    check_environment(Environment(name, folder).simulator().make(1, folder))
-
-
-def test_behaviors_do_not_look_at_it(kuairand_folder: Path) -> None:
-    folder = kuairand_folder / "environment"
+    for name in ("synthetic-taobao-distractor", "kuairand-distractor-on"):
+        check_environment(Environment(name, folder).simulator().make(1, folder))
     for name, behavior in (("synthetic-taobao", "optimal"), ("kuairand", "oracle")):
         environments = (Environment(n, folder) for n in (name, f"{name}-distractor-on"))
         plain, distractor = (evaluate_behavior(w, behavior, 40, 0)["R_cum"] for w in environments)
@@ -168,7 +162,6 @@ def test_a_policy_is_shown_the_distractor_where_it_was_trained_on_it(
 def test_screening_finds_the_distractor_among_items_and_its_value_changes_no_return(
     kuairand_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That what is dropped might never have been logged is tested with `ucfrec.runs.screened`."""
     store = EpisodeStore.open(kuairand_folder / "log" / "store")
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     planted = plant_distractor(store, tmp_path / "planted")

@@ -24,17 +24,11 @@ class Browser:
             os.dup2(read_by_it, 3)
             os.dup2(written_by_it, 4)
 
-        self._process = subprocess.Popen(
-            [
-                *(CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run"),
-                *("--disable-dev-shm-usage", f"--user-data-dir={folder}"),
-                *("--remote-debugging-pipe", "about:blank"),
-            ],
-            preexec_fn=hand_over,
-            close_fds=False,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        command = (CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run")
+        command += ("--disable-dev-shm-usage", f"--user-data-dir={folder}")
+        command += ("--remote-debugging-pipe", "about:blank")
+        quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, preexec_fn=hand_over, close_fds=False, **quiet)
         os.close(read_by_it)
         os.close(written_by_it)
         self._buffer, self._number, self._session = b"", 0, ""

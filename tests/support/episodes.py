@@ -1,9 +1,5 @@
-"""Random episodes as plain Python lists, the stores they make, and what a slow reader sees there.
-
-Everything here is written from the documentation of `ucfrec.episodes.store` and
-`ucfrec.episodes.states`, one row at a time and in float64, so that tests compare the store with an
-independent computation.
-"""
+"""Random episodes as plain Python lists, the stores they make, and what a slow reader sees there:
+one row at a time, in float64, from the documentation of `ucfrec.episodes.store` and `states`."""
 
 import math
 from dataclasses import dataclass, field, replace

@@ -12,13 +12,10 @@ ITEMS = 4
 
 
 class Echo(gymnasium.Env[Any, Any]):
-    """Five steps; the reward of item a is a, that of a vector its sum.
-
-    A session's secret number is observed as `secret`, and the step as the category `step`; with
-    `whole` the category alone is the observation. `notes` adds an entry of no fixed size. `users`
-    is the `user_id` of every `info`; `visitors` are the users of one session after the other, told
-    by `reset` alone, None for a session without.
-    """
+    """Five steps; the reward of item a is a, that of a vector its sum. Observed are a session's
+    `secret` number and the category `step`, with `whole` the latter alone; `notes` adds an entry of
+    no fixed size. `users` is the `user_id` of every `info`, `visitors` those of one session after
+    the other, told by `reset` alone."""
 
     def __init__(
         self,

@@ -2,8 +2,7 @@
 
     python killed_training.py SEED FOLDER
 
-Prints how many processes were killed and what the last one's loop returned. One
-interpreter imports torch; each life of the training is a fork of it.
+Prints how many were killed and what the last loop returned. Each is a fork of one interpreter.
 """
 
 import json

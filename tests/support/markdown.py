@@ -31,11 +31,8 @@ class Page:
 
     def code(self, language: str) -> list[str]:
         """Code blocks of a language, without the indentation of the list they stand in."""
-        return [
-            "\n".join(line.removeprefix(indent) for line in code.splitlines())
-            for indent, kind, code in _BLOCK.findall(self.text)
-            if kind == language
-        ]
+        blocks = [(i, code) for i, kind, code in _BLOCK.findall(self.text) if kind == language]
+        return ["\n".join(n.removeprefix(i) for n in code.splitlines()) for i, code in blocks]
 
     def commands(self) -> list[str]:
         """Command lines of `ucfrec` and `ucfrec-control`, continued lines joined."""

@@ -9,24 +9,13 @@ from ucfrec.results.rows import CONFIGURATIONS, ResultRow
 
 
 def result_row(value: float = 1.0, **fields: Any) -> ResultRow:
-    """A row of a recommendation table with `value` as R_cum; `fields` as they differ from it.
-
-    `metrics` are added to R_cum, other fields replace those of the row.
-    """
-    given: dict[str, Any] = {
-        "suite": "recommendation",
-        "table": "main",
-        "task": "w",
-        "environment": "w",
-        "method": "m",
-        "policy": "m",
-        "training_seed": 0,
-        "checkpoint": "best",
-        "metric": "R_cum",
-    }
-    metric = fields.get("metric", given["metric"])
-    metrics = {metric: value, **fields.pop("metrics", {})}
-    return ResultRow(**given | {"metrics": metrics} | fields)
+    """A row of a recommendation table with `value` as R_cum; `metrics` are added to it, other
+    `fields` replace those of the row."""
+    given: dict[str, Any] = {"suite": "recommendation", "table": "main", "metric": "R_cum"}
+    given |= {"task": "w", "environment": "w", "method": "m", "policy": "m"}
+    given |= {"training_seed": 0, "checkpoint": "best"} | fields
+    given["metrics"] = {given["metric"]: value, **fields.get("metrics", {})}
+    return ResultRow(**given)
 
 
 def read_configurations(folder: Path) -> dict[str, Any]:

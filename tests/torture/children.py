@@ -31,11 +31,7 @@ class End:
     hung: bool = False
 
     def fault(self, allowed: Sequence[int]) -> str:
-        """What is wrong with this end; empty if nothing is.
-
-        Args:
-            allowed: exit statuses; 2, 130 and 143 print one line, others no traceback.
-        """
+        """What is wrong with this end; of the `allowed` statuses 2, 130 and 143 print a line."""
         printed = self.printed.strip()
         if self.hung:
             return "hung"
@@ -169,9 +165,5 @@ def leftovers(*folders: Path) -> list[str]:
     """Locks and scratch in the folders."""
     from ucfrec.files.atomic import LOCK, SCRATCH
 
-    return [
-        str(path)
-        for folder in folders
-        for path in folder.rglob(".*")
-        if path.name.endswith((LOCK, SCRATCH))
-    ]
+    hidden = [path for folder in folders for path in folder.rglob(".*")]
+    return [str(path) for path in hidden if path.name.endswith((LOCK, SCRATCH))]

@@ -125,10 +125,8 @@ def _content(file: Path) -> bytes:
         from ucfrec.fitting.checkpoint import load_tensors
 
         tensors, _ = load_tensors(file)
-        return b"".join(
-            name.encode() + np.ascontiguousarray(tensor.numpy()).tobytes()
-            for name, tensor in sorted(tensors.items())
-        )
+        parts = ((k.encode(), v.contiguous().numpy().tobytes()) for k, v in sorted(tensors.items()))
+        return b"".join(name + values for name, values in parts)
     if file.name == "meta.json":
         return json.dumps(json.loads(file.read_text())["fingerprint"]).encode()
     if file.name == "metrics.jsonl":

@@ -145,10 +145,8 @@ def hostile_parquet(folder: Path) -> Counter[str]:
     place.mkdir()
     Running(lambda: _write_hostile(place)).wait()
     for path in sorted(place.glob("*.parquet")):
-        end = Running(
-            command("prepare", path, "--out", place / "store", "--memory-limit", "200MB"),
-            memory=4 * 2**30,
-        ).wait(60)
+        work = command("prepare", path, "--out", place / "store", "--memory-limit", "200MB")
+        end = Running(work, memory=4 * 2**30).wait(60)
         counts["cases"] += 1
         counts["refused"] += end.status == 2
         if fault := end.fault((0, 2)):

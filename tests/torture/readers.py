@@ -221,7 +221,7 @@ def _mutate_json(generator: random.Random, content: bytes) -> bytes:
     if isinstance(value, dict):
         value.pop("checksum", None)
     for _ in range(generator.choice((1, 1, 1, 2, 5))):
-        place, key, inner = None, None, value
+        place, inner = None, value
         while isinstance(inner, dict | list) and inner:
             place = inner
             key = generator.choice([*inner] if isinstance(inner, dict) else range(len(inner)))

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Final
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.vector import VectorEnv
 from pydantic import Field
 
 from ucfrec.acting.rollout import Actor, Memoryless, Step, rollout
@@ -24,7 +23,7 @@ from ucfrec_control.data.agents import read_agent
 from ucfrec_control.data.d4rl import write_d4rl
 from ucfrec_control.data.sac import SacConfig, SacTraining, seed_all
 from ucfrec_control.data.trajectories import PACKAGES, Trajectories
-from ucfrec_control.environments.environments import SIDE_BY_SIDE, make_env
+from ucfrec_control.environments.environments import SIDE_BY_SIDE, AnyEnv, make_env
 
 SHOWN: Final = ("dataset", "trajectories", "steps", "mean_return")
 _COLUMNS: Final = ("observations", "actions", "rewards")
@@ -228,7 +227,7 @@ def _train(env_id: str, folder: Path, seed: int, config: CollectConfig) -> _Trai
     return training
 
 
-def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, episodes: int) -> None:
+def _evaluate(training: _Training, env: AnyEnv, seed: int, episodes: int) -> None:
     """Evaluate and save the current policy, and save a checkpoint of the sac."""
     sac, index = training.sac, len(training.evaluations)
     mean_return = _mean_return(env, sac, episodes, (seed, 3, index))
@@ -237,16 +236,14 @@ def _evaluate(training: _Training, env: VectorEnv[Any, Any, Any], seed: int, epi
     sac.save(training.checkpoint, training.evaluations)
 
 
-def _mean_return(
-    env: VectorEnv[Any, Any, Any], actor: Actor, episodes: int, key: tuple[int, ...]
-) -> float:
+def _mean_return(env: AnyEnv, actor: Actor, episodes: int, key: tuple[int, ...]) -> float:
     return float(rollout(env, actor, episodes, seed_all(key), describe="evaluate").returns.mean())
 
 
 class _Uniform(Memoryless):
     """Actor that chooses uniformly random actions."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], seed: int) -> None:
+    def __init__(self, env: AnyEnv, seed: int) -> None:
         self._space = env.action_space
         self._space.seed(seed)
 

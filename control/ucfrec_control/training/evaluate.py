@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 
 from ucfrec.acting.decision import DecisionRule
 from ucfrec.acting.rollout import rollout
@@ -24,6 +23,7 @@ from ucfrec.runs.trained_policy import TrainedPolicy
 from ucfrec_control.data.trajectories import PACKAGES, control_source
 from ucfrec_control.environments.environments import (
     SIDE_BY_SIDE,
+    AnyEnv,
     Wrap,
     environment_of_data,
     make_env,
@@ -129,7 +129,7 @@ def open_environment(
     wrappers: Sequence[Wrap] = (),
     distractor: float = 0.0,
     **settings: Any,
-) -> VectorEnv[Any, Any, Any]:
+) -> AnyEnv:
     """`count` environments that show what was logged where the policy was trained, distractors
     fixed to `distractor`; `settings` are arguments over those of the data.
 

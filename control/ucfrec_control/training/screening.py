@@ -153,9 +153,8 @@ class _Data:
         self.moving = self.changes.abs().amax(0) > 0
         held_out = held_out_steps(view, self.episodes)
         self.seen, self.held_out = np.flatnonzero(~held_out), np.flatnonzero(held_out)
-        self.reward_variance = max(
-            float(self.rewards[torch.from_numpy(self.held_out)].var()), 1e-12
-        )
+        variance = self.rewards[torch.from_numpy(self.held_out)].var()
+        self.reward_variance = max(float(variance), 1e-12)
         self.config, self.seed = config, seed
 
     def absences(self, missing: Sequence[Collection[int]]) -> Tensor:
@@ -195,9 +194,8 @@ class _Predictors(nn.Module):
     def errors(self, data: _Data, rows: Tensor, missing: Tensor) -> tuple[Tensor, Tensor]:
         """Squared errors (M, B, S) and (M, B); `missing` (M, 1 or B, S) is 1 where missing."""
         missing = missing.expand(-1, len(rows), -1)
-        actions, rewards = (
-            values[rows].expand(len(missing), -1, -1) for values in (data.actions, data.rewards)
-        )
+        actions = data.actions[rows].expand(len(missing), -1, -1)
+        rewards = data.rewards[rows].expand(len(missing), -1, -1)
         inputs = torch.cat([data.states[rows] * (1 - missing), missing, actions], 2)
         next_errors = self.next_state(torch.cat([inputs, rewards], 2)) - data.changes[rows]
         return next_errors.square(), (self.reward(inputs) - rewards).square().squeeze(2)
@@ -248,10 +246,9 @@ def _fit_shared(data: _Data) -> _Predictors:
 
 def _find_helpful(shared: _Predictors, data: _Data) -> list[int]:
     """Dimensions without which the shared predictor knows less of the reward."""
-    missing = [(), *((dimension,) for dimension in range(data.size))]
     whole, *errors = (
-        float(shared.all_errors(data, data.held_out, data.absences([one]))[1].mean())
-        for one in missing
+        float(shared.all_errors(data, data.held_out, data.absences([missing]))[1].mean())
+        for missing in [(), *((dimension,) for dimension in range(data.size))]
     )
     most = whole + data.config.min_reward_effect * data.reward_variance
     return [dimension for dimension, error in enumerate(errors) if error >= most]

@@ -1,14 +1,13 @@
 """A synthetic Taobao environment, without downloads and with a known optimal policy."""
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import Rule, SessionMixture
-from ucfrec_simulators.session_env import draw_categories
+from ucfrec_simulators.session_env import AnyEnv, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -102,14 +101,14 @@ QUALITIES: Final = ((0.1, 0.2, 0.25), (0.4, 0.2, 0.25), (0.7, 0.2, 0.20), (0.95,
 """Blends of the mixture: quality, noise, share of sessions."""
 
 
-def optimal(env: VectorEnv[Any, Any, Any], seed: int) -> Rule:
+def optimal(env: AnyEnv, seed: int) -> Rule:
     """The optimal policy, which always takes a*; `seed` is unused."""
     environment = taobao(env)
     assert isinstance(environment, SyntheticTaobao)
     return Rule(environment.optimal_actions)
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A fifth of the sessions get uniform actions, the others a noisy blend of an untuned constant

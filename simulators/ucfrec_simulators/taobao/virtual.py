@@ -3,18 +3,17 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from torch import nn
 
 from ucfrec.arrays import Array, Float32Array, Float64Array, IntArray
 from ucfrec.errors import InputError
 from ucfrec.evaluation.simulator import Simulator
 from ucfrec_simulators.behaviors import SessionMixture
-from ucfrec_simulators.session_env import data_folder, draw_categories
+from ucfrec_simulators.session_env import AnyEnv, data_folder, draw_categories
 from ucfrec_simulators.taobao import ddpg
 from ucfrec_simulators.taobao.environment import (
     ACTION_DIM,
@@ -135,7 +134,7 @@ QUALITIES: Final = ((0.1, 0.3, 0.30), (0.4, 0.3, 0.20), (0.7, 0.4, 0.15), (0.9, 
 """Blends of the mixture: quality, noise, share of sessions."""
 
 
-def mixture(env: VectorEnv[Any, Any, Any], seed: int) -> SessionMixture:
+def mixture(env: AnyEnv, seed: int) -> SessionMixture:
     """A logging policy of medium mean quality and high variance between sessions.
 
     A quarter of the sessions get uniform actions, the others a blend of an untuned constant and the

@@ -98,6 +98,13 @@ def test_rows_have_the_settings_that_they_are_named_after() -> None:
     assert [main[m].policy.best_share for m in ("bc", "bc-10", "bc-25")] == [1.0, 0.1, 0.25]
 
 
+@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
+def test_what_is_no_context_is_refused(given: str) -> None:
+    assert context_given("ucf=20") == ("ucf", 20)
+    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
+        context_given(given)
+
+
 def test_seeds_are_fewer_for_some_methods_and_for_antmaze() -> None:
     small, full = BUDGETS["small"], BUDGETS["full"]
     assert small.fewer_seeds.keys() <= METHODS.keys()
@@ -115,13 +122,6 @@ def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
     assert contexts.pop("dc-wo-time") == 20
     assert {contexts[name] for name in ("ucf", "dt-wo-time")} == {8}
     assert {contexts[name] for name in ("bc", "bc-10", "bc-25")} == {1}
-
-
-@pytest.mark.parametrize("given", ["ucf", "nope=8", "ucf=0", "ucf=-3", "ucf=8.5", "ucf=9999999"])
-def test_what_is_no_context_is_refused(given: str) -> None:
-    assert context_given("ucf=20") == ("ucf", 20)
-    with pytest.raises(ArgumentTypeError, match="METHOD=STEPS"):
-        context_given(given)
 
 
 @pytest.mark.parametrize("table", TABLES)

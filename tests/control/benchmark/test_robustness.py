@@ -47,20 +47,15 @@ def test_a_distractor_tells_of_the_reward(folder: Path, tmp_path: Path, early: b
     assert seen.record.source.others["distractors"][0]["early"] == early
     episodes, steps = store.all_steps()
     told = np.minimum(steps + early, store.lengths[episodes] - 1)
-    high = store.step_values(schema.REWARD, episodes, told) > np.median(
-        store.step_values(schema.REWARD, episodes, steps)
-    )
-    shown = seen.step_values(schema.OBSERVATION, episodes, steps)
-    np.testing.assert_array_equal(shown[:, -1], high)
-    before = store.step_values(schema.OBSERVATION, episodes, steps)
-    np.testing.assert_array_equal(shown[:, :-1], before)
+    median = np.median(store.step_values(schema.REWARD, episodes, steps))
+    high = store.step_values(schema.REWARD, episodes, told) > median
+    before, shown = (s.step_values(schema.OBSERVATION, episodes, steps) for s in (store, seen))
+    np.testing.assert_array_equal(shown, np.column_stack([before, high]))
 
 
 def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> None:
-    rows = [
-        row("none", 50.0), row("early", 20.0), row("stochastic", 40.0),
-        row("none", 100.0, seed=1), row("early", 80.0, seed=1), row("stochastic", 10.0, seed=1),
-    ]  # fmt: skip
+    scores = {"none": (50.0, 100.0), "early": (20.0, 80.0), "stochastic": (40.0, 10.0)}
+    rows = [row(kind, scores[kind][seed], seed=seed) for kind in scores for seed in (0, 1)]
     # Lost at 0: early 60 and 20%, stochastic 20 and 90%; at 1, where twice large a return is
     # reached: early 20 and −60%, stochastic −60 and 80%.
     (line,) = largest_drops(rows)
@@ -68,10 +63,9 @@ def test_the_largest_drop_of_a_method_is_over_cases_in_the_mean_over_seeds() -> 
 
 
 def row(distractor: str, score: float, method: str = "dt", seed: int = 0) -> ResultRow:
-    return result_row(
-        score, suite="robustness", task="d", method=method, training_seed=seed, metric="score",
-        conditions={"distractor": distractor}, metrics={"score_at_one": 2 * score},
-    )  # fmt: skip
+    own = {"conditions": {"distractor": distractor}, "metrics": {"score_at_one": 2 * score}}
+    own |= {"suite": "robustness", "task": "d", "method": method, "metric": "score"}
+    return result_row(score, training_seed=seed, **own)
 
 
 def test_drops_compare_with_the_same_seed_without_distractor() -> None:
@@ -84,7 +78,7 @@ def test_drops_compare_with_the_same_seed_without_distractor() -> None:
     early = found["early", 0]
     assert (early["clean"], early["score"], early["drop"]) == (80.0, 20.0, 75.0)
     assert (early["score_at_one"], early["drop_at_one"]) == (40.0, 50.0)
-    assert found["stochastic", 0]["drop"] == -25.0
+    assert found["stochastic", 0]["drop"] == -25
     assert math.isnan(found["early", 1]["drop"])
 
 

@@ -56,18 +56,12 @@ def test_trajectories_become_episodes(file: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(values[0], columns[name][5:9])
     np.testing.assert_allclose(store.returns[2], columns["rewards"][5:11].sum(), rtol=1e-5)
     assert store.record.source.others["env_id"] == "Hopper-v5"
-
-
-def test_doubles_and_float_flags_read_as_singles_and_bools(file: Path, tmp_path: Path) -> None:
-    """medium-replay has float64; AntMaze stores its flags as floats."""
-    wide = {name: values.astype(np.float64) for name, values in hopper_like(LENGTHS).items()}
+    # medium-replay has float64; AntMaze stores its flags as floats.
+    wide = {name: values.astype(np.float64) for name, values in columns.items()}
     read = read_d4rl(write_hdf5(tmp_path / "b.hdf5", wide))
     assert read.observations.dtype == read.rewards.dtype == np.float32
     assert read.terminated.dtype == bool
-    first, second = (
-        t.write_store(tmp_path / f"s{i}") for i, t in enumerate((read_d4rl(file), read))
-    )
-    assert first.record.fingerprint == second.record.fingerprint
+    assert read.write_store(tmp_path / "wide").record.fingerprint == store.record.fingerprint
 
 
 def test_an_unfinished_last_trajectory_is_dropped_and_counted(tmp_path: Path) -> None:
@@ -90,8 +84,7 @@ def test_steps_on_the_goal_are_dropped_of_antmaze_alone(tmp_path: Path) -> None:
     assert read.source["dropped"]["one_step_trajectories"] == 1
     assert read.source["env_id"] == "d4rl/antmaze-umaze-v2"
     assert read.final_observations is None
-    kept = np.delete(columns["rewards"], 4)
-    np.testing.assert_array_equal(read.rewards, kept)
+    np.testing.assert_array_equal(read.rewards, np.delete(columns["rewards"], 4))
     assert len(read_d4rl(write_hdf5(tmp_path / "hopper.hdf5", columns)).lengths) == 4
 
 
@@ -120,6 +113,10 @@ def test_d4rl_files_are_of_v4_environments(tmp_path: Path) -> None:
     assert read_d4rl(write_hdf5(tmp_path / "halfcheetah.hdf5", hopper_like()), "Hopper-v5")
     assert find_kind("hopper_medium_expert-v2") == "medium-expert"
     assert find_kind("mujoco/hopper/medium-v0") == "medium"
+    assert require_task("HalfCheetah-v5").score(12135.0) == 100
+    assert require_task(None, "walker2d_mixed-zoo").score([1.629008, 4592.3]).tolist() == [0, 100]
+    with pytest.raises(InputError, match="no reference returns are known for Ant-v5"):
+        require_task("Ant-v5")
 
 
 def with_one(value: float) -> Callable[[Array], Array]:
@@ -207,19 +204,15 @@ def test_what_is_not_within_the_file_is_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_links_in_groups_are_found(tmp_path: Path) -> None:
+def test_links_in_groups_are_found_and_what_compresses_well_is_read(tmp_path: Path) -> None:
     path = write_hdf5(tmp_path / "hopper.hdf5", hopper_like())
     require_inside(path)
     with h5py.File(path, "r+") as file:
         file["infos/more"] = h5py.ExternalLink("/etc/passwd", "/")
     with pytest.raises(InputError, match="more is a link to another file"):
         require_inside(path)
-
-
-def test_values_that_compress_well_are_read(tmp_path: Path) -> None:
     columns = hopper_like((1000,) * 50)
     columns["actions"][:] = 0
-    path = tmp_path / "hopper.hdf5"
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=9)
@@ -352,13 +345,6 @@ def test_minari_goals_are_left_out_and_unfinished_episodes_dropped(minari_folder
     np.testing.assert_array_equal(read.final_observations, wanted[4:])
     assert read.lengths.tolist() == [4]
     assert read.source["dropped"]["unfinished_steps"] == 4
-
-
-def test_scores_are_d4rls() -> None:
-    assert require_task("HalfCheetah-v5").score(12135.0) == 100
-    assert require_task(None, "walker2d_mixed-zoo").score([1.629008, 4592.3]).tolist() == [0, 100]
-    with pytest.raises(InputError, match="no reference returns are known for Ant-v5"):
-        require_task("Ant-v5")
 
 
 @pytest.mark.realdata

@@ -47,9 +47,8 @@ def test_evaluate_writes_last_and_best_apart(folder: Path, tmp_path: Path) -> No
     assert MADE in printed
     assert "warning" not in said
     rows = read_results(out)
-    assert [(r.checkpoint, r.target_return) for r in rows] == [
-        (checkpoint, target) for checkpoint in ("last", "best") for target in (3600, 1800)
-    ]
+    keys = [(r.checkpoint, r.target_return) for r in rows]
+    assert keys == list(product(("last", "best"), (3600, 1800)))
     record = read_json(run / "run.json")
     for row in rows:
         assert (row.task, row.method, row.policy, row.training_seed) == (MADE, "dt", "dt", 3)
@@ -108,9 +107,8 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     out = tmp_path / "rows.json"
     control("evaluate", folder / "distracted-run", *LAST, "--target", 900, "--json", out)
     (row,) = read_results(out)
-    assert row.details["distractors"] == [
-        {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
-    ]
+    planted = {"dimension": 11, "flip": 0.15, "seed": 0, "early": False}
+    assert row.details["distractors"] == [planted]
     env = make_env("Hopper-v5", 2, [0.0])
     steps: list[Step] = []
     rollout(env, Uniform(env, 0), 4, seed=0, on_step=steps.append)
@@ -175,7 +173,6 @@ def test_help_needs_none_of_the_extras() -> None:
 
 @pytest.mark.realdata
 def test_a_clone_of_a_zoo_file_hops(tmp_path: Path) -> None:
-    """Behaviour cloning, minutes less than a real run, is well above what falls at once."""
     read_d4rl(data_folder("control") / "hopper_medium-zoo.hdf5").write_store(tmp_path / "store")
     settings = ["train.steps=300", "train.warmup_steps=20", "train.learning_rate=2e-3"]
     settings += ["train.batch_size=256", "train.validate_every=300"]
@@ -218,9 +215,8 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
     command = ("benchmark", "--data", tmp_path, *where)
     control(*command)
     rows, before = read_rows(results), results.read_text()
-    assert sorted((r.method, r.checkpoint) for r in rows) == [
-        (method, checkpoint) for method in ("lsdt", "ucf") for checkpoint in ("best", "last")
-    ]
+    kept = sorted((r.method, r.checkpoint) for r in rows)
+    assert kept == list(product(("lsdt", "ucf"), ("best", "last")))
     for row in rows:
         assert (row.suite, row.table, row.task) == ("control", "main", MADE)
         assert row.conditions.items() >= {"budget": "small", "episodes": 2}.items()
@@ -240,10 +236,9 @@ def test_a_benchmark_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mo
     file.rename(tmp_path / "hopper_medium-own.hdf5")
     control(*command, "--file", "hopper_medium-own", "--method", "lsdt", "--seeds", 2)
     more = read_rows(results)[len(again) :]
-    assert sorted((r.task, r.method, r.training_seed) for r in more) == [
-        ("hopper_medium-own", "lsdt", seed) for seed in (0, 0, 1, 1)
-    ]
-    assert {r.evaluation_seed for r in more} == {1000}
+    keys = {(r.task, r.method, r.evaluation_seed) for r in more}
+    assert keys == {("hopper_medium-own", "lsdt", 1000)}
+    assert sorted(str(r.training_seed) for r in more) == ["0", "0", "1", "1"]
 
 
 STRANGE: dict[str, list[object]] = {
@@ -254,9 +249,7 @@ STRANGE: dict[str, list[object]] = {
     "data env_id": [5],
     "data versions": ["text", {"mujoco": 3}],
     "data distractors": [5, [1]],
-    "data env_settings": [
-        *([1], {"xml_file": "/etc/passwd"}, {"frame_skip": 10**9}, {"frame_skip": 0})
-    ],
+    "data env_settings": [[1], {"xml_file": "/etc/x"}, {"frame_skip": 10**9}, {"frame_skip": 0}],
 }
 
 

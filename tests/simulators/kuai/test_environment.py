@@ -65,10 +65,8 @@ def test_every_exit_agrees_with_a_plain_reading(
         np.testing.assert_array_equal(paid, rewards[users, actions])
         assert list(zip(terminated, terminated | truncated, strict=True)) == expected
         np.testing.assert_array_equal(boring, terminated)
-        sessions = [
-            Plain(tags, rule) if over else session
-            for session, (_, over) in zip(sessions, expected, strict=True)
-        ]
+        ends = [over for _, over in expected]
+        sessions = [Plain(tags, rule) if e else s for s, e in zip(sessions, ends, strict=True)]
 
 
 def small(num_envs: int = 6, items: int = 40, rule: str = "dorl", regime: str = "FB") -> KuaiEnv:
@@ -137,7 +135,11 @@ def test_uniform_choice_among_allowed_items_is_uniform() -> None:
     assert info[FORBIDDEN].shape == (20_000, 30)
 
 
-def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
+def test_what_does_not_fit_a_masked_item_and_a_deaf_actor_are_refused() -> None:
+    with pytest.raises(InputError, match="5 items are too few for a session of 10"):
+        small(1, items=5, regime="NX_10")
+    with pytest.raises(InputError, match=r"3 users × 4 items, .* tags of 5 items"):
+        KuaiEnv(1, np.zeros((3, 4), np.float32), [()] * 5, EXITS["cirs"])
     env = small(2, regime="NX_10")
     env.reset(seed=0)
     env.step(np.array([3, 4]))
@@ -145,13 +147,6 @@ def test_a_masked_item_is_refused_and_a_deaf_actor_too() -> None:
         env.step(np.array([5, 4]))
     with pytest.raises(InputError, match="which Rule ignores"):
         rollout(env, repeat_action(np.zeros(1, np.float32)), 2, 0)
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="5 items are too few for a session of 10"):
-        small(1, items=5, regime="NX_10")
-    with pytest.raises(InputError, match=r"3 users × 4 items, .* tags of 5 items"):
-        KuaiEnv(1, np.zeros((3, 4), np.float32), [()] * 5, EXITS["cirs"])
 
 
 @pytest.mark.parametrize("regime", REGIMES)

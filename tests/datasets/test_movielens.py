@@ -60,9 +60,7 @@ def official_100k() -> bytes:
     return file.getvalue()
 
 
-def test_the_100k_release_is_trained_on_in_one_call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_call_trains_on_the_100k_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = official_100k()
     release = DATASET.releases["movielens-100k"]
     checksum = f"md5:{hashlib.md5(content).hexdigest()}"

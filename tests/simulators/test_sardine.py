@@ -101,7 +101,7 @@ def test_logs_hold_propensities_and_tags(tmp_path: Path) -> None:
         assert np.flatnonzero(topics).tolist() == tags.tolist()
 
 
-def test_other_environments_and_a_missing_package_are_named(
+def test_other_environments_and_missing_packages_are_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with pytest.raises(InputError, match="serves SARDINE, not SyntheticCatalog"):

@@ -323,9 +323,7 @@ def list_readers(inputs: Inputs) -> list[Reader]:
     def read_log(file: Path) -> object:
         return validate([file], read_mapping(file.with_name("empty.toml")))
 
-    def alone(
-        folder: Path, file: str, read: Callable[[Path], object], slow: bool = False
-    ) -> Reader:
+    def lone(folder: Path, file: str, read: Callable[[Path], object], slow: bool = False) -> Reader:
         """What reads one file, whatever lies beside it."""
         return Reader(f"{Path(file).name} alone", folder, file, lambda at: read(at / file), slow)
 
@@ -339,18 +337,18 @@ def list_readers(inputs: Inputs) -> list[Reader]:
         *(Reader(f"run: {file}", run, file, act, slow=True) for file in of_run),
         Reader("report: run.json", run, "run.json", report, slow=True),
         Reader("report: samples.json", run, "samples.json", report, slow=True),
-        alone(run, "policy/last.safetensors", load_tensors),
-        alone(run, "policy/metrics.jsonl", lambda file: read_metrics(file.parent)),
-        alone(run, "items.parquet", lambda file: read_ids(file, "item_id")),
-        alone(texts, "rows.jsonl", read_rows),
-        alone(texts, "evaluations.json", read_results),
+        lone(run, "policy/last.safetensors", load_tensors),
+        lone(run, "policy/metrics.jsonl", lambda file: read_metrics(file.parent)),
+        lone(run, "items.parquet", lambda file: read_ids(file, "item_id")),
+        lone(texts, "rows.jsonl", read_rows),
+        lone(texts, "evaluations.json", read_results),
         Reader("report: evaluations.json", texts, "evaluations.json", report_results, slow=True),
-        alone(texts, "mapping.toml", read_mapping),
-        alone(texts, "config.toml", lambda file: resolve_config(file=file)),
-        alone(texts, "setting.txt", read_setting),
-        alone(texts, "log.csv", read_log, slow=True),
-        alone(texts, "log.parquet", read_log, slow=True),
-        alone(texts, "hopper.hdf5", read_d4rl),
+        lone(texts, "mapping.toml", read_mapping),
+        lone(texts, "config.toml", lambda file: resolve_config(file=file)),
+        lone(texts, "setting.txt", read_setting),
+        lone(texts, "log.csv", read_log, slow=True),
+        lone(texts, "log.parquet", read_log, slow=True),
+        lone(texts, "hopper.hdf5", read_d4rl),
     ]
 
 

@@ -198,6 +198,8 @@ def _row(
         env.close()
     seconds = time.perf_counter() - began
     low, high = task.score(bootstrap_interval(rolled_out.returns, seed))
+    conditions: dict[str, Any] = {"episodes": episodes, "distractor_fixed_to": distractor}
+    conditions["lambda_mask"] = record.settings["policy"].get("lambda_mask")
     row = ResultRow(
         suite=EVALUATE,
         table=EVALUATE,
@@ -206,11 +208,7 @@ def _row(
         policy=record.config.policy_name,
         training_seed=record.seed,
         evaluation_seed=seed,
-        conditions={
-            "episodes": episodes,
-            "distractor_fixed_to": distractor,
-            "lambda_mask": record.settings["policy"].get("lambda_mask"),
-        },
+        conditions=conditions,
         config_hash=config_hash(record.settings),
         data_fingerprint=record.fingerprint,
         metric="score",

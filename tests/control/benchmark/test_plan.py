@@ -125,9 +125,7 @@ def test_a_method_has_the_context_that_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_every_row_is_trained_at_the_rate_of_its_policy(
-    table: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_has_the_rate_of_its_policy(table: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {name: float(number) for number, name in enumerate(SEARCHED, start=1)}
     monkeypatch.setattr(plan, "chosen_rates", lambda budget: rates)
     for name, method in TABLES[table].items():
@@ -142,9 +140,7 @@ def test_every_row_is_trained_at_the_rate_of_its_policy(
 
 
 @pytest.mark.slow
-def test_the_best_trajectories_are_cloned_and_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_trajectories_are_cloned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Good trajectories act one way and the others the other way: who clones which is seen."""
     columns = hopper_like((30, 8, 25, 20) * 10)
     ends = np.flatnonzero(columns["terminals"] | columns["timeouts"])

@@ -93,10 +93,8 @@ def screenable() -> Columns:
     return columns
 
 
-def begin(
-    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> dict[tuple[str, str], Path]:
-    """Screened runs of one file and one distractor begun in `out`, by distractor and method."""
+def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str], Path]:
+    """Screened runs of a file and a distractor begun in `out`, by distractor and method."""
     budget = Budget("small", (MADE,), 1, Evaluation(2, 1000), (*TINY, "crm.epochs=1"))
     monkeypatch.setitem(BUDGETS, "small", budget)
     monkeypatch.setattr(plan, "ROBUST", {"dt": METHODS["dt"], **SCREENED})
@@ -107,7 +105,7 @@ def begin(
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)
     monkeypatch.setattr("ucfrec_control.training.screening.ScreeningConfig", lambda: QUICK)
     runs, stages = {}, SharedStages(tmp_path / "stages")
-    for cell in plan.robustness_cells(tmp_path, out, budget):
+    for cell in plan.robustness_cells(tmp_path, tmp_path / "out", budget):
         assert cell.run is not None
         runs[str(cell.conditions["distractor"]), cell.method] = cell.run
         if cell.screening is not None:
@@ -117,11 +115,9 @@ def begin(
 
 
 @pytest.mark.slow
-def test_cells_are_measured_once_and_screening_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_are_measured_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, results = tmp_path / "out", tmp_path / "rows.jsonl"
-    runs = begin(tmp_path, out, monkeypatch)
+    runs = begin(tmp_path, monkeypatch)
     command = ("robustness", "--data", tmp_path, "--out", out, "--results", results)
     printed = control(*command)[0]
     rows, before = read_rows(results), results.read_text()
@@ -164,9 +160,7 @@ def test_cells_are_measured_once_and_screening_is_reported(
     assert control("robustness", "--show-only", "--results", results)[0] == printed
 
 
-def test_training_with_screening_records_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_screening_is_recorded_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Predictors this small reach no larger share of the reward.
     config = replace(QUICK, hidden=8, min_reward_r2=0.5)
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 5)

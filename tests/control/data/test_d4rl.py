@@ -278,9 +278,7 @@ main(["convert", *sys.argv[1:]])
 """
 
 
-def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_no_scratch(
-    file: Path, minari_folder: Path
-) -> None:
+def test_a_killed_conversion_leaves_no_dataset_or_scratch(file: Path, minari_folder: Path) -> None:
     command = [sys.executable, "-c", KILLED, file, "mine/hopper/mine-v0"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert not (minari_folder / "mine" / "hopper" / "mine-v0").exists()

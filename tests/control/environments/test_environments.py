@@ -164,9 +164,7 @@ def test_runs_on_d4rl_files_are_judged_in_d4rls_environment(run: Path, tmp_path:
 
 
 @needs_robotics
-def test_minari_mazes_are_those_of_the_data(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mazes_are_of_the_data(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     antmaze_settings("AntMaze_UMaze-v4")
     maze = [[1] * 5, [1, "g", 0, 0, 1], [1, 1, 1, 0, 1], [1, "r", 0, 0, 1], [1] * 5]
@@ -213,9 +211,7 @@ def test_names_of_d4rl_tell_its_environments() -> None:
     assert find_kind("antmaze-medium-diverse-v2") == "diverse"
 
 
-def test_without_gymnasium_robotics_one_line_says_what_to_install(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_robotics_the_extra_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     needs = f"{REBUILT} needs gymnasium-robotics, which is not installed; install ucfrec[antmaze]"
     assert needs in refused("evaluate", run)
@@ -224,9 +220,7 @@ def test_without_gymnasium_robotics_one_line_says_what_to_install(
 
 
 @needs_robotics
-def test_d4rl_files_keep_their_environment_in_minari(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_d4rl_files_keep_their_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     file = write_hdf5(tmp_path / "antmaze-umaze-v2.hdf5", ant_columns((9, 8)), env_id=None)
     control("convert", file, "antmaze/mine-v0")

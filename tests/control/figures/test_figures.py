@@ -180,9 +180,7 @@ def test_curves_are_means_over_seeds(runs: Path) -> None:
     np.testing.assert_array_equal(as_given.get_xydata(), [[0, 0], [2000, 2000]])
 
 
-def test_one_command_draws_what_it_can_and_names_what_is_missing(
-    runs: Path, tmp_path: Path
-) -> None:
+def test_one_command_draws_what_it_can_and_names_the_rest(runs: Path, tmp_path: Path) -> None:
     names = ("rows.jsonl", "evaluated.json", "figures", "copied")
     results, evaluated, out, copied = (tmp_path / name for name in names)
     targets = ("--target", 1000, "--target", 3000, "--episodes", 1, "--json", evaluated)

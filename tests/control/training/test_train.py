@@ -91,7 +91,7 @@ def test_behaviour_cloning_has_no_target(folder: Path, store: EpisodeStore, tmp_
     assert f"note: --target does nothing for {cloned} (bc)" in said
 
 
-def test_data_does_not_choose_what_is_imported(
+def test_data_imports_nothing(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "theirs.py").write_text("raise SystemExit('their code ran')")
@@ -116,9 +116,7 @@ def test_a_policy_with_a_distractor_is_judged_at_zero(folder: Path, tmp_path: Pa
     assert not any(step.observations[:, 11].any() for step in steps)
 
 
-def test_policies_that_know_their_largest_return_are_asked_for_it(
-    store: EpisodeStore, tmp_path: Path
-) -> None:
+def test_policies_that_know_their_return_are_asked_for(store: EpisodeStore, tmp_path: Path) -> None:
     pursue = ["policy.advantage_weights=true", "policy.max_return=true", "policy.best_share=0.5"]
     own = {"lsdt": ["policy.kernel_groups=4"], "ucf": ["crm.epochs=1", "csg.epochs=1"]}
     for policy_name in ("dt", "dc", "lsdt", "ucf"):
@@ -254,7 +252,7 @@ STRANGE: dict[str, list[object]] = {
 
 
 @pytest.mark.parametrize(("entry", "value"), [(e, v) for e, vs in STRANGE.items() for v in vs])
-def test_a_strangers_run_is_refused_on_one_line(
+def test_a_strangers_run_is_refused(
     folder: Path, tmp_path: Path, entry: str, value: object
 ) -> None:
     run = changed(folder / "store-run", tmp_path / "run", tuple(entry.split()), value)

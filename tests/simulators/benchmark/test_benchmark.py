@@ -67,9 +67,7 @@ def assert_rules_are_those_of_the_runs(rows: Sequence[ResultRow], out: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
-def test_rows_are_those_of_the_evaluation_and_are_measured_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = replace(TINY, logs=2, tasks=("kuairand", "synthetic-catalog"))
     monkeypatch.setitem(BUDGETS, "small", tiny)
     some = {name: METHODS[name] for name in ("popular", "dt+shared")}
@@ -144,18 +142,14 @@ def test_any_gymnasium_environment_is_measured(
     assert random.metrics["length"] == 5
 
 
-def test_sardine_is_left_out_where_it_is_not_installed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sardine_may_be_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(plan._PACKAGES, "sardine-static", "not_installed")
     budget = replace(TINY, tasks=("sardine-static", "synthetic-catalog"))
     assert planned(tmp_path, budget).missing() == ["sardine-static"]
 
 
 @pytest.mark.usefixtures("no_data")
-def test_every_cell_of_every_table_has_a_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_cell_of_every_table_has_a_configuration(tmp_path: Path) -> None:
     pages, catalog = ("synthetic-taobao",), ("synthetic-catalog",)
     tasks_of = {"shared": catalog, "sweeps": pages, "distractor": pages}
     budget = replace(TINY, seeds=1, tasks=(*pages, *catalog), tasks_of=tasks_of)
@@ -196,9 +190,7 @@ def test_a_task_that_is_named_is_measured_alone_also_outside_the_budget(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_data")
-def test_screened_methods_are_rows_of_the_distractor_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_screened_methods_have_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ucfrec.counterfactual.screening.TREES", 25)
     budget = replace(TINY, sessions=300, settings=(*TINY.settings, "rule.sessions=10"))
     given = planned(tmp_path, budget, tasks=["synthetic-catalog"])
@@ -221,9 +213,7 @@ def test_screened_methods_are_rows_of_the_distractor_table(
     assert TrainedPolicy.load(run).dropped == flagged
 
 
-def test_tables_of_rows_at_hand_are_shown_without_measuring(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_show_only_measures_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rows.jsonl"
     arguments = ["benchmark", "recommendation", "--show-only", "--results", str(path)]
     assert main(arguments) == 2

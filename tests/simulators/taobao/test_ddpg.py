@@ -47,9 +47,7 @@ def reference_density(actions: Float32Array, mean: Float32Array, scale: float) -
     scale=st.floats(0.05, 2),
     seed=st.integers(0, 99),
 )
-def test_the_density_is_that_of_a_truncated_normal(
-    mean: list[float], scale: float, seed: int
-) -> None:
+def test_the_density_is_of_a_truncated_normal(mean: list[float], scale: float, seed: int) -> None:
     means = np.tile(np.array(mean, dtype=np.float32), (20, 1))
     actions, density = truncated_normal(means, scale, np.random.default_rng(seed))
     assert np.abs(actions).max() <= 1

@@ -18,10 +18,8 @@ from ucfrec_datasets.kuairand import DATASET
 
 KEYS = ["user_id", "video_id", "time_ms"]
 FEEDBACK = "is_click is_like is_follow is_comment is_forward is_hate long_view"
-NUMBERS = (
-    "is_lowactive_period is_live_streamer is_video_author follow_user_num fans_user_num "
-    "friend_user_num register_days"
-)
+NUMBERS = "is_lowactive_period is_live_streamer is_video_author register_days "
+NUMBERS += "follow_user_num fans_user_num friend_user_num"
 
 
 def real_log() -> tuple[Path, pd.DataFrame]:

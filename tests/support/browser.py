@@ -74,9 +74,9 @@ class Browser:
         self.send("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
 
-    def until(self, condition: str, seconds: float = 30) -> None:
+    def until(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + 30
         while not self.run(condition):
             assert time.monotonic() < end, condition
             time.sleep(0.05)

@@ -66,12 +66,9 @@ class Inputs:
         write("rows.jsonl", f"{json.dumps({**row, **values, 'conditions': {'b': 1}})}\n" * 3)
         options = ("--episodes", 20, "--json", self.texts / "evaluations.json")
         require_done("evaluate", self.run, "--env", "synthetic-catalog", *options)
-        write(
-            "mapping.toml",
-            'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'
-            'timestamp = "seconds * 1000"\n[[item_features]]\nfiles = ["items.csv"]\n'
-            'key = "iid"\ncolumns = ["ln(1 + price)"]\n',
-        )
+        mapping = 'reward = "is_click"\nsession_by = "gap"\n[columns]\nuser_id = "uid"\n'
+        mapping += 'timestamp = "seconds * 1000"\n[[item_features]]\nfiles = ["items.csv"]\n'
+        write("mapping.toml", f'{mapping}key = "iid"\ncolumns = ["ln(1 + price)"]\n')
         write("empty.toml", "")
         train = "[train]\nsteps = 20\nlearning_rate = 1e-3\n"
         write("config.toml", f"{train}[policy]\ndim = 16\n[csg]\nband = [0.2, 0.5]\n")
@@ -111,12 +108,10 @@ def digest_output(path: Path) -> str:
     """A digest of an output, without times and names of folders."""
     digest = hashlib.sha256()
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    for file in files:
-        if not file.is_file() or file.name in ("run.json", "collect.json") or "events" in str(file):
-            continue
-        name = file.relative_to(path).as_posix() if path.is_dir() else ""
-        digest.update(f"{name}:".encode())
-        digest.update(_content(file))
+    for file in filter(Path.is_file, files):
+        if file.name not in ("run.json", "collect.json") and "events" not in str(file):
+            name = file.relative_to(path).as_posix() if path.is_dir() else ""
+            digest.update(f"{name}:".encode() + _content(file))
     return digest.hexdigest()
 
 
@@ -149,12 +144,10 @@ def _numbers(value: object) -> object:
     return value if isinstance(value, int | float) else None
 
 
-def use_temporary(folder: Path) -> Path:
+def use_temporary(folder: Path) -> None:
     """Make a folder inside `folder` the one for temporary files."""
     import tempfile
 
-    place = folder / "tmp"
-    place.mkdir()
-    os.environ["TMPDIR"] = str(place)
     tempfile.tempdir = None
-    return place
+    os.environ["TMPDIR"] = str(folder / "tmp")
+    (folder / "tmp").mkdir()

@@ -25,18 +25,15 @@ def limits(inputs: Inputs, folder: Path) -> Counter[str]:
     place.mkdir()
     (place / "file").write_text("")
     for job in inputs.jobs():
-        for name, out in (
-            ("path through a file", place / "file" / "out"),
-            ("name too long", place / ("n" * 254)),
-            ("folder for a file" if job.suffix else "exists", place),
-        ):
+        taken = "folder for a file" if job.suffix else "exists"
+        outs = {"path through a file": place / "file" / "out", taken: place}
+        for name, out in (outs | {"name too long": place / ("n" * 254)}).items():
             _expect(counts, job, name, Running(command(*job.arguments(out))))
         out = place / f"small-{job.name}{job.suffix}"
         _expect(counts, job, "file too large", Running(_limited(job, out)))
         for megabytes in (60, 200, 1000):
             out = place / f"memory-{job.name}-{megabytes}{job.suffix}"
-            memory = megabytes * 2**20
-            started = Running(command(*job.arguments(out)), memory=memory)
+            started = Running(command(*job.arguments(out)), memory=megabytes * 2**20)
             _expect(counts, job, f"{megabytes} MB of memory", started, (0, 2, *_BY_A_LIBRARY))
         closed = place / "closed"
         closed.mkdir(mode=0o500, exist_ok=True)
@@ -106,12 +103,9 @@ def _mounted(job: Job, disk: Path, options: str) -> Callable[[], int]:
         disk.mkdir(exist_ok=True)
         if ctypes.CDLL(None).unshare(0x00020000):  # CLONE_NEWNS; Python has it from 3.12 on
             return 75
-        quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        for arguments in (
-            ["mount", "--make-rprivate", "/"],
-            ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(disk)],
-        ):
-            if subprocess.run(arguments, check=False, **quiet).returncode:
+        quiet: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+        for arguments in (["--make-rprivate", "/"], ["-t", "tmpfs", "-o", options, "tmpfs", disk]):
+            if subprocess.run(["mount", *arguments], check=False, **quiet).returncode:
                 return 75
         return command(*job.arguments(disk / f"out{job.suffix}"))()
 

@@ -12,11 +12,12 @@ import random
 import resource
 import shutil
 import signal
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,13 +145,9 @@ def _read(reader: Reader, place: Path, counts: Counter[str], expected: Any = Non
 
 def _find_place(error: BaseException) -> str:
     """The last place in ucfrec that the error passed."""
-    place, step = "", error.__traceback__
-    while step is not None:
-        file = step.tb_frame.f_code.co_filename
-        if "ucfrec" in file:
-            place = f"{Path(file).name}:{step.tb_lineno}"
-        step = step.tb_next
-    return place
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [f"{Path(f.filename).name}:{f.lineno}" for f in frames if "ucfrec" in f.filename]
+    return ours[-1] if ours else ""
 
 
 def _flip_batch(reader: Reader, place: Path, seed: int, numbers: range, answer: Path) -> int:
@@ -314,8 +311,8 @@ def list_readers(inputs: Inputs) -> list[Reader]:
     def report(folder: Path) -> object:
         return write_report(folder.with_name("out.html"), [folder])
 
-    def report_results(folder: Path) -> object:
-        return write_report(folder / "out.html", [inputs.run], [folder / "evaluations.json"])
+    def report_results(file: Path) -> object:
+        return write_report(file.with_name("out.html"), [inputs.run], [file])
 
     def read_setting(file: Path) -> object:
         return resolve_config(overrides=[file.read_bytes().decode("utf-8", "replace")])
@@ -342,7 +339,7 @@ def list_readers(inputs: Inputs) -> list[Reader]:
         lone(run, "items.parquet", lambda file: read_ids(file, "item_id")),
         lone(texts, "rows.jsonl", read_rows),
         lone(texts, "evaluations.json", read_results),
-        Reader("report: evaluations.json", texts, "evaluations.json", report_results, slow=True),
+        replace(lone(texts, "evaluations.json", report_results, True), name="report: evaluations"),
         lone(texts, "mapping.toml", read_mapping),
         lone(texts, "config.toml", lambda file: resolve_config(file=file)),
         lone(texts, "setting.txt", read_setting),

@@ -61,20 +61,18 @@ _KINDS: Final = (
 
 
 class Agent(Memoryless):
-    """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`)."""
+    """The deterministic action of a saved agent plus Gaussian noise (an `Actor` of `rollout`).
 
-    def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
-        """Args:
+    Args:
         network: maps observations (N, O) to (N, A).
         squashed: whether its outputs, within [−1, 1], are stretched to the action space.
-        space: the environment's actions.
         noise: standard deviation of the noise, in halves of the action space's range.
-        seed: of the noise.
-        """
+    """
+
+    def __init__(self, network: nn.Module, squashed: bool, space: Box, noise: float, seed: int):
         self._network, self._squashed = network.eval(), squashed
         self._low, self._high = (side.astype(np.float64) for side in (space.low, space.high))
-        self._noise, self._seed = noise, seed
-        self._generator = np.random.default_rng(seed)
+        self._noise, self._generator = noise, np.random.default_rng(seed)
 
     def act(self, observations: Float32Array, live: BoolArray) -> tuple[Float32Array, None]:
         """Actions (N, A) within the action space, and None."""

@@ -114,11 +114,7 @@ def _dataset(trained: Trained) -> dict[str, Any]:
 
 
 def environment_of(trained: Trained, env_id: str | None) -> str:
-    """`env_id`, or the environment of the data if it is None.
-
-    Raises:
-        InputError: the environment of the data cannot be used; see `environment_of_data`.
-    """
+    """`env_id`, or `environment_of_data` if it is None, with its errors."""
     return env_id or environment_of_data(_dataset(trained))
 
 

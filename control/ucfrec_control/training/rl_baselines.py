@@ -214,19 +214,15 @@ def _train(store: EpisodeStore, out: Path, config: RLConfig, seed: int) -> RLRec
     record, checkpoint = RLRecord.read(out), out / _CHECKPOINT
     step, seconds = _resume(checkpoint, algorithm, dataset)
     log = MetricsLog(out, step)
+    quiet = {"logger_adapter": d3rlpy.logging.NoopAdapterFactory(), "show_progress": False}
     with progress(config.steps, config.algorithm, "steps", done=step) as bar:
         while step < config.steps:
             if step:  # a new seed after each checkpoint, so no generator's state is saved
                 d3rlpy.seed(seed + step)
             steps = min(CHECKPOINT_EVERY, config.steps - step)
-            ((_, losses),) = algorithm.fit(
-                dataset,
-                n_steps=steps,
-                n_steps_per_epoch=steps,
-                logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
-                show_progress=False,
-                callback=lambda *_: bar.update(),
-            )
+            size = {"n_steps": steps, "n_steps_per_epoch": steps}
+            how = {"callback": lambda *_: bar.update(), **quiet}
+            ((_, losses),) = algorithm.fit(dataset, **size, **how)
             step += steps
             log.add(step, losses)
             state: dict[str, Any] = {"step": step, "seconds": seconds + perf_counter() - started}
